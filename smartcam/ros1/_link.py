@@ -126,8 +126,11 @@ class BridgeLink:
     """A link that :meth:`run` keeps.
 
     Attributes:
+        url: the bridge's.
+        outbox: what is sent.
         connected: whether there is a bridge now.
         failure: why there is none; "" where nothing has been tried.
+        changed: is notified of each change of these.
     """
 
     def __init__(self, url: str, outbox: Outbox, listener: Listener, backoff: Backoff) -> None:
@@ -135,7 +138,8 @@ class BridgeLink:
         self.failure = ""
         self.changed = asyncio.Condition()
         self.connected = False
-        self._outbox, self._listener, self._backoff = outbox, listener, backoff
+        self.outbox = outbox
+        self._listener, self._backoff = listener, backoff
 
     async def run(self) -> None:
         """Keep a link until this is cancelled, or the tries are over."""
@@ -183,17 +187,21 @@ class BridgeLink:
 
     async def _tell_lost(self, reason: str) -> bool:
         """Say that there is no link; return whether there was one."""
-        was, said_before = self.connected, self.failure
-        await self._set(connected=False, failure=f"{self.url}: {reason}")
-        self._outbox.clear()
-        await self._listener.lost()
-        level = logging.DEBUG if said_before == self.failure else logging.WARNING
+        was, told_before = self.connected, self.failure
+        await self.end(f"{self.url}: {reason}")
+        level = logging.DEBUG if told_before == self.failure else logging.WARNING
         logger.log(level, "%s: no rosbridge: %s", self.url, reason)
         return was
 
+    async def end(self, failure: str = "") -> None:
+        """Have no link, and nothing left that was for it."""
+        await self._set(connected=False, failure=failure)
+        self.outbox.clear()
+        await self._listener.lost()
+
     async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
         while True:
-            text = await text_of(await self._outbox.take())
+            text = await text_of(await self.outbox.take())
             try:
                 async with asyncio.timeout(STALLED):
                     await web.send_str(text)
@@ -206,7 +214,7 @@ class BridgeLink:
             message = await web.receive()
             if message.type is kinds.TEXT:
                 self._hear(message.data)
-                await self._outbox.room()
+                await self.outbox.room()
             elif message.type is kinds.ERROR:
                 raise ConnectionError(str(web.exception() or message.data))
             elif message.type in {kinds.CLOSE, kinds.CLOSING, kinds.CLOSED}:

@@ -64,7 +64,7 @@ class Lane:
 
     def say_again(self) -> None:
         """Have a latched topic's last message wait: the bridge is new."""
-        if self._last is not None:
+        if self._last is not None and not self._waiting:
             self.put(self._last, connected=True)
 
 

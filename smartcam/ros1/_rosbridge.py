@@ -3,116 +3,78 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-import re
 from typing import TYPE_CHECKING, Any
 
+from smartcam._server import Server
 from smartcam.backoff import Backoff
-from smartcam.exceptions import ConfigurationError
-from smartcam.ros1._calls import RosbridgeService
-from smartcam.ros1._json_messages import encoded, ros1_name, to_json
+from smartcam.exceptions import ConfigurationError, RosError
+from smartcam.ros1._json_messages import encoded
 from smartcam.ros1._link import BridgeLink
-from smartcam.ros1._outbox import Lane, Outbox
+from smartcam.ros1._outbox import Outbox
+from smartcam.ros1._publishing import RosbridgePublisher
 from smartcam.ros1._retiring import retire
+from smartcam.ros1._serving import RosbridgeService
+from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
+from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._types import RosTypes
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable
-    from typing import Self
 
     from smartcam.ros1._json_messages import Part
-    from smartcam.ros2._types import MessageType
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
+HANDLER_TIMEOUT = 600.0
+"""Seconds that a service's handler may take."""
 FLUSH = 1.0
 """Seconds at the end for what waits to be sent."""
-MOST_CALLS = 64
-"""That are carried out for a node at the same time; the next is refused."""
-_NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
+REPEAT = 10.0
+"""Seconds between two sayings of what is latched on a topic that nodes share, such as
+``/tf_static``: a bridge keeps one message for all of its clients."""
 _LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.INFO}
 
 
-class RosbridgePublisher:
-    """A topic that a node publishes.
-
-    Attributes:
-        topic: its full name.
-        type: what its messages are.
-    """
-
-    def __init__(self, node: RosbridgeNode, topic: str, kind: MessageType, lane: Lane) -> None:
-        self.topic, self.type, self.lane = topic, kind, lane
-        self._node = node
-
-    @property
-    def dropped(self) -> int:
-        """Messages that were not sent: there was no bridge, or newer ones came."""
-        return self.lane.dropped
-
-    @property
-    def sent(self) -> int:
-        """Messages that were sent to the bridge; it does not say what became of them."""
-        return self.lane.sent
-
-    def publish(self, message: Any = None, /, **fields: Any) -> None:
-        """Publish a message, or the one of these fields; never waits.
-
-        Raises:
-            RosMessageError: it is none of this topic's type.
-        """
-        if message is None:
-            message = self.type.new(**fields)
-        said: dict[str, Any] = {"op": "publish", "topic": self.topic}
-        said["msg"] = to_json(self.type, message)
-        if self.lane.latched:
-            said["latch"] = True  # or the bridge takes it for another publisher
-        self._node._put(self, encoded(said))  # noqa: SLF001 - its own
-
-    def close(self) -> None:
-        """Stop publishing; what waits is not sent. Idempotent."""
-        self._node._forget_publisher(self)  # noqa: SLF001
-
-    def advertisement(self) -> dict[str, Any]:
-        """Return how a bridge is told."""
-        told = {"op": "advertise", "topic": self.topic, "type": ros1_name(self.type.name)}
-        return told | {"latch": self.lane.latched}
-
-
-class RosbridgeNode:
-    """A node of ROS 1 in asyncio, over a rosbridge: ``async with RosbridgeNode(...) as node``.
+class RosbridgeNode(Server):
+    """A node of ROS 1 in asyncio, over a rosbridge; ``async with`` opens and closes it.
 
     Opening it does not wait for the bridge: it is tried until it is there, and again when it is
-    lost. What is advertised is advertised again then, and the last message of latched topics is
-    published again; other messages that are published without a bridge are dropped and counted.
-    A call that is under way when the bridge goes ends.
+    lost. Everything is advertised again then, and the last message of a latched topic published
+    again; other messages without a bridge are dropped and counted. A call that is under way when
+    the bridge goes is cancelled.
 
-    The protocol has no answer to an advertisement. That the bridge has the type (its machine must
-    have the package) shows in the bridge's log, and in ``rostopic info``.
+    The protocol has no answer to an advertisement: that a bridge does not know a type, because its
+    machine has not the package, is in the bridge's log alone.
 
     Args:
-        name: the node's name.
-        namespace: where it is.
+        name: letters, digits and ``_``.
+        namespace: such as ``/line1``.
         bridge: the bridge's URL, ``ws://host:9090``.
-        types: the messages and services that are known; None for those of ROS 2 Jazzy.
-        backoff: when a bridge is tried again.
+        types: the messages and services that are known; None for those of Jazzy. What ROS 1 has not
+            is left out where it is published or served, and told in the log.
+        backoff: when a bridge is tried again; None for :class:`smartcam.Backoff` as it is.
 
     Raises:
-        ConfigurationError: a name, or the URL, cannot work.
+        ConfigurationError: a name or the URL cannot be.
+        MissingExtraError: the extra ``ros2`` is not installed.
     """
+
+    parameters: None = None  # which ROS 1 has elsewhere
 
     def __init__(
         self,
         name: str,
-        namespace: str = "/",
         *,
+        namespace: str = "/",
         bridge: str,
         types: RosTypes | None = None,
         backoff: Backoff | None = None,
     ) -> None:
-        self.namespace = _full_name(namespace, "/")
-        self.name = _full_name(name, self.namespace)
-        self.types = types or RosTypes()
+        self.name: str = check_node(name)
+        self.namespace: str = check_namespace(namespace)
+        self.types: RosTypes = types or RosTypes()
         self._outbox = Outbox()
         self._link = BridgeLink(bridge, self._outbox, self, backoff or Backoff())
         self._publishers: dict[str, RosbridgePublisher] = {}
@@ -120,10 +82,15 @@ class RosbridgeNode:
         self._running: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
         self._new: list[RosbridgeService] = []  # that are to be advertised
-        self._heard: dict[str, Callable[[dict[str, Any]], None]] = {
+        self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "status": self._told,
         }
+
+    @property
+    def full_name(self) -> str:
+        """Such as ``/line1/cam3``."""
+        return full_name(self.namespace, self.name)
 
     @property
     def connected(self) -> bool:
@@ -132,7 +99,7 @@ class RosbridgeNode:
 
     @property
     def failure(self) -> str:
-        """Why the bridge is not there."""
+        """Why the bridge is not there; "" where it is, or has not been tried."""
         return self._link.failure
 
     async def wait_connected(self, timeout: float | None = None) -> None:
@@ -141,17 +108,26 @@ class RosbridgeNode:
         Raises:
             TimeoutError: it was not within ``timeout`` seconds.
         """
+        await self._wait(timeout, lambda: self._link.connected)
+
+    async def wait_changed(self) -> None:
+        """Wait until the bridge comes or goes, or why it is not there changes."""
+        before = self.connected, self.failure
+        await self._wait(None, lambda: (self.connected, self.failure) != before)
+
+    async def _wait(self, timeout: float | None, met: Callable[[], bool]) -> None:
         async with asyncio.timeout(timeout), self._link.changed:
-            await self._link.changed.wait_for(lambda: self._link.connected)
+            await self._link.changed.wait_for(met)
 
-    async def __aenter__(self) -> Self:
-        if self._running is not None:
-            raise ConfigurationError(f"{self.name}: it was opened already")
-        self._running = asyncio.create_task(self._link.run())
-        return self
+    # ------------------------------------------------------------------ life
 
-    async def __aexit__(self, *_: object) -> None:
-        """Withdraw everything from the bridge, within seconds."""
+    async def start(self) -> None:
+        """Open it."""
+        if self._running is None:
+            self._running = asyncio.create_task(self._link.run())
+
+    async def stop(self) -> None:
+        """Close it: withdraw everything from the bridge, which takes some seconds. Idempotent."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -161,104 +137,114 @@ class RosbridgeNode:
         finally:
             running.cancel()
             await asyncio.wait((running,))
-            await self.lost()
+            await self._link.end()
+            self._publishers.clear()
+            self._services.clear()
+            self._outbox = self._link.outbox = Outbox()
 
     async def _withdraw_all(self) -> None:
-        try:
+        with contextlib.suppress(TimeoutError):  # it does not read
             async with asyncio.timeout(FLUSH):
                 await self._outbox.flushed()
-        except TimeoutError:
-            pass  # it does not read
-        await asyncio.gather(*(one.still() for one in self._services.values()))
-        await retire(self._link.url, [*self._services])
+        services = [one for one in self._services.values() if one.exists]
+        await asyncio.gather(*(one.still() for one in services))
+        await retire(self._link.url, [one.name for one in services])
 
     # ------------------------------------------------------------------ what it has
 
-    def publisher(
-        self, topic: str, type: str, *, depth: int = 5, latched: bool = False  # noqa: A002
-    ) -> RosbridgePublisher:
+    def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgePublisher:
         """Publish on a topic.
 
         Args:
-            topic: its name: relative to the namespace, ``/absolute`` or ``~/private``.
-            type: what is published, ``std_msgs/msg/String``.
-            depth: messages that may wait for the bridge; beyond that the oldest goes.
-            latched: who subscribes later gets the last message.
+            topic: absolute, relative to the namespace, or private (``~/it``).
+            type: such as ``std_msgs/msg/String``.
+            qos: of it, ``depth`` counts, for messages that wait for the bridge, and ``latched``.
 
         Raises:
-            ConfigurationError: no such type, also in ROS 1; no such name; or there is one already.
+            ConfigurationError: the topic cannot be, is there already, or there is no such type.
+            RosError: the node is not open.
         """
-        kind, name = self.types.message(type), self.resolve(topic)
-        self._check(name, kind.name, self._publishers)
-        lane = Lane(depth, latched=latched)
-        publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, lane)
-        self._outbox.add(lane)
-        self._say(publisher.advertisement())
+        kind, name = self.types.message(type), self._resolved(topic, "topic", self._publishers)
+        publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
+        if self._told_absent(publisher.exists, name, kind.name):
+            self._outbox.add(publisher.lane)
+            self.say(encoded(publisher.advertisement()))
         return publisher
 
     def serve(
-        self, service: str, type: str, handler: Callable[[Any], Awaitable[Any]]  # noqa: A002
+        self,
+        service: str,
+        type: str,
+        handler: Callable[[Any], Awaitable[Any]],
+        *,
+        qos: QoS = SERVICES,  # noqa: ARG002 - ROS 1 has none
+        timeout: float = HANDLER_TIMEOUT,
     ) -> RosbridgeService:
-        """Serve a service.
+        """Serve.
 
         Args:
-            service: its name, as a topic's.
-            type: what it takes and gives, ``std_srvs/srv/Trigger``.
-            handler: gets the request and returns the response. What it raises becomes the
-                response's text field for errors (``error``, ``message``, ``status_message``). Where
-                it has none the call fails at the caller.
+            service: its name, as of a topic.
+            type: such as ``std_srvs/srv/Trigger``.
+            handler: is awaited with each request, and returns the response, or a mapping of its
+                fields. The text of an error becomes the response's field ``error``, ``message`` or
+                ``status_message``; where it has none of these the call fails at its caller.
+            qos: has no meaning in ROS 1.
+            timeout: seconds that the handler may take.
 
         Raises:
-            ConfigurationError: as for :meth:`publisher`.
+            ConfigurationError: the name cannot be, is there already, or there is no such type.
+            RosError: the node is not open.
         """
-        kind, name = self.types.service(type), self.resolve(service)
-        self._check(name, kind.name, self._services)
-        served = self._services[name] = RosbridgeService(self, name, kind, handler)
-        self._advertise([served])
+        kind, name = self.types.service(type), self._resolved(service, "service", self._services)
+        served = RosbridgeService(self, name, kind, handler, timeout)
+        self._services[name] = served
+        if self._told_absent(served.exists, name, kind.name):
+            self._advertise([served])
         return served
 
-    def resolve(self, name: str) -> str:
-        """Return the full name of a topic or service of this node.
+    def _resolved(self, name: str, what: str, there: dict[str, Any]) -> str:
+        full = resolve(name, self.namespace, self.name, what)
+        if self._running is None:
+            raise RosError(f"{self.full_name}: the node is not open")
+        if full in there:
+            raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
+        return full
 
-        Raises:
-            ConfigurationError: it is none.
-        """
-        if name.startswith("~"):
-            return _full_name(name[1:].removeprefix("/"), self.name)
-        return _full_name(name, self.namespace)
-
-    def _check(self, name: str, kind: str, there: dict[str, Any]) -> None:
-        if name in there:
-            raise ConfigurationError(f"{self.name}: {name} is there already")
-        if ros1_name(kind) is None:
-            raise ConfigurationError(f"{self.name}: {name}: ROS 1 has no type {kind}")
+    def _told_absent(self, exists: bool, name: str, kind: str) -> bool:
+        if not exists:
+            logger.info("%s: left out, ROS 1 has no %s", name, kind)
+        return exists
 
     # ------------------------------------------------------------------ for its parts
 
-    def _put(self, publisher: RosbridgePublisher, parts: tuple[Part, ...]) -> None:
-        if self._publishers.get(publisher.topic) is not publisher:
-            raise ConfigurationError(f"{publisher.topic}: it is closed")
-        publisher.lane.put(parts, connected=self.connected)
+    def has(self, end: RosbridgePublisher | RosbridgeService) -> bool:
+        """Whether it is not closed."""
+        return end in (self._publishers.get(end.name), self._services.get(end.name))
+
+    def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
+        """Have no more of it."""
+        if not self.has(end):
+            return
+        if isinstance(end, RosbridgePublisher):
+            del self._publishers[end.name]
+            if end.exists:
+                self._outbox.remove(end.lane)
+                self.say(encoded({"op": "unadvertise", "topic": end.name}))
+            return
+        del self._services[end.name]
+        if end.ready:
+            self.begin(end.withdraw())
+
+    def say(self, parts: tuple[Part, ...]) -> None:
+        """Say something to the bridge that is there; the next one hears all it needs by itself."""
+        if self.connected:
+            self._outbox.say(parts)
+
+    def wake(self) -> None:
+        """A message waits to be sent."""
         self._outbox.wake()
 
-    def _forget_publisher(self, publisher: RosbridgePublisher) -> None:
-        if self._publishers.get(publisher.topic) is publisher:
-            del self._publishers[publisher.topic]
-            self._outbox.remove(publisher.lane)
-            self._say({"op": "unadvertise", "topic": publisher.topic})
-
-    def _forget_service(self, service: RosbridgeService) -> None:
-        if self._services.get(service.service) is service:
-            del self._services[service.service]
-            if self.connected:
-                self._start(service.withdraw())
-
-    def _say(self, operation: dict[str, Any]) -> None:
-        """Say something to the bridge that is there now; the next one hears it otherwise."""
-        if self.connected:
-            self._outbox.say(encoded(operation))
-
-    def _start(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Have something done as long as this bridge is there."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
@@ -270,10 +256,20 @@ class RosbridgeNode:
     def came(self) -> None:
         """Advertise everything to a new bridge."""
         for publisher in self._publishers.values():
-            self._outbox.say(encoded(publisher.advertisement()))
-            publisher.lane.say_again()
-        self._outbox.wake()
-        self._advertise(self._services.values())
+            if publisher.exists:
+                self.say(encoded(publisher.advertisement()))
+                publisher.lane.say_again()
+        self.begin(self._repeat_shared())
+        self._advertise(one for one in self._services.values() if one.exists)
+
+    async def _repeat_shared(self) -> None:
+        within = f"{self.full_name}/"
+        while True:
+            await asyncio.sleep(REPEAT)
+            for publisher in self._publishers.values():
+                if publisher.exists and not publisher.name.startswith(within):
+                    publisher.lane.say_again()
+                    self._outbox.wake()
 
     def _advertise(self, services: Iterable[RosbridgeService]) -> None:
         """Have services advertised, all at once that are new in this turn of the loop."""
@@ -281,24 +277,22 @@ class RosbridgeNode:
             begun = bool(self._new)
             self._new += services
             if not begun and self._new:
-                self._start(self._advertise_new())
+                self.begin(self._advertise_new())
 
     async def _advertise_new(self) -> None:
-        while self._new:
-            await asyncio.sleep(0)
-            new, self._new = self._new, []
-            await retire(self._link.url, [one.service for one in new])
-            for service in new:
-                if self._services.get(service.service) is service:
-                    service.advertise()
+        await asyncio.sleep(0)
+        new, self._new = self._new, []
+        await retire(self._link.url, [one.name for one in new])
+        for service in new:
+            service.advertise()
 
     def heard(self, operation: dict[str, Any]) -> None:
         """Do what the bridge says."""
-        heard = self._heard.get(operation["op"])
-        if heard is None:
-            logger.debug("%s: from the bridge: %.200r", self.name, operation)
+        hear = self._hears.get(operation["op"])
+        if hear is None:
+            logger.debug("%s: from the bridge: %.200r", self.full_name, operation)
         else:
-            heard(operation)
+            hear(operation)
 
     async def lost(self) -> None:
         """End what was under way for a bridge that is gone."""
@@ -315,27 +309,14 @@ class RosbridgeNode:
         name, identity = operation.get("service"), operation.get("id")
         service = self._services.get(name) if isinstance(name, str) else None
         if service is None:
-            logger.warning("%s: the bridge calls %.80r, which is not served", self.name, name)
-            self._say({"op": "service_response", "service": name, "id": identity, "result": False})
-        elif service.ready:  # or it is a call that the bridge has aborted
-            service.call(identity, operation.get("args"), busy=len(self._tasks) >= MOST_CALLS)
+            logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
+            refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
+            self.say(encoded(refusal))
+        elif service.ready:  # or it is a call that the bridge aborts
+            service.call(identity, operation.get("args"))
 
     def _told(self, operation: dict[str, Any]) -> None:
         level = _LEVELS.get(str(operation.get("level")), logging.DEBUG)
         about = f" ({operation['id']})" if operation.get("id") else ""
-        logger.log(level, "%s: the bridge%s: %.500s", self.name, about, operation.get("msg"))
-
-
-def _full_name(name: str, within: str) -> str:
-    """Return a full name.
-
-    Raises:
-        ConfigurationError: it is none.
-    """
-    parts = [one for one in name.split("/") if one]
-    if not all(map(_NAME.fullmatch, parts)) or (not parts and within != "/"):
-        raise ConfigurationError(
-            f"no name in ROS: expected parts of letters, digits and _, got {name!r:.80}"
-        )
-    before = "" if name.startswith("/") or within == "/" else within
-    return "/".join([before, *parts]) if parts else "/"
+        said = operation.get("msg")
+        logger.log(level, "%s: the bridge says%s: %.500s", self.full_name, about, said)

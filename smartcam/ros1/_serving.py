@@ -1,0 +1,167 @@
+"""Services that are called through a rosbridge."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import RosError, SmartCamError
+from smartcam.ros1._json_messages import encoded, from_json, ros1_name, to_json
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from typing import Self
+
+    from smartcam.ros1._json_messages import Part
+    from smartcam.ros1._rosbridge import RosbridgeNode
+    from smartcam.ros2._types import MessageType, ServiceType
+
+logger: logging.Logger = logging.getLogger("smartcam.ros1")
+
+MOST_CALLS = 64
+"""Calls of a service that are carried out at the same time; one beyond is refused."""
+SETTLE = 0.5
+"""Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
+has not handed over stays, and is then the response to a later call."""
+ERROR_FIELDS = ("error", "message", "status_message")
+"""The fields of a response that say what went wrong, the first that it has."""
+
+
+class RosbridgeService:
+    """Serves; made by :meth:`RosbridgeNode.serve`.
+
+    Attributes:
+        name: its absolute name.
+        type: of requests and responses.
+        ready: whether it is advertised to the bridge that is there.
+        calls: calls that came.
+        failed: those that were refused, or failed.
+    """
+
+    def __init__(
+        self,
+        node: RosbridgeNode,
+        name: str,
+        kind: ServiceType,
+        handler: Callable[[Any], Awaitable[Any]],
+        timeout: float,
+    ) -> None:
+        self.name, self.type = name, kind
+        self.ready = False
+        self.exists = ros1_name(kind.name) is not None
+        self.calls = self.failed = 0
+        self._node, self._handler, self._timeout = node, handler, timeout
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._responded = float("-inf")
+        self._text_field = error_field(kind.response)
+
+    def close(self) -> None:
+        """Serve no more; calls under way fail at their callers. Idempotent."""
+        self._node.forget(self)
+
+    async def wait_closed(self) -> None:
+        """Wait until the calls that were given up have ended."""
+        if self._tasks:
+            await asyncio.wait(tuple(self._tasks))
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------ for the node
+
+    def advertise(self) -> None:
+        """Advertise it, where it is not closed."""
+        if self._node.has(self):
+            self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
+            self.ready = True
+
+    async def withdraw(self) -> None:
+        """Have the bridge withdraw it, so that its callers hear of it."""
+        await self.still()
+        self._say({"op": "unadvertise_service"})
+
+    async def still(self) -> None:
+        """Take no more calls, end those under way, and let the bridge hand over its responses."""
+        self.ready = False
+        tasks = [one for one in self._tasks if one is not asyncio.current_task()]
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+        left = self._responded + SETTLE - asyncio.get_running_loop().time()
+        if left > 0:
+            await asyncio.sleep(left)
+
+    def call(self, identity: object, said: object) -> None:
+        """Carry out a call. What it waits for ends where the bridge goes."""
+        self.calls += 1
+        busy = len(self._tasks) >= MOST_CALLS
+        task = self._node.begin(self._carry_out(identity, said, busy=busy))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # ------------------------------------------------------------------ inside
+
+    async def _carry_out(self, identity: object, said: object, *, busy: bool) -> None:
+        try:
+            parts = await self._response(identity, said, busy=busy)
+        except SmartCamError as exc:
+            await self._refuse(identity, str(exc))
+        except TimeoutError:
+            await self._refuse(identity, f"no answer in {self._timeout:g} s")
+        except Exception as exc:
+            logger.exception("%s ! its handler failed", self.name)
+            await self._refuse(identity, f"{type(exc).__name__}: {exc}")
+        else:
+            self._respond(parts)
+
+    async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
+        if busy:
+            raise RosError(f"{MOST_CALLS} calls of it are under way, which is the most")
+        request = from_json(self.type.request, {} if said is None else said)
+        async with asyncio.timeout(self._timeout):
+            response = await self._handler(request)
+        kind = self.type.response
+        if isinstance(response, Mapping):
+            response = kind.new(**response)
+        return self._encoded(identity, to_json(kind, response), result=True)
+
+    async def _refuse(self, identity: object, text: str) -> None:
+        self.failed += 1
+        logger.warning("%s ! %s", self.name, text)
+        kind = self.type.response
+        if self._text_field:
+            values = to_json(kind, kind.new(**{self._text_field: text}))
+            self._respond(self._encoded(identity, values, result=False))
+            return
+        # A bridge takes no notice of the result and would hand over zeros: the service goes for a
+        # moment, which is an error for its callers.
+        self._respond(self._encoded(identity, None, result=False))
+        await self.withdraw()
+        self.advertise()
+
+    def _encoded(self, identity: object, values: object, *, result: bool) -> tuple[Part, ...]:
+        said = {"op": "service_response", "service": self.name, "result": result}
+        if identity is not None:
+            said["id"] = identity
+        if values is not None:
+            said["values"] = values
+        return encoded(said)
+
+    def _respond(self, parts: tuple[Part, ...]) -> None:
+        self._responded = asyncio.get_running_loop().time()
+        self._node.say(parts)
+
+    def _say(self, operation: dict[str, Any]) -> None:
+        self._node.say(encoded({**operation, "service": self.name}))
+
+
+def error_field(kind: MessageType) -> str:
+    """Return the field of a response that says what went wrong, "" where it has none."""
+    texts = {one.name for one in kind.fields if one.type == "string" and not one.shape}
+    return next((one for one in ERROR_FIELDS if one in texts), "")
