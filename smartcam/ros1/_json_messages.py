@@ -129,7 +129,8 @@ def from_json(kind: MessageType, said: Any) -> Any:
         names = RENAMED.get(kind.name, {})
         ordered = [names.get(one.name, one.name) for one in kind.fields]
         said = dict(zip(ordered, said, strict=False))
-    return kind.new(**_said(kind, said, "", _DEEPEST))
+    message = kind.new(**_said(kind, said, "", _DEEPEST))
+    return kind.decode(kind.encode(message))  # as ROS 2 has it: arrays of numpy, bytes
 
 
 def _said(kind: MessageType, said: Any, where: str, depth: int) -> dict[str, Any]:
