@@ -60,7 +60,7 @@ EPILOG = (
 
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
-    "A fleet": ("serve", "fleet"),
+    "A fleet": ("serve", "fleet", "ros2"),
     "Pictures": ("frames", "depth"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
@@ -321,7 +321,7 @@ async def demo_command(
 
 for _one in (
     *(live, probe, doctor, image, decode, calibrate, sheet),
-    *(record, replay, pcap, dissector, serve, fleet, frames, depth),
+    *(record, replay, pcap, dissector, serve, fleet, ros2, frames, depth),
 ):
     command.add_command(_one)
 
