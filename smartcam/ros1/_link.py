@@ -28,6 +28,8 @@ CONNECT_TIMEOUT = 10.0
 """Seconds until a bridge has answered the handshake."""
 STALLED = 10.0
 """Seconds that a bridge may take to read one message."""
+GOODBYE = 1.0
+"""Seconds that a bridge gets to answer a goodbye."""
 HEARTBEAT = 10.0
 """Seconds of silence after which it is asked whether it is there; half of them to answer."""
 LIVED = 5.0
@@ -89,7 +91,7 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
         OSError, aiohttp.ClientError, TimeoutError: there is none.
     """
     aiohttp = _aiohttp()
-    timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=1.0)
+    timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE)
     async with aiohttp.ClientSession() as session:
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
@@ -100,12 +102,17 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
             raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s") from None
         try:
             yield web
-            await web.close()
         finally:
             peer = web.get_extra_info("socket")
-            if peer is not None:
-                with contextlib.suppress(OSError):
-                    peer.shutdown(socket.SHUT_RDWR)  # or what waits would be kept for it
+            try:
+                async with asyncio.timeout(GOODBYE):
+                    await web.close()
+            except link_errors():
+                pass  # it does not read, or is gone
+            finally:
+                if peer is not None:
+                    with contextlib.suppress(OSError):
+                        peer.shutdown(socket.SHUT_RDWR)  # or what waits would be kept for it
 
 
 async def text_of(parts: tuple[Part, ...]) -> str:
@@ -214,6 +221,7 @@ class BridgeLink:
             message = await web.receive()
             if message.type is kinds.TEXT:
                 self._hear(message.data)
+                await asyncio.sleep(0)  # many may have come at once
                 await self.outbox.room()
             elif message.type is kinds.ERROR:
                 raise ConnectionError(str(web.exception() or message.data))

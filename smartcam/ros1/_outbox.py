@@ -21,6 +21,7 @@ class Lane:
     Attributes:
         dropped: messages that were not sent: no bridge, or newer ones came.
         sent: messages that were handed to the WebSocket.
+        waiting_bytes: of those that wait.
     """
 
     def __init__(self, depth: int, *, latched: bool) -> None:
@@ -28,7 +29,7 @@ class Lane:
         self.dropped = self.sent = 0
         self._depth = depth
         self._waiting: collections.deque[tuple[Part, ...]] = collections.deque()
-        self._bytes = 0
+        self.waiting_bytes = 0
         self._last: tuple[Part, ...] | None = None  # of a latched topic, for a bridge to come
 
     def __bool__(self) -> bool:
@@ -43,9 +44,9 @@ class Lane:
         if not connected:
             return
         self._waiting.append(parts)
-        self._bytes += sum(map(len, parts))
+        self.waiting_bytes += sum(map(len, parts))
         while len(self._waiting) > self._depth or (
-            self._bytes > MOST_BYTES and len(self._waiting) > 1
+            self.waiting_bytes > MOST_BYTES and len(self._waiting) > 1
         ):
             self.take()
             self.dropped += 1
@@ -53,14 +54,14 @@ class Lane:
     def take(self) -> tuple[Part, ...]:
         """Return the oldest."""
         parts = self._waiting.popleft()
-        self._bytes -= sum(map(len, parts))
+        self.waiting_bytes -= sum(map(len, parts))
         return parts
 
     def clear(self) -> None:
         """Forget what waits: the bridge is gone."""
         self.dropped += 0 if self.latched else len(self._waiting)
         self._waiting.clear()
-        self._bytes = 0
+        self.waiting_bytes = 0
 
     def say_again(self) -> None:
         """Have a latched topic's last message wait: the bridge is new."""

@@ -28,6 +28,9 @@ class Served:
         self.count = 0
         self.withdrawn = asyncio.Event()
 
+    def add(self) -> None:
+        self.count += 1
+
 
 class Bridge(Server):
     """See the module.
@@ -104,7 +107,7 @@ class Bridge(Server):
         """
         await self.until(lambda: service in self.services)
         served = self.services[service]
-        served.count += 1
+        await self._change(served.add)
         identity = f"service_request:{service}:{served.count}"
         said = {"op": "call_service", "id": identity, "service": service}
         with contextlib.suppress(ConnectionError):
@@ -114,10 +117,15 @@ class Bridge(Server):
             raise Gone
         return self.responses.pop(identity)
 
+    async def another(self, service: str, before: Served) -> None:
+        """Wait until a service is advertised again."""
+        await self.until(lambda: self.services.get(service, before) is not before)
+
     async def say(self, operation: object) -> None:
         """Say something on the first link."""
         text = operation if isinstance(operation, str) else json.dumps(operation)
-        await self.links[0].send_str(text)
+        with contextlib.suppress(ConnectionError):
+            await self.links[0].send_str(text)
 
     async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         link = web.WebSocketResponse(max_msg_size=0)
