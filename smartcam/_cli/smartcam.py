@@ -26,6 +26,7 @@ from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.running import JsonErrors
+from smartcam._cli.ros2 import ros2
 from smartcam._cli.serve import serve
 from smartcam._cli.sheet import sheet
 from smartcam._cli.terminal import counting

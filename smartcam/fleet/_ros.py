@@ -14,6 +14,7 @@ from smartcam.fleet._ros_file import RosCamera, RosSection, node_names
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
 from smartcam.ros2._context import SETTINGS, RosContext
+from smartcam.ros2._names import as_name
 from smartcam.ros2._node import Node
 from smartcam.settings import CameraSettings
 
@@ -138,8 +139,8 @@ class RosFleet(Server):
     def _options(self, name: str) -> CameraNodeOptions:
         said = self._said.get(name, RosCamera())
         return CameraNodeOptions(
-            frame_id=said.frame_id or name.replace("/", "_"),
-            parent_frame=said.parent_frame,
+            frame_id=said.frame_id or as_name(name).replace("/", "_"),
+            parent_frame=said.parent_frame or "",
             autostart=self._section.autostart,
         )
 
