@@ -37,6 +37,14 @@ ONLY_ROS2: Final = frozenset(
 )  # fmt: skip
 """Packages that ROS 1 has not, or with other fields."""
 
+_ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
+    "bool": (bool,),
+    "string": (str,),
+    "float32": (int, float),
+    "float64": (int, float),
+}
+"""What a value of JSON may be; integers where nothing is said."""
+
 _BYTES: Final = ("uint8", "char")
 _MARK: Final = secrets.token_hex(12)
 _CHUNK: Final = 3 << 16  # a multiple of three: parts of base64 make a whole
@@ -169,9 +177,13 @@ def _heard(kind: MessageType, field: Field, value: Any, where: str, depth: int) 
             ) from exc
     if field.shape and not isinstance(value, list):
         raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {value!r:.80}")
-    if field.type == "byte":
-        value = [_unsigned(one) for one in value] if field.shape else _unsigned(value)
     if not field.nested:
+        allowed = _ALLOWED.get(field.type, (int,))
+        wrong = [one for one in (value if field.shape else [value]) if type(one) not in allowed]
+        if wrong:
+            raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {wrong[0]!r:.80}")
+        if field.type == "byte":
+            return [*map(_unsigned, value)] if field.shape else _unsigned(value)
         return value
     inner = kind.nested[field.type]
     if not field.shape:
@@ -179,9 +191,8 @@ def _heard(kind: MessageType, field: Field, value: Any, where: str, depth: int) 
     return [_said(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
 
 
-def _unsigned(value: Any) -> Any:
-    is_negative = isinstance(value, int) and -128 <= value < 0  # noqa: PLR2004
-    return value + 256 if is_negative else value
+def _unsigned(value: int) -> int:
+    return value + 256 if -128 <= value < 0 else value  # noqa: PLR2004
 
 
 def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:

@@ -21,7 +21,7 @@ from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._types import RosTypes
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Iterable
+    from collections.abc import Awaitable, Callable, Coroutine
 
     from smartcam.ros1._json_messages import Part
 
@@ -82,6 +82,8 @@ class RosbridgeNode(Server):
         self._running: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
         self._new: list[RosbridgeService] = []  # that are to be advertised
+        self._leaving: list[RosbridgeService] = []  # that are to be withdrawn
+        self._changing: asyncio.Task[None] | None = None
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "status": self._told,
@@ -140,15 +142,17 @@ class RosbridgeNode(Server):
             await self._link.end()
             self._publishers.clear()
             self._services.clear()
+            self._leaving.clear()
             self._outbox = self._link.outbox = Outbox()
 
     async def _withdraw_all(self) -> None:
         with contextlib.suppress(TimeoutError):  # it does not read
             async with asyncio.timeout(FLUSH):
                 await self._outbox.flushed()
-        services = [one for one in self._services.values() if one.exists]
-        await asyncio.gather(*(one.still() for one in services))
-        await retire(self._link.url, [one.name for one in services])
+        for service in tuple(self._services.values()):
+            self.forget(service)
+        if self._changing is not None:
+            await asyncio.wait((self._changing,))
 
     # ------------------------------------------------------------------ what it has
 
@@ -199,7 +203,8 @@ class RosbridgeNode(Server):
         served = RosbridgeService(self, name, kind, handler, timeout)
         self._services[name] = served
         if self._told_absent(served.exists, name, kind.name):
-            self._advertise([served])
+            self._new.append(served)
+            self._change()
         return served
 
     def _resolved(self, name: str, what: str, there: dict[str, Any]) -> str:
@@ -232,8 +237,17 @@ class RosbridgeNode(Server):
                 self.say(encoded({"op": "unadvertise", "topic": end.name}))
             return
         del self._services[end.name]
-        if end.ready:
-            self.begin(end.withdraw())
+        end.ready = False
+        if end.exists:
+            self._leaving.append(end)
+            self._change()
+
+    def renew(self, service: RosbridgeService) -> None:
+        """Withdraw a service and advertise it again: its calls fail at their callers."""
+        service.ready = False
+        self._leaving.append(service)
+        self._new.append(service)
+        self._change()
 
     def say(self, parts: tuple[Part, ...]) -> None:
         """Say something to the bridge that is there; the next one hears all it needs by itself."""
@@ -260,7 +274,8 @@ class RosbridgeNode(Server):
                 self.say(encoded(publisher.advertisement()))
                 publisher.lane.say_again()
         self.begin(self._repeat_shared())
-        self._advertise(one for one in self._services.values() if one.exists)
+        self._new = [one for one in self._services.values() if one.exists]
+        self._change()
 
     async def _repeat_shared(self) -> None:
         within = f"{self.full_name}/"
@@ -271,18 +286,24 @@ class RosbridgeNode(Server):
                     publisher.lane.say_again()
                     self._outbox.wake()
 
-    def _advertise(self, services: Iterable[RosbridgeService]) -> None:
-        """Have services advertised, all at once that are new in this turn of the loop."""
-        if self.connected:
-            begun = bool(self._new)
-            self._new += services
-            if not begun and self._new:
-                self.begin(self._advertise_new())
+    def _change(self) -> None:
+        """Have services withdrawn and advertised: one after another, those of this turn at once."""
+        if self.connected and self._changing is None and (self._new or self._leaving):
+            self._changing = self.begin(self._change_services())
+            self._changing.add_done_callback(self._changed)
 
-    async def _advertise_new(self) -> None:
+    def _changed(self, task: asyncio.Task[None]) -> None:
+        if self._changing is task:
+            self._changing = None
+            self._change()
+
+    async def _change_services(self) -> None:
         await asyncio.sleep(0)
-        new, self._new = self._new, []
-        await retire(self._link.url, [one.name for one in new])
+        new, leaving = self._new, self._leaving
+        self._new = []
+        await asyncio.gather(*(one.still() for one in leaving))
+        await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
+        self._leaving = self._leaving[len(leaving) :]
         for service in new:
             service.advertise()
 
@@ -296,9 +317,9 @@ class RosbridgeNode(Server):
 
     async def lost(self) -> None:
         """End what was under way for a bridge that is gone."""
-        self._new.clear()
         for service in self._services.values():
             service.ready = False
+        self._new, self._changing = [], None
         tasks = [*self._tasks]
         for task in tasks:
             task.cancel()
@@ -308,6 +329,8 @@ class RosbridgeNode(Server):
     def _called(self, operation: dict[str, Any]) -> None:
         name, identity = operation.get("service"), operation.get("id")
         service = self._services.get(name) if isinstance(name, str) else None
+        if any(one.name == name for one in self._leaving):
+            return  # it fails at its caller
         if service is None:
             logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
             refusal = {"op": "service_response", "service": name, "id": identity, "result": False}

@@ -80,19 +80,11 @@ class RosbridgeService:
             self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
             self.ready = True
 
-    async def withdraw(self) -> None:
-        """Have the bridge withdraw it, so that its callers hear of it."""
-        await self.still()
-        self._say({"op": "unadvertise_service"})
-
     async def still(self) -> None:
-        """Take no more calls, end those under way, and let the bridge hand over its responses."""
-        self.ready = False
-        tasks = [one for one in self._tasks if one is not asyncio.current_task()]
-        for task in tasks:
+        """End the calls under way, and let the bridge hand over the responses that it has."""
+        for task in self._tasks:
             task.cancel()
-        if tasks:
-            await asyncio.wait(tasks)
+        await self.wait_closed()
         left = self._responded + SETTLE - asyncio.get_running_loop().time()
         if left > 0:
             await asyncio.sleep(left)
@@ -111,12 +103,12 @@ class RosbridgeService:
         try:
             parts = await self._response(identity, said, busy=busy)
         except SmartCamError as exc:
-            await self._refuse(identity, str(exc))
+            self._refuse(identity, str(exc))
         except TimeoutError:
-            await self._refuse(identity, f"no answer in {self._timeout:g} s")
+            self._refuse(identity, f"no answer in {self._timeout:g} s")
         except Exception as exc:
             logger.exception("%s ! its handler failed", self.name)
-            await self._refuse(identity, f"{type(exc).__name__}: {exc}")
+            self._refuse(identity, f"{type(exc).__name__}: {exc}")
         else:
             self._respond(parts)
 
@@ -131,7 +123,7 @@ class RosbridgeService:
             response = kind.new(**response)
         return self._encoded(identity, to_json(kind, response), result=True)
 
-    async def _refuse(self, identity: object, text: str) -> None:
+    def _refuse(self, identity: object, text: str) -> None:
         self.failed += 1
         logger.warning("%s ! %s", self.name, text)
         kind = self.type.response
@@ -142,8 +134,7 @@ class RosbridgeService:
         # A bridge takes no notice of the result and would hand over zeros: the service goes for a
         # moment, which is an error for its callers.
         self._respond(self._encoded(identity, None, result=False))
-        await self.withdraw()
-        self.advertise()
+        self._node.renew(self)
 
     def _encoded(self, identity: object, values: object, *, result: bool) -> tuple[Part, ...]:
         said = {"op": "service_response", "service": self.name, "result": result}
