@@ -47,8 +47,8 @@ class Listener(Protocol):
     def heard(self, operation: dict[str, Any]) -> None:
         """Hear an operation; never waits."""
 
-    async def lost(self) -> None:
-        """Hear that the bridge is gone."""
+    async def lost(self, was: bool) -> None:
+        """Hear that there is no bridge, and whether there was one before."""
 
 
 def checked_url(url: str) -> str:
@@ -194,17 +194,19 @@ class BridgeLink:
 
     async def _tell_lost(self, reason: str) -> bool:
         """Say that there is no link; return whether there was one."""
-        was, told_before = self.connected, self.failure
-        await self.end(f"{self.url}: {reason}")
+        told_before = self.failure
+        was = await self.end(f"{self.url}: {reason}")
         level = logging.DEBUG if told_before == self.failure else logging.WARNING
         logger.log(level, "%s: no rosbridge: %s", self.url, reason)
         return was
 
-    async def end(self, failure: str = "") -> None:
-        """Have no link, and nothing left that was for it."""
+    async def end(self, failure: str = "") -> bool:
+        """Have no link, and nothing left that was for it; return whether there was one."""
+        was = self.connected
         await self._set(connected=False, failure=failure)
         self.outbox.clear()
-        await self._listener.lost()
+        await self._listener.lost(was)
+        return was
 
     async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
         while True:

@@ -55,6 +55,7 @@ class RosbridgeNode(Server):
         types: the messages and services that are known; None for those of Jazzy. What ROS 1 has not
             is left out where it is published or served, and told in the log.
         backoff: when a bridge is tried again; None for :class:`smartcam.Backoff` as it is.
+        on_change: is told that the bridge has come or is gone; it is called in the loop.
 
     Raises:
         ConfigurationError: a name or the URL cannot be.
@@ -71,10 +72,12 @@ class RosbridgeNode(Server):
         bridge: str,
         types: RosTypes | None = None,
         backoff: Backoff | None = None,
+        on_change: Callable[[RosbridgeNode], None] = lambda _node: None,
     ) -> None:
         self.name: str = check_node(name)
         self.namespace: str = check_namespace(namespace)
         self.types: RosTypes = types or RosTypes()
+        self._on_change = on_change
         self._outbox = Outbox()
         self._link = BridgeLink(bridge, self._outbox, self, backoff or Backoff())
         self._publishers: dict[str, RosbridgePublisher] = {}
@@ -112,10 +115,9 @@ class RosbridgeNode(Server):
         """
         await self._wait(timeout, lambda: self._link.connected)
 
-    async def wait_changed(self) -> None:
-        """Wait until the bridge comes or goes, or why it is not there changes."""
-        before = self.connected, self.failure
-        await self._wait(None, lambda: (self.connected, self.failure) != before)
+    async def wait_tried(self) -> None:
+        """Wait until the bridge is there, or it is known why not."""
+        await self._wait(None, lambda: self._link.connected or bool(self._link.failure))
 
     async def _wait(self, timeout: float | None, met: Callable[[], bool]) -> None:
         async with asyncio.timeout(timeout), self._link.changed:
@@ -269,6 +271,7 @@ class RosbridgeNode(Server):
 
     def came(self) -> None:
         """Advertise everything to a new bridge."""
+        self._on_change(self)
         for publisher in self._publishers.values():
             if publisher.exists:
                 self.say(encoded(publisher.advertisement()))
@@ -315,8 +318,10 @@ class RosbridgeNode(Server):
         else:
             hear(operation)
 
-    async def lost(self) -> None:
+    async def lost(self, was: bool) -> None:
         """End what was under way for a bridge that is gone."""
+        if self._running is not None and was:
+            self._on_change(self)
         for service in self._services.values():
             service.ready = False
         self._new, self._changing = [], None

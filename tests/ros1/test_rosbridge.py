@@ -476,8 +476,6 @@ async def test_a_message_that_is_too_long(bridge: Bridge, node: RosbridgeNode) -
     await bridge.until(lambda: bridge.services)
     before = bridge.services["/line1/cam3/trigger"]
     await bridge.say(" " * (_link.LARGEST + 1))
-    await node.wait_changed()
-    assert not node.connected
     await bridge.another("/line1/cam3/trigger", before)
     assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
 
