@@ -172,7 +172,7 @@ class BridgeLink:
                 self._listener.came()
                 await self._carry(web)
         except link_errors() as exc:
-            return str(exc) or type(exc).__name__
+            return str(getattr(exc, "os_error", exc)) or type(exc).__name__
         return "it closed the link"
 
     async def _carry(self, web: aiohttp.ClientWebSocketResponse) -> None:
