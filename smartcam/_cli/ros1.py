@@ -71,7 +71,7 @@ async def _served(
     file, folder = load_fleet(path), Path(path).parent
     said = {one.name: one.entry.ros2 for one in file.plan()}
     found = {name: one.load_calibration(folder) for name, one in said.items()}
-    section = file.ros2 or RosSection()
+    section = file.ros2 or RosSection.model_validate({})
     async with FleetServer(file, folder=folder) as server:
         await server.wait_tried()
         async with bridged(
@@ -106,7 +106,8 @@ def _section(namespace: str, *, autostart: bool = True) -> Any:
     from smartcam.fleet._ros_file import RosSection
     from smartcam.ros2._names import check_namespace
 
-    return RosSection(namespace=check_namespace(namespace), autostart=autostart)
+    given = {"namespace": check_namespace(namespace), "autostart": autostart}
+    return RosSection.model_validate(given)
 
 
 def _node(node: RosbridgeNode, bridge: str) -> dict[str, Any]:

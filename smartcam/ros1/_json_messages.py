@@ -9,14 +9,15 @@ import base64
 import binascii
 import json
 import secrets
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from smartcam.exceptions import RosMessageError
 from smartcam.ros2._type_values import check
 
 if TYPE_CHECKING:
-    from smartcam.ros2._type_definitions import Field
+    from collections.abc import Mapping
+
+    from smartcam.ros2._type_definitions import MessageField
     from smartcam.ros2._types import MessageType
 
 Part: TypeAlias = "str | Raw"
@@ -98,7 +99,7 @@ def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
     return said
 
 
-def _value(kind: MessageType, field: Field, value: Any) -> Any:
+def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
     if field.nested:
         inner = kind.nested[field.type]
         return [_fields(inner, one) for one in value] if field.shape else _fields(inner, value)
@@ -116,7 +117,7 @@ def _plain(value: Any) -> Any:
 
 def _signed(value: int) -> int:
     """Return a byte as ROS 1 has it, whose ``byte`` is an int8."""
-    return value - 256 if value > 127 else int(value)  # noqa: PLR2004
+    return value - 256 if value > 127 else int(value)
 
 
 def from_json(kind: MessageType, said: Any) -> Any:
@@ -149,25 +150,21 @@ def _said(kind: MessageType, said: Any, where: str, depth: int) -> dict[str, Any
         )
     if not depth:
         raise RosMessageError(f"{kind.name}: {where}: nested too deep")
-    ours = {new: old for old, new in RENAMED.get(kind.name, {}).items()}
-    only = ONLY_ROS1.get(kind.name, {})
-    fields = {field.name: field for field in kind.fields}
+    names, only = RENAMED.get(kind.name, {}), ONLY_ROS1.get(kind.name, {})
+    fields = {names.get(field.name, field.name): field for field in kind.fields}
     found = dict[str, Any]()
     for name, value in said.items():
         if name in only:
             continue
-        field = fields.get(ours.get(name, name))
-        if field is None or (name in RENAMED.get(kind.name, {})):
-            expected = [*fields, *only]
-            expected = [RENAMED.get(kind.name, {}).get(one, one) for one in expected]
-            raise RosMessageError(
-                f"{kind.name}: {where}{name}: no such field, expected {', '.join(expected) or None}"
-            )
+        field = fields.get(name)
+        if field is None:
+            expected = ", ".join((*fields, *only)) or "none"
+            raise RosMessageError(f"{kind.name}: {where}{name}: no such field, expected {expected}")
         found[field.attribute] = _heard(kind, field, value, f"{where}{name}", depth)
     return found
 
 
-def _heard(kind: MessageType, field: Field, value: Any, where: str, depth: int) -> Any:
+def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth: int) -> Any:
     if field.shape and field.type in _BYTES and isinstance(value, str):
         try:
             return base64.b64decode(value, validate=True)
@@ -179,20 +176,17 @@ def _heard(kind: MessageType, field: Field, value: Any, where: str, depth: int) 
         raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {value!r:.80}")
     if not field.nested:
         allowed = _ALLOWED.get(field.type, (int,))
-        wrong = [one for one in (value if field.shape else [value]) if type(one) not in allowed]
-        if wrong:
-            raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {wrong[0]!r:.80}")
+        values: list[Any] = value if field.shape else [value]
+        for one in values:
+            if type(one) not in allowed:
+                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {one!r:.80}")
         if field.type == "byte":
-            return [*map(_unsigned, value)] if field.shape else _unsigned(value)
-        return value
+            values = [one + 256 if -128 <= one < 0 else one for one in values]
+        return values if field.shape else values[0]
     inner = kind.nested[field.type]
     if not field.shape:
         return _said(inner, value, f"{where}.", depth - 1)
     return [_said(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
-
-
-def _unsigned(value: int) -> int:
-    return value + 256 if -128 <= value < 0 else value  # noqa: PLR2004
 
 
 def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
 from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.ros1._json_messages import Part, Raw
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     import aiohttp
 
     from smartcam.backoff import Backoff
+    from smartcam.ros1._json_messages import Part
     from smartcam.ros1._outbox import Outbox
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
@@ -38,7 +38,7 @@ LARGEST = 8 << 20
 """Bytes of a message from a bridge; a longer one ends the link."""
 
 
-class Listener(Protocol):
+class LinkListener(Protocol):
     """What hears of a link."""
 
     def came(self) -> None:
@@ -140,7 +140,7 @@ class BridgeLink:
         changed: is notified of each change of these.
     """
 
-    def __init__(self, url: str, outbox: Outbox, listener: Listener, backoff: Backoff) -> None:
+    def __init__(self, url: str, outbox: Outbox, listener: LinkListener, backoff: Backoff) -> None:
         self.url = checked_url(url)
         self.failure = ""
         self.changed = asyncio.Condition()
@@ -235,9 +235,9 @@ class BridgeLink:
     def _hear(self, text: str) -> None:
         try:
             operation = json.loads(text)
-            if not isinstance(operation, dict) or not isinstance(operation.get("op"), str):
-                raise ValueError("no object with an op")
-        except (ValueError, RecursionError) as exc:
-            logger.warning("%s: not rosbridge: %.80r (%s)", self.url, text, exc)
-            return
-        self._listener.heard(operation)
+        except (ValueError, RecursionError):
+            operation = None
+        if isinstance(operation, dict) and isinstance(operation.get("op"), str):
+            self._listener.heard(operation)
+        else:
+            logger.warning("%s: expected an operation of rosbridge, got %.80r", self.url, text)

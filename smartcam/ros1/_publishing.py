@@ -34,8 +34,7 @@ class RosbridgePublisher:
 
     @property
     def published(self) -> int:
-        """Messages that were handed to the WebSocket; the bridge does not say what became of them.
-        """
+        """Messages that were sent; the bridge does not say what became of them."""
         return self.lane.sent
 
     @property

@@ -183,7 +183,7 @@ class RosbridgeNode(Server):
         type: str,
         handler: Callable[[Any], Awaitable[Any]],
         *,
-        qos: QoS = SERVICES,  # noqa: ARG002 - ROS 1 has none
+        qos: QoS = SERVICES,
         timeout: float = HANDLER_TIMEOUT,
     ) -> RosbridgeService:
         """Serve.

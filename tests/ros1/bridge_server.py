@@ -6,29 +6,31 @@ without end, and takes no notice of a response's ``result``.
 """
 
 import base64
+import contextlib
 import hashlib
 import json
 import socketserver
 import sys
 import threading
+from typing import Any
 
-import genpy
-import roslib.message
-import rospy
+import genpy  # type: ignore[import-not-found]
+import roslib.message  # type: ignore[import-not-found]
+import rospy  # type: ignore[import-not-found]
 
 GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
-services = {}
-publishers = {}
-responses = {}
+services: dict[str, Any] = {}
+publishers: dict[str, Any] = {}
+responses: dict[str, Any] = {}
 changed = threading.Condition()
 
 
-def filled(message, said):
+def filled(message: Any, said: Any) -> Any:
     """Fill a message with what JSON says."""
     if not isinstance(said, dict):
-        raise ValueError(f"{message._type}: no object: {said!r:.60}")
-    types = dict(zip(message.__slots__, message._slot_types))
+        raise TypeError(f"{message._type}: no object: {said!r:.60}")
+    types = dict(zip(message.__slots__, message._slot_types, strict=True))
     for name, value in said.items():
         kind, now = types[name], getattr(message, name)
         if isinstance(now, genpy.rostime.TVal):
@@ -44,13 +46,10 @@ def filled(message, said):
     return message
 
 
-def said_of(value, kind=""):
+def said_of(value: Any) -> Any:
     """Return what JSON says of a message's value."""
     if isinstance(value, genpy.Message):
-        return {
-            name: said_of(getattr(value, name), kind)
-            for name, kind in zip(value.__slots__, value._slot_types)
-        }
+        return {name: said_of(getattr(value, name)) for name in value.__slots__}
     if isinstance(value, genpy.rostime.TVal):
         return {"secs": value.secs, "nsecs": value.nsecs}
     if isinstance(value, bytes):
@@ -63,12 +62,12 @@ def said_of(value, kind=""):
 class Served:
     """A service that a link has advertised."""
 
-    def __init__(self, name, kind, link):
+    def __init__(self, name: str, kind: str, link: Any) -> None:
         self.name, self.link, self.count, self.withdrawn = name, link, 0, False
         self.make = roslib.message.get_service_class(kind)
         self.server = rospy.Service(name, self.make, self.call)
 
-    def call(self, request):
+    def call(self, request: Any) -> Any:
         with changed:
             self.count += 1
             number = f"service_request:{self.name}:{self.count}"
@@ -78,7 +77,7 @@ class Served:
             changed.wait_for(lambda: number in responses or self.withdrawn)
             return None if self.withdrawn else responses.pop(number)
 
-    def withdraw(self):
+    def withdraw(self) -> Any:
         with changed:
             self.withdrawn = True
             changed.notify_all()
@@ -88,12 +87,12 @@ class Served:
 class Link(socketserver.StreamRequestHandler):
     """One WebSocket."""
 
-    def handle(self):
+    def handle(self) -> Any:
         head = b""
         while line := self.rfile.readline().strip():
             if line.lower().startswith(b"sec-websocket-key:"):
                 head = line.partition(b":")[2].strip()
-        accept = base64.b64encode(hashlib.sha1(head + GUID).digest())
+        accept = base64.b64encode(hashlib.sha1(head + GUID, usedforsecurity=False).digest())
         self.lock = threading.Lock()
         self.wfile.write(
             b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -103,9 +102,9 @@ class Link(socketserver.StreamRequestHandler):
             while (text := self.read()) is not None:
                 self.hear(json.loads(text))
         except OSError:
-            pass
+            pass  # it is gone
 
-    def read(self):
+    def read(self) -> Any:
         """Return the next text, None at the end."""
         while True:
             head = self.rfile.read(2)
@@ -117,7 +116,9 @@ class Link(socketserver.StreamRequestHandler):
             mask = self.rfile.read(4)
             data = self.rfile.read(size)
             whole = (mask * (size // 4 + 1))[:size]
-            data = (int.from_bytes(data, "big") ^ int.from_bytes(whole, "big")).to_bytes(size, "big")
+            data = (int.from_bytes(data, "big") ^ int.from_bytes(whole, "big")).to_bytes(
+                size, "big"
+            )
             if kind == 1:
                 return data
             if kind == 9:
@@ -126,7 +127,7 @@ class Link(socketserver.StreamRequestHandler):
                 self.frame(8, data)
                 return None
 
-    def frame(self, kind, data):
+    def frame(self, kind: Any, data: Any) -> Any:
         size = len(data)
         told = bytes([size]) if size < 126 else b"\x7e" + size.to_bytes(2, "big")
         if size > 0xFFFF:
@@ -134,21 +135,19 @@ class Link(socketserver.StreamRequestHandler):
         with self.lock:
             self.wfile.write(bytes([0x80 | kind]) + told + data)
 
-    def send(self, operation):
-        try:
+    def send(self, operation: Any) -> Any:
+        with contextlib.suppress(OSError, ValueError):  # it is gone: who waits for an answer waits
             self.frame(1, json.dumps(operation).encode())
-        except (OSError, ValueError):
-            pass  # it is gone; whoever waits for an answer waits
 
-    def hear(self, said):
+    def hear(self, said: Any) -> Any:
         try:
             getattr(self, "on_" + said["op"])(said)
-        except Exception as error:
-            print("bridge:", said["op"], repr(error), file=sys.stderr, flush=True)
+        except Exception as error:  # noqa: BLE001 - it goes on, and says so
+            sys.stderr.write(f"bridge: {said['op']}: {error!r}\n")
             told = {"op": "status", "level": "error", "msg": f"{said['op']}: {error!r}"}
             self.send(told)
 
-    def on_advertise(self, said):
+    def on_advertise(self, said: Any) -> Any:
         if said["topic"] not in publishers:
             make = roslib.message.get_message_class(said["type"])
             latch = said.get("latch", False)
@@ -156,35 +155,35 @@ class Link(socketserver.StreamRequestHandler):
             publishers[said["topic"]] = publisher, set()
         publishers[said["topic"]][1].add(self)
 
-    def on_unadvertise(self, said):
+    def on_unadvertise(self, said: Any) -> Any:
         publisher, links = publishers[said["topic"]]
         links.discard(self)
         if not links:
             del publishers[said["topic"]]
             publisher.unregister()
 
-    def on_publish(self, said):
+    def on_publish(self, said: Any) -> Any:
         publisher, _ = publishers[said["topic"]]
         publisher.publish(filled(publisher.data_class(), said["msg"]))
 
-    def on_advertise_service(self, said):
+    def on_advertise_service(self, said: Any) -> Any:
         there = services.pop(said["service"], None)
         if there is not None:
             there.server.shutdown("another came")
         services[said["service"]] = Served(said["service"], said["type"], self)
 
-    def on_unadvertise_service(self, said):
+    def on_unadvertise_service(self, said: Any) -> Any:
         there = services.pop(said["service"], None)
         if there is not None:
             there.withdraw()
 
-    def on_service_response(self, said):
+    def on_service_response(self, said: Any) -> Any:
         response = filled(services[said["service"]].make._response_class(), said["values"])
         with changed:
             responses[said["id"]] = response
             changed.notify_all()
 
-    def on_call_service(self, said):
+    def on_call_service(self, said: Any) -> Any:
         answer = {"op": "service_response", "id": said["id"], "service": said["service"]}
         self.send({**answer, "values": "none of its services", "result": False})
 

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -59,7 +59,7 @@ class Program:
         self._answers: dict[int, asyncio.Future[Any]] = {}
         self.lines: asyncio.Queue[str] = asyncio.Queue()
 
-    async def __aenter__(self) -> "Program":
+    async def __aenter__(self) -> Self:
         with self.log.open("a") as log:
             self.process = await asyncio.create_subprocess_exec(
                 *self._command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log,
@@ -105,7 +105,7 @@ class Proxy:
     def __init__(self) -> None:
         self._links: set[asyncio.StreamWriter] = set()
 
-    async def __aenter__(self) -> "Proxy":
+    async def __aenter__(self) -> Self:
         self._server = await asyncio.start_server(self._carry, "127.0.0.1", PROXY)
         return self
 
@@ -295,6 +295,7 @@ async def main(folder: Path, command: list[str]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
+    subprocess.run(["ip", "link", "set", "lo", "up"], check=True)  # noqa: S607
     own_bridge = [PYTHON, str(ROOT / "tests" / "ros1" / "bridge_server.py")]
-    print(json.dumps(asyncio.run(main(Path(sys.argv[1]), sys.argv[2:] or own_bridge))))
+    seen = asyncio.run(main(Path(sys.argv[1]), sys.argv[2:] or own_bridge))
+    sys.stdout.write(json.dumps(seen))

@@ -1,20 +1,21 @@
-"""A program of ROS 1, on Debian's rospy: a line of JSON on stdin is done, and answered on stdout."""
+"""A program of ROS 1, on Debian's rospy: does a line of JSON from stdin, answers on stdout."""
 
 import hashlib
 import json
 import sys
 import threading
 import time
+from typing import Any
 
-import genpy
-import roslib.message
-import rosgraph
-import rospy
+import genpy  # type: ignore[import-not-found]
+import rosgraph  # type: ignore[import-not-found]
+import roslib.message  # type: ignore[import-not-found]
+import rospy  # type: ignore[import-not-found]
 
 lock = threading.Lock()
 
 
-def said_of(value):
+def said_of(value: Any) -> Any:
     if isinstance(value, genpy.Message):
         return {name: said_of(getattr(value, name)) for name in value.__slots__}
     if isinstance(value, genpy.rostime.TVal):
@@ -26,16 +27,16 @@ def said_of(value):
     return value
 
 
-def proxy(service, kind, **options):
+def proxy(service: Any, kind: Any, **options: Any) -> Any:
     rospy.wait_for_service(service, 30)
     return rospy.ServiceProxy(service, roslib.message.get_service_class(kind), **options)
 
 
-def call(service, kind, fields):
+def call(service: Any, kind: Any, fields: Any) -> Any:
     return said_of(proxy(service, kind)(**fields))
 
 
-def sure(service, kind, fields):
+def sure(service: Any, kind: Any, fields: Any) -> Any:
     """Call until it works: a service that is advertised again fails for a moment."""
     end = time.monotonic() + 30
     while True:
@@ -46,17 +47,17 @@ def sure(service, kind, fields):
                 raise
 
 
-def get(topic, kind):
+def get(topic: Any, kind: Any) -> Any:
     make = roslib.message.get_message_class(kind)
     return said_of(rospy.wait_for_message(topic, make, 30))
 
 
-def state():
+def state() -> Any:
     publishers, _, services = rosgraph.Master("/peer").getSystemState()
     return {"topics": [one[0] for one in publishers], "services": [one[0] for one in services]}
 
 
-def median(service, kind, fields, count):
+def median(service: Any, kind: Any, fields: Any, count: Any) -> Any:
     """Return how long a call takes, milliseconds."""
     do, spent = proxy(service, kind, persistent=True), []
     for _ in range(count):
@@ -66,22 +67,30 @@ def median(service, kind, fields, count):
     return sorted(spent)[count // 2] * 1e3
 
 
-def own(service, kind):
+def own(service: Any, kind: Any) -> Any:
     """Serve with what is empty."""
     make = roslib.message.get_service_class(kind)
     rospy.Service(service, make, lambda _: make._response_class())
 
 
-DO = {"call": call, "sure": sure, "get": get, "state": state, "median": median, "own": own}
+DO: dict[str, Any] = {
+    "call": call,
+    "sure": sure,
+    "get": get,
+    "state": state,
+    "median": median,
+    "own": own,
+}
 
 
-def answer(asked):
+def answer(asked: Any) -> Any:
     try:
         said = {"ok": DO[asked["do"]](*asked["with"])}
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - it is the answer
         said = {"error": f"{type(error).__name__}: {error}"}
     with lock:
-        print(json.dumps({**said, "id": asked["id"]}), flush=True)
+        sys.stdout.write(json.dumps({**said, "id": asked["id"]}) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def test_fields_with_another_name_in_ros1() -> None:
     assert not {"k", "d", "r", "p"} & {*found}
     form = TYPES.message("sensor_msgs/msg/CameraInfo")
     assert from_json(form, found).k.tolist() == found["K"]
-    with pytest.raises(RosMessageError, match="k: no such field, expected .*D, K, R, P"):
+    with pytest.raises(RosMessageError, match=r"k: no such field, expected .*D, K, R, P"):
         from_json(form, {"k": found["K"]})
 
 
@@ -121,7 +121,7 @@ def test_names_of_types() -> None:
         ("std_msgs/msg/String", {"data": None}, "data: expected string"),
         ("std_msgs/msg/String", "a", "expected an object, got 'a'"),
         ("std_msgs/msg/String", ["a", "b"], "expected up to 1 values, got 2"),
-        ("std_msgs/msg/Empty", {"a": 1}, "a: no such field, expected None"),
+        ("std_msgs/msg/Empty", {"a": 1}, "a: no such field, expected none"),
         ("std_msgs/msg/Bool", {"data": 2}, "data: expected bool, got 2"),
         ("std_msgs/msg/Bool", {"data": "true"}, "data: expected bool"),
         ("std_msgs/msg/UInt8", {"data": 256}, "data: expected uint8, got 256"),

@@ -12,8 +12,7 @@ import pytest
 
 import smartcam
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError
-from smartcam.ros1 import RosbridgeNode
-from smartcam.ros1 import _link, _outbox, _serving
+from smartcam.ros1 import RosbridgeNode, _link, _outbox, _serving
 from smartcam.ros2 import QoS
 from tests.ros1.bridge import Bridge, Gone
 
@@ -123,7 +122,7 @@ async def test_without_a_bridge_the_last_latched_message_is_kept(bridge: Bridge)
         assert (status.heard, results.heard) == (True, False)
         with pytest.raises(TimeoutError):
             await node.wait_connected(5)
-        assert node.failure.startswith(f"{bridge.url}: Cannot connect")
+        assert node.failure.startswith(f"{bridge.url}: [Errno ")
         await bridge.start()
         await node.wait_connected(60)
         assert node.failure == ""
@@ -334,7 +333,7 @@ async def test_errors_without_a_field_for_them(bridge: Bridge, node: RosbridgeNo
         if len(others) == 3:
             await fails.wait()
             raise smartcam.TriggerError("no")
-        await asyncio.Event().wait()
+        return await never(_request)
 
     service = node.serve("~/empty", EMPTY, handler)
     assert (await bridge.call("/line1/cam3/empty"))["values"] == {}
@@ -459,7 +458,7 @@ async def test_what_is_no_operation(
     await bridge.say('{"op": "of later"}')
     node.serve("~/trigger", TRIGGER, yes)
     assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
-    assert "not rosbridge" in caplog.text
+    assert "expected an operation of rosbridge" in caplog.text
 
 
 async def test_bytes_are_of_another_mode(
@@ -509,7 +508,9 @@ async def test_answers_to_a_bridge_that_does_not_read_have_a_bound(
     "url", ["", "host:9090", "http://host:9090", "ws://", "ws://host:0", "ws://host:x", "ws://[::1"]
 )
 def test_no_url(url: str) -> None:
-    with pytest.raises(ConfigurationError, match="expected a URL such as ws://192.168.0.5:9090"):
+    with pytest.raises(
+        ConfigurationError, match=r"expected a URL such as ws://192\.168\.0\.5:9090"
+    ):
         RosbridgeNode("cam3", bridge=url)
 
 

@@ -23,7 +23,9 @@ PACKAGES = (
     "python3-diagnostic-msgs ros-std-msgs ros-geometry-msgs"
 )
 MODULES = "rosmaster, rospy, genpy, std_srvs.srv, sensor_msgs.msg, diagnostic_msgs.msg"
-ABORTED = "responded with an error: b'service cannot process request: service handler returned None'"
+ABORTED = (
+    "responded with an error: b'service cannot process request: service handler returned None'"
+)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     )
     logs = "".join(f"\n{one.name}: {one.read_text()[-3000:]}" for one in folder.glob("*.log"))
     assert done.returncode == 0, done.stderr.decode() + logs
-    return json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
 def test_topics(seen: dict[str, Any]) -> None:
