@@ -30,6 +30,8 @@ STALLED = 10.0
 """Seconds that a bridge may take to read one message."""
 GOODBYE = 1.0
 """Seconds that a bridge gets to answer a goodbye."""
+SEND_BUFFER = 1 << 17
+"""Bytes that the system keeps for a bridge that is slow: what waits there is not the newest."""
 HEARTBEAT = 10.0
 """Seconds of silence after which it is asked whether it is there; half of them to answer."""
 LIVED = 5.0
@@ -100,10 +102,12 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
                 )
         except TimeoutError:
             raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s") from None
+        peer = web.get_extra_info("socket")
+        if peer is not None:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         try:
             yield web
         finally:
-            peer = web.get_extra_info("socket")
             try:
                 async with asyncio.timeout(GOODBYE):
                     await web.close()
