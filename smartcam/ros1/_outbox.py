@@ -108,6 +108,11 @@ class Outbox:
         self._ready.clear()
         self._room.set()
 
+    @property
+    def full(self) -> bool:
+        """Whether more operations wait than should."""
+        return not self._room.is_set()
+
     async def room(self) -> None:
         """Wait while more operations wait than should."""
         await self._room.wait()
