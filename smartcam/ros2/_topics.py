@@ -34,15 +34,16 @@ LONG = 1 << 16
 MOST_WAITING = 1 << 26
 """Bytes of a topic's messages that wait to be said, or to be read."""
 
-HEARTBEAT = 0.5
-"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
-
 
 def said(message: object, fields: dict[str, Any]) -> object:
     """Return what is to be said: a message, or the fields of one."""
     if message is not None and fields:
         raise RosMessageError("expected a message or its fields, got both")
     return fields if message is None else message
+
+
+HEARTBEAT = 0.5
+"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
 
 
 class RosEnd:
@@ -66,8 +67,8 @@ class RosEnd:
         """The absolute name of the topic or service."""
         return self.entity.name
 
-    def _declare(self, how: Callable[[Any], Any]) -> ZenohDeclared:
-        declared = ZenohDeclared(self._context.zenoh).of(how)
+    def _declare(self, how: Callable[[Any], Any], *, by_dropping: bool = False) -> ZenohDeclared:
+        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).of(how)
         self._declared.append(declared)
         return declared
 
@@ -119,16 +120,20 @@ class RosPublisher(RosEnd):
         self._waiting: collections.deque[tuple[bytes, bytes]] = collections.deque()
         self._bytes = 0
         self._publisher: Any = None
+        qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
+        self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
         self._patient: Any = None  # waits for room
-        self._declare(self._make)
+        self._lane = "latched" if qos.latched else "long"
+        self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
         self._appear()
 
     def _make(self, session: Any) -> Any:
         zenoh, qos = self._context.zenoh.engine, self.entity.qos
         drop = zenoh.CongestionControl.DROP
         block = zenoh.CongestionControl.BLOCK
+        waits = qos.latched or (qos.depth is None and qos.reliable)
         how: dict[str, Any] = {
-            "congestion_control": block if qos.depth is None and qos.reliable else drop,
+            "congestion_control": block if waits else drop,
             "reliability": zenoh.Reliability.RELIABLE
             if qos.reliable
             else zenoh.Reliability.BEST_EFFORT,
@@ -180,7 +185,7 @@ class RosPublisher(RosEnd):
             raise RosError(f"{self.name}: this publisher is closed")
         self._number += 1
         attachment = Attachment(self._number, time.time_ns(), self.entity.gid).encode()
-        if len(data) <= LONG and not self._context.waits(self):
+        if self._direct and len(data) <= LONG and not self._context.waits(self):
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
             return
@@ -192,7 +197,7 @@ class RosPublisher(RosEnd):
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
-        self._context.say_later(self, self._say_next)
+        self._context.say_later(self, self._say_next, self._lane)
 
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
@@ -219,14 +224,24 @@ class RosPublisher(RosEnd):
 
     def close(self) -> None:
         """Be gone; what waits to be said is not said any more. Idempotent."""
+        if self._closed:
+            return
         super().close()
         with self._lock:
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._bytes = 0
-            patient, self._patient = self._patient, None
+        if self._context.waits(self):  # its thread may be at it, and does that when it is done
+            self._context.say_later(self, self._take_back, self._lane)
+        else:
+            self._take_back()
+
+    def _take_back(self) -> None:
+        patient, self._patient = self._patient, None
         if patient is not None:
             quietly(patient.undeclare)
+        self._publisher = None
+        self._outlet.close()
 
 
 class _Heard(NamedTuple):
@@ -263,7 +278,7 @@ class RosSubscription(RosEnd):
             overflow="drop_oldest",
             max_queue_bytes=MOST_WAITING,
         )
-        self._declare(self._make)
+        self._declare(self._make, by_dropping=entity.qos.latched)
         self._appear()
 
     def _make(self, session: Any) -> Any:
