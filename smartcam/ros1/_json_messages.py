@@ -12,7 +12,6 @@ import secrets
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from smartcam.exceptions import RosMessageError
-from smartcam.ros2._type_values import check
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -58,16 +57,14 @@ class Raw:
     __slots__ = ("data",)
 
     def __init__(self, data: Any) -> None:
-        # a copy: who publishes may use the buffer again
-        self.data = data if isinstance(data, bytes) else bytes(memoryview(data).cast("B"))
+        self.data: memoryview = memoryview(data).cast("B")
 
     def __len__(self) -> int:
         return (len(self.data) + 2) // 3 * 4
 
     def chunks(self) -> list[memoryview]:
         """Return it in parts that take a moment each."""
-        whole = memoryview(self.data)
-        return [whole[start : start + _CHUNK] for start in range(0, len(whole), _CHUNK)]
+        return [self.data[start : start + _CHUNK] for start in range(0, len(self.data), _CHUNK)]
 
 
 def ros1_name(name: str) -> str | None:
@@ -77,15 +74,13 @@ def ros1_name(name: str) -> str | None:
 
 
 def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
-    """Return a message as JSON has it, with :class:`Raw` for bytes.
+    """Return a message, or the mapping of its fields, as JSON has it, with :class:`Raw` for bytes.
 
     Raises:
         RosMessageError: it is no message of this type.
     """
-    if getattr(message, "__msgtype__", None) != kind.name:
-        raise RosMessageError(f"expected a {kind.name}, got {message!r:.80}")
-    check(kind, message)
-    return _fields(kind, message)
+    # what comes back fits, and is ours: who publishes may use a buffer again
+    return _fields(kind, kind.decode(kind.encode(message)))
 
 
 def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
@@ -104,15 +99,11 @@ def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
         inner = kind.nested[field.type]
         return [_fields(inner, one) for one in value] if field.shape else _fields(inner, value)
     if not field.shape:
-        return _signed(value) if field.type == "byte" else _plain(value)
+        return _signed(value) if field.type == "byte" else value
     if field.type in _BYTES:
-        return Raw(bytes(value) if isinstance(value, (list, tuple)) else value)
+        return Raw(value)
     items = value.tolist() if hasattr(value, "tolist") else list(value)
-    return [_signed(one) for one in items] if field.type == "byte" else [*map(_plain, items)]
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if hasattr(value, "item") else value  # numpy's
+    return [_signed(one) for one in items] if field.type == "byte" else items
 
 
 def _signed(value: int) -> int:

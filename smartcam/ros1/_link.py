@@ -242,6 +242,9 @@ class BridgeLink:
         except (ValueError, RecursionError):
             operation = None
         if isinstance(operation, dict) and isinstance(operation.get("op"), str):
-            self._listener.heard(operation)
+            try:
+                self._listener.heard(operation)
+            except Exception:
+                logger.exception("%s ! %.200r", self.url, operation)  # the link goes on
         else:
             logger.warning("%s: expected an operation of rosbridge, got %.80r", self.url, text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import RosError, RosMessageError
@@ -60,12 +59,10 @@ class RosbridgePublisher:
         """
         if message is not None and fields:
             raise RosMessageError("expected a message or its fields, got both")
-        if message is None or isinstance(message, Mapping):
-            message = self.type.new(**(fields if message is None else message))
         said: dict[str, Any] = {"op": "publish", "topic": self.name}
         if self.lane.latched:
             said["latch"] = True  # or the bridge takes it for another publisher
-        said["msg"] = to_json(self.type, message)
+        said["msg"] = to_json(self.type, fields if message is None else message)
         if not self._node.has(self):
             raise RosError(f"{self.name}: this publisher is closed")
         if self.exists:

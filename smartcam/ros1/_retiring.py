@@ -12,7 +12,7 @@ import asyncio
 import json
 import logging
 import uuid
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from smartcam.ros1._link import link_errors, web_socket
 
@@ -31,6 +31,11 @@ SPARE = 5.0
 """Seconds more, for the link and for a bridge that is busy."""
 KNOWN = "/rosout/get_loggers"
 """A service that every roscore has. Its answer says that what was said before is done."""
+
+
+def question(mark: str) -> dict[str, Any]:
+    """Return what a bridge answers when it is through with all before."""
+    return {"op": "call_service", "service": KNOWN, "id": mark, "args": {}}
 
 
 async def retire(url: str, services: Sequence[str]) -> None:
@@ -64,7 +69,7 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
         ConnectionError: it is gone.
     """
     mark = f"smartcam:{uuid.uuid4()}"
-    await web.send_json({"op": "call_service", "service": KNOWN, "id": mark, "args": {}})
+    await web.send_json(question(mark))
     async for message in web:
         try:
             operation = json.loads(message.data)

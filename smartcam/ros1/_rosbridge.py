@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import uuid
 from typing import TYPE_CHECKING, Any
 
 from smartcam._server import Server
@@ -14,8 +15,8 @@ from smartcam.ros1._json_messages import encoded
 from smartcam.ros1._link import BridgeLink
 from smartcam.ros1._outbox import Outbox
 from smartcam.ros1._publishing import RosbridgePublisher
-from smartcam.ros1._retiring import retire
-from smartcam.ros1._serving import RosbridgeService
+from smartcam.ros1._retiring import question, retire
+from smartcam.ros1._serving import CLOSE_TIMEOUT, RosbridgeService
 from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
 from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._types import RosTypes
@@ -87,9 +88,11 @@ class RosbridgeNode(Server):
         self._new: list[RosbridgeService] = []  # that are to be advertised
         self._leaving: list[RosbridgeService] = []  # that are to be withdrawn
         self._changing: asyncio.Task[None] | None = None
+        self._marks: dict[str, asyncio.Event] = {}  # questions whose answer is awaited
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "status": self._told,
+            "service_response": self._answered,
         }
 
     @property
@@ -153,7 +156,7 @@ class RosbridgeNode(Server):
                 await self._outbox.flushed()
         for service in tuple(self._services.values()):
             self.forget(service)
-        if self._changing is not None:
+        while self._changing is not None:
             await asyncio.wait((self._changing,))
 
     # ------------------------------------------------------------------ what it has
@@ -239,14 +242,14 @@ class RosbridgeNode(Server):
                 self.say(encoded({"op": "unadvertise", "topic": end.name}))
             return
         del self._services[end.name]
-        end.ready = False
+        end.end_turn()
         if end.exists:
             self._leaving.append(end)
             self._change()
 
     def renew(self, service: RosbridgeService) -> None:
         """Withdraw a service and advertise it again: its calls fail at their callers."""
-        service.ready = False
+        service.end_turn()
         self._leaving.append(service)
         self._new.append(service)
         self._change()
@@ -306,9 +309,29 @@ class RosbridgeNode(Server):
         self._new = []
         await asyncio.gather(*(one.still() for one in leaving))
         await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
+        if leaving:
+            await self._read_all()
         self._leaving = self._leaving[len(leaving) :]
         for service in new:
             service.advertise()
+
+    async def _read_all(self) -> None:
+        """Wait until what the bridge has said on this link was read: calls that it has aborted."""
+        mark = f"smartcam:{uuid.uuid4()}"
+        self._marks[mark] = passed = asyncio.Event()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                self.say(encoded(question(mark)))
+                await passed.wait()
+        except TimeoutError:
+            logger.warning("%s: the bridge does not answer", self.full_name)
+        finally:
+            del self._marks[mark]
+
+    def _answered(self, operation: dict[str, Any]) -> None:
+        passed = self._marks.get(str(operation.get("id")))
+        if passed is not None:
+            passed.set()
 
     def heard(self, operation: dict[str, Any]) -> None:
         """Do what the bridge says."""
@@ -323,17 +346,20 @@ class RosbridgeNode(Server):
         if self._running is not None and was:
             self._on_change(self)
         for service in self._services.values():
-            service.ready = False
+            service.end_turn()
         self._new, self._changing = [], None
         tasks = [*self._tasks]
         for task in tasks:
             task.cancel()
         if tasks:
-            await asyncio.wait(tasks)
+            await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
 
     def _called(self, operation: dict[str, Any]) -> None:
         name, identity = operation.get("service"), operation.get("id")
-        service = self._services.get(name) if isinstance(name, str) else None
+        if not isinstance(name, str) or not isinstance(identity, str | int | None):
+            logger.warning("%s: no call: %.200r", self.full_name, operation)
+            return
+        service = self._services.get(name)
         if any(one.name == name for one in self._leaving):
             return  # it fails at its caller
         if service is None:

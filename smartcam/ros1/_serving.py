@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import RosError, SmartCamError
@@ -25,6 +24,8 @@ MOST_CALLS = 64
 SETTLE = 0.5
 """Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
 has not handed over stays, and is then the response to a later call."""
+CLOSE_TIMEOUT = 5.0
+"""Seconds for handlers that were cancelled; one that goes on is its author's."""
 ERROR_FIELDS = ("error", "message", "status_message")
 """The fields of a response that say what went wrong, the first that it has."""
 
@@ -55,6 +56,7 @@ class RosbridgeService:
         self._node, self._handler, self._timeout = node, handler, timeout
         self._tasks: set[asyncio.Task[None]] = set()
         self._responded = float("-inf")
+        self._turn = 0  # of being advertised: what was called in another one is not answered
         self._text_field = error_field(kind.response)
 
     def close(self) -> None:
@@ -80,11 +82,18 @@ class RosbridgeService:
             self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
             self.ready = True
 
+    def end_turn(self) -> None:
+        """Answer no call that came up to now: the bridge counts them from one again."""
+        self.ready = False
+        self._turn += 1
+
     async def still(self) -> None:
         """End the calls under way, and let the bridge hand over the responses that it has."""
+        self.end_turn()
         for task in self._tasks:
             task.cancel()
-        await self.wait_closed()
+        if self._tasks:
+            await asyncio.wait(tuple(self._tasks), timeout=CLOSE_TIMEOUT)
         left = self._responded + SETTLE - asyncio.get_running_loop().time()
         if left > 0:
             await asyncio.sleep(left)
@@ -100,17 +109,18 @@ class RosbridgeService:
     # ------------------------------------------------------------------ inside
 
     async def _carry_out(self, identity: object, said: object, *, busy: bool) -> None:
+        turn = self._turn
         try:
             parts = await self._response(identity, said, busy=busy)
         except SmartCamError as exc:
-            self._refuse(identity, str(exc))
+            self._refuse(turn, identity, str(exc))
         except TimeoutError:
-            self._refuse(identity, f"no answer in {self._timeout:g} s")
+            self._refuse(turn, identity, f"no answer in {self._timeout:g} s")
         except Exception as exc:
             logger.exception("%s ! its handler failed", self.name)
-            self._refuse(identity, f"{type(exc).__name__}: {exc}")
+            self._refuse(turn, identity, f"{type(exc).__name__}: {exc}")
         else:
-            self._respond(parts)
+            self._respond(turn, parts)
 
     async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
         if busy:
@@ -118,23 +128,20 @@ class RosbridgeService:
         request = from_json(self.type.request, {} if said is None else said)
         async with asyncio.timeout(self._timeout):
             response = await self._handler(request)
-        kind = self.type.response
-        if isinstance(response, Mapping):
-            response = kind.new(**response)
-        return self._encoded(identity, to_json(kind, response), result=True)
+        return self._encoded(identity, to_json(self.type.response, response), result=True)
 
-    def _refuse(self, identity: object, text: str) -> None:
+    def _refuse(self, turn: int, identity: object, text: str) -> None:
         self.failed += 1
         logger.warning("%s ! %s", self.name, text)
         kind = self.type.response
         if self._text_field:
-            values = to_json(kind, kind.new(**{self._text_field: text}))
-            self._respond(self._encoded(identity, values, result=False))
-            return
-        # A bridge takes no notice of the result and would hand over zeros: the service goes for a
-        # moment, which is an error for its callers.
-        self._respond(self._encoded(identity, None, result=False))
-        self._node.renew(self)
+            values = to_json(kind, {self._text_field: text})
+            self._respond(turn, self._encoded(identity, values, result=False))
+        elif turn == self._turn:
+            # A bridge takes no notice of the result and would hand over zeros: the service goes for
+            # a moment, which is an error for its callers.
+            self._respond(turn, self._encoded(identity, None, result=False))
+            self._node.renew(self)
 
     def _encoded(self, identity: object, values: object, *, result: bool) -> tuple[Part, ...]:
         said = {"op": "service_response", "service": self.name, "result": result}
@@ -144,9 +151,10 @@ class RosbridgeService:
             said["values"] = values
         return encoded(said)
 
-    def _respond(self, parts: tuple[Part, ...]) -> None:
-        self._responded = asyncio.get_running_loop().time()
-        self._node.say(parts)
+    def _respond(self, turn: int, parts: tuple[Part, ...]) -> None:
+        if turn == self._turn:
+            self._responded = asyncio.get_running_loop().time()
+            self._node.say(parts)
 
     def _say(self, operation: dict[str, Any]) -> None:
         self._node.say(encoded({**operation, "service": self.name}))

@@ -42,6 +42,7 @@ class Bridge(Server):
         published: operations ``publish``.
         services: by name.
         reading: cleared, nothing is read.
+        late: what the first link hears at the last moment, before a question is answered.
     """
 
     def __init__(self) -> None:
@@ -51,6 +52,7 @@ class Bridge(Server):
         self.published: list[dict[str, Any]] = []
         self.services: dict[str, Served] = {}
         self.responses: dict[str, dict[str, Any]] = {}
+        self.late: dict[str, Any] | None = None
         self.changed = asyncio.Condition()
         self.reading = asyncio.Event()
         self.reading.set()
@@ -174,4 +176,6 @@ class Bridge(Server):
 
     async def _call_service(self, link: web.WebSocketResponse, said: dict[str, Any]) -> None:
         answer = {"op": "service_response", "id": said["id"], "service": said["service"]}
+        if link is self.links[0] and self.late is not None:
+            await link.send_str(json.dumps(self.late))
         await link.send_str(json.dumps({**answer, "values": "no such service", "result": False}))

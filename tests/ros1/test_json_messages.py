@@ -167,7 +167,9 @@ def test_numbers_that_json_has_not(value: float) -> None:
 
 def test_what_is_of_another_type() -> None:
     form = TYPES.message("std_msgs/msg/String")
-    with pytest.raises(RosMessageError, match="expected a std_msgs/msg/String, got 5"):
+    with pytest.raises(
+        RosMessageError, match="std_msgs/msg/String: expected a message of this type, got int"
+    ):
         to_json(form, 5)
     message = form.new()
     message.data = 5

@@ -9,6 +9,8 @@ import re
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError
@@ -105,7 +107,9 @@ async def test_no_message(node: RosbridgeNode) -> None:
         publisher.publish(data=5)
     with pytest.raises(RosMessageError, match="a message or its fields, got both"):
         publisher.publish({"data": "a"}, data="b")
-    with pytest.raises(RosMessageError, match="expected a std_msgs/msg/String"):
+    with pytest.raises(
+        RosMessageError, match="std_msgs/msg/String: expected a message of this type"
+    ):
         publisher.publish(node.types.message("std_msgs/msg/Bool").new())
     assert publisher.published == publisher.dropped == 0
 
@@ -349,6 +353,60 @@ async def test_errors_without_a_field_for_them(bridge: Bridge, node: RosbridgeNo
     assert service.failed == 1
 
 
+async def test_a_call_of_before_is_not_carried_out_afterwards(
+    bridge: Bridge, node: RosbridgeNode
+) -> None:
+    """The bridge has aborted it, and would give its answer to the call of the same number."""
+    numbers = []
+
+    async def handler(_request: Any) -> Any:
+        numbers.append(len(numbers))
+        if len(numbers) == 1:
+            raise smartcam.TriggerError("no")
+        return {}
+
+    service = node.serve("~/empty", EMPTY, handler)
+    number = f"service_request:{service.name}:1"
+    bridge.late = {"op": "call_service", "id": number, "service": service.name}
+    with pytest.raises(Gone):
+        await bridge.call(service.name)
+    assert (await bridge.call(service.name))["id"] == number
+    assert len(numbers) == 2
+
+
+async def test_a_handler_that_does_not_end_answers_nobody_afterwards(
+    bridge: Bridge, node: RosbridgeNode
+) -> None:
+    began, goes_on = [asyncio.Event(), asyncio.Event()], asyncio.Event()
+
+    async def handler(_request: Any) -> Any:
+        if not began[0].is_set():
+            began[0].set()
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                await goes_on.wait()
+                return {"message": "old"}
+        began[1].set()
+        await goes_on.wait()
+        await asyncio.sleep(1)
+        return {"message": "new"}
+
+    service = node.serve("~/trigger", TRIGGER, handler)
+    old = asyncio.create_task(bridge.call(service.name))
+    await began[0].wait()
+    before = bridge.services[service.name]
+    await bridge.cut()
+    await bridge.another(service.name, before)
+    new = asyncio.create_task(bridge.call(service.name))
+    await began[1].wait()
+    goes_on.set()
+    assert (await new)["values"]["message"] == "new"
+    with pytest.raises(Gone):
+        await old
+    assert sum(one["op"] == "service_response" for one in bridge.said) == 1
+
+
 async def test_too_many_calls(
     bridge: Bridge, node: RosbridgeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -424,9 +482,10 @@ async def test_close_a_service(bridge: Bridge, node: RosbridgeNode) -> None:
 async def test_a_call_of_what_is_not_served(
     bridge: Bridge, node: RosbridgeNode, caplog: pytest.LogCaptureFixture
 ) -> None:
-    for service in ("/other", 5, None):
+    for service in (5, None, "/other"):
         await bridge.say({"op": "call_service", "id": 7, "service": service})
-    await bridge.until(lambda: [one["op"] for one in bridge.said].count("service_response") == 3)
+    await bridge.say('{"op": "call_service", "id": NaN, "service": "/other"}')
+    await bridge.until(lambda: any(one["op"] == "service_response" for one in bridge.said))
     answer = {"op": "service_response", "service": "/other", "id": 7, "result": False}
     assert answer in bridge.said
     assert "called '/other', which it does not serve" in caplog.text
@@ -460,6 +519,39 @@ async def test_what_is_no_operation(
     node.serve("~/trigger", TRIGGER, yes)
     assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
     assert "expected an operation of rosbridge" in caplog.text
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
+    max_leaves=5,
+)
+OPERATIONS = st.fixed_dictionaries(
+    {"op": st.sampled_from(["call_service", "status", "service_response", "publish"]) | JSON},
+    optional={
+        "id": JSON,
+        "service": st.just("/line1/cam3/set") | JSON,
+        "args": st.fixed_dictionaries({"data": JSON}) | JSON,
+        "level": st.just("error") | JSON,
+        "msg": JSON,
+    },
+)
+
+
+async def test_nothing_that_a_bridge_says_ends_a_node(bridge: Bridge, node: RosbridgeNode) -> None:
+    node.serve("~/set", SET, yes)
+    await bridge.until(lambda: bridge.services)
+    said = []
+
+    @given(OPERATIONS)
+    def collect(operation: dict[str, Any]) -> None:
+        said.append(operation)
+
+    collect()
+    for operation in said:
+        await bridge.say(operation)
+    assert (await bridge.call("/line1/cam3/set", {"data": True}))["result"] is True
+    assert len(bridge.links) == 1
 
 
 async def test_bytes_are_of_another_mode(
@@ -498,7 +590,7 @@ async def test_answers_to_a_bridge_that_does_not_read_have_a_bound(
             await bridge.say({"op": "call_service", "service": service.name, "id": str(number)})
 
     calling = asyncio.create_task(call())
-    while not node._outbox.full:
+    while not node._outbox.full:  # noqa: ASYNC110 - of what nothing tells
         await asyncio.sleep(0.001)
     assert service.calls < 20
     bridge.reading.set()
