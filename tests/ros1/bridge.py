@@ -42,7 +42,7 @@ class Bridge(Server):
         published: operations ``publish``.
         services: by name.
         reading: cleared, nothing is read.
-        late: what the first link hears at the last moment, before a question is answered.
+        late: what the first link hears when another was told that all is done.
     """
 
     def __init__(self) -> None:
@@ -115,6 +115,7 @@ class Bridge(Server):
         with contextlib.suppress(ConnectionError):
             await served.link.send_str(json.dumps({**said, "args": args or {}, **more}))
         await self.until(lambda: identity in self.responses or served.withdrawn.is_set())
+        await asyncio.sleep(0.1)  # its thread wakes up
         if served.withdrawn.is_set():
             raise Gone
         return self.responses.pop(identity)
@@ -176,6 +177,6 @@ class Bridge(Server):
 
     async def _call_service(self, link: web.WebSocketResponse, said: dict[str, Any]) -> None:
         answer = {"op": "service_response", "id": said["id"], "service": said["service"]}
-        if link is self.links[0] and self.late is not None:
-            await link.send_str(json.dumps(self.late))
         await link.send_str(json.dumps({**answer, "values": "no such service", "result": False}))
+        if link is not self.links[0] and self.late is not None:
+            await self.links[0].send_str(json.dumps(self.late))

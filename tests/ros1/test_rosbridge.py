@@ -353,11 +353,32 @@ async def test_errors_without_a_field_for_them(bridge: Bridge, node: RosbridgeNo
     assert service.failed == 1
 
 
+async def test_responses_are_handed_over_before_their_service_goes(
+    bridge: Bridge, node: RosbridgeNode
+) -> None:
+    """One that the bridge has not handed over stays, for the call of the same number."""
+    numbers: list[int] = []
+
+    async def handler(_request: Any) -> Any:
+        numbers.append(len(numbers))
+        if len(numbers) == 2:
+            raise smartcam.TriggerError("no")
+        return {}
+
+    service = node.serve("~/empty", EMPTY, handler)
+    first, second = [asyncio.create_task(bridge.call(service.name)) for _ in range(2)]
+    assert (await first)["result"] is True
+    with pytest.raises(Gone):
+        await second
+    await bridge.call(service.name)
+    assert len(numbers) == 3
+
+
 async def test_a_call_of_before_is_not_carried_out_afterwards(
     bridge: Bridge, node: RosbridgeNode
 ) -> None:
     """The bridge has aborted it, and would give its answer to the call of the same number."""
-    numbers = []
+    numbers: list[int] = []
 
     async def handler(_request: Any) -> Any:
         numbers.append(len(numbers))
