@@ -42,7 +42,7 @@ class Bridge(Server):
         published: operations ``publish``.
         services: by name.
         reading: cleared, nothing is read.
-        late: what the first link hears when another was told that all is done.
+        late: what the first link, a slow one, hears when a service has been withdrawn.
     """
 
     def __init__(self) -> None:
@@ -169,7 +169,14 @@ class Bridge(Server):
         served = self.services.pop(said["service"], None)
         if served is not None:
             served.withdrawn.set()
+            late = asyncio.create_task(self._say_late())
             await asyncio.sleep(1)
+            self._late = late
+
+    async def _say_late(self) -> None:
+        if self.late is not None:
+            await asyncio.sleep(1.3)
+            await self.say(self.late)
 
     async def _service_response(self, _: web.WebSocketResponse, said: dict[str, Any]) -> None:
         if "values" in said and said["service"] in self.services:
@@ -177,6 +184,6 @@ class Bridge(Server):
 
     async def _call_service(self, link: web.WebSocketResponse, said: dict[str, Any]) -> None:
         answer = {"op": "service_response", "id": said["id"], "service": said["service"]}
+        if link is self.links[0] and self.late is not None:
+            await asyncio.sleep(0.5)
         await link.send_str(json.dumps({**answer, "values": "no such service", "result": False}))
-        if link is not self.links[0] and self.late is not None:
-            await self.links[0].send_str(json.dumps(self.late))

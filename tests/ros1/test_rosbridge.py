@@ -389,8 +389,14 @@ async def test_a_call_of_before_is_not_carried_out_afterwards(
     service = node.serve("~/empty", EMPTY, handler)
     number = f"service_request:{service.name}:1"
     bridge.late = {"op": "call_service", "id": number, "service": service.name}
+    await bridge.until(lambda: service.name in bridge.services)
+    before = bridge.services[service.name]
     with pytest.raises(Gone):
         await bridge.call(service.name)
+    await bridge.another(service.name, before)
+    await asyncio.sleep(2)
+    assert len(numbers) == 1
+    bridge.late = None
     assert (await bridge.call(service.name))["id"] == number
     assert len(numbers) == 2
 
