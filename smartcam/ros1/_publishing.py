@@ -23,12 +23,15 @@ class RosbridgePublisher:
         name: the topic's absolute name.
         type: of the messages.
         lane: what waits to be sent.
+        exists: whether ROS 1 has the type.
+        subscribed: whether anybody hears it, as far as is known.
     """
 
     def __init__(self, node: RosbridgeNode, name: str, kind: MessageType, qos: QoS) -> None:
         self.name, self.type = name, kind
         self.lane = Lane(qos.kept, latched=qos.latched)
         self.exists = ros1_name(kind.name) is not None
+        self.subscribed = True  # or it is not known
         self._node = node
 
     @property
@@ -43,8 +46,14 @@ class RosbridgePublisher:
 
     @property
     def heard(self) -> bool:
-        """Whether a message goes anywhere: the bridge is there (who subscribes it does not say)."""
-        return self.exists and (self.lane.latched or self._node.connected)
+        """Whether a message goes anywhere: the bridge is there, and nothing says that nobody hears.
+
+        Of a topic with long messages it is asked every two seconds, where rosapi answers, as it
+        does beside most bridges.
+        """
+        if not self.exists or self.lane.latched:
+            return self.exists
+        return self._node.connected and self.subscribed
 
     def publish(self, message: object = None, /, **fields: Any) -> None:
         """Publish a message; never waits.

@@ -33,9 +33,10 @@ KNOWN = "/rosout/get_loggers"
 """A service that every roscore has. Its answer says that what was said before is done."""
 
 
-def question(mark: str) -> dict[str, Any]:
-    """Return what a bridge answers when it is through with all before."""
-    return {"op": "call_service", "service": KNOWN, "id": mark, "args": {}}
+def question(service: str, arguments: dict[str, Any]) -> dict[str, Any]:
+    """Return a call, which a bridge answers when it is through with all before."""
+    mark = f"smartcam:{uuid.uuid4()}"
+    return {"op": "call_service", "service": service, "id": mark, "args": arguments}
 
 
 async def retire(url: str, services: Sequence[str]) -> None:
@@ -68,13 +69,13 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
     Raises:
         ConnectionError: it is gone.
     """
-    mark = f"smartcam:{uuid.uuid4()}"
-    await web.send_json(question(mark))
+    asked = question(KNOWN, {})
+    await web.send_json(asked)
     async for message in web:
         try:
             operation = json.loads(message.data)
         except (ValueError, TypeError, RecursionError):
             continue
-        if isinstance(operation, dict) and operation.get("id") == mark:
+        if isinstance(operation, dict) and operation.get("id") == asked["id"]:
             return
     raise ConnectionError("it closed the link")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import uuid
 from typing import TYPE_CHECKING, Any
 
 from smartcam._server import Server
@@ -15,8 +14,9 @@ from smartcam.ros1._json_messages import encoded
 from smartcam.ros1._link import BridgeLink
 from smartcam.ros1._outbox import Outbox
 from smartcam.ros1._publishing import RosbridgePublisher
-from smartcam.ros1._retiring import question, retire
+from smartcam.ros1._retiring import KNOWN, question, retire
 from smartcam.ros1._serving import CLOSE_TIMEOUT, RosbridgeService
+from smartcam.ros1._subscribers import listen_for_subscribers
 from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
 from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._types import RosTypes
@@ -32,6 +32,8 @@ HANDLER_TIMEOUT = 600.0
 """Seconds that a service's handler may take."""
 FLUSH = 1.0
 """Seconds at the end for what waits to be sent."""
+ASK_TIMEOUT = 5.0
+"""Seconds for the answer to a call of ours."""
 REPEAT = 10.0
 """Seconds between two sayings of what is latched on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
@@ -88,7 +90,7 @@ class RosbridgeNode(Server):
         self._new: list[RosbridgeService] = []  # that are to be advertised
         self._leaving: list[RosbridgeService] = []  # that are to be withdrawn
         self._changing: asyncio.Task[None] | None = None
-        self._marks: dict[str, asyncio.Event] = {}  # questions whose answer is awaited
+        self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
             "status": self._told,
@@ -280,6 +282,7 @@ class RosbridgeNode(Server):
                 self.say(encoded(publisher.advertisement()))
                 publisher.lane.say_again()
         self.begin(self._repeat_shared())
+        self.begin(listen_for_subscribers(self, self._publishers))
         self._new = [one for one in self._services.values() if one.exists]
         self._change()
 
@@ -309,29 +312,33 @@ class RosbridgeNode(Server):
         self._new = []
         await asyncio.gather(*(one.still() for one in leaving))
         await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
-        if leaving:
-            await self._read_all()
+        if leaving:  # what the bridge has said before: calls that it has aborted
+            await self.ask(KNOWN, {})
         self._leaving = self._leaving[len(leaving) :]
         for service in new:
             service.advertise()
 
-    async def _read_all(self) -> None:
-        """Wait until what the bridge has said on this link was read: calls that it has aborted."""
-        mark = f"smartcam:{uuid.uuid4()}"
-        self._marks[mark] = passed = asyncio.Event()
+    async def ask(self, service: str, arguments: dict[str, Any]) -> dict[str, Any] | None:
+        """Call a service of ROS 1: what the bridge says then, None where it says nothing in time.
+
+        All that it said before was heard by then.
+        """
+        asked = question(service, arguments)
+        answer = self._asked[asked["id"]] = asyncio.get_running_loop().create_future()
         try:
-            async with asyncio.timeout(CLOSE_TIMEOUT):
-                self.say(encoded(question(mark)))
-                await passed.wait()
+            async with asyncio.timeout(ASK_TIMEOUT):
+                self.say(encoded(asked))
+                return await answer
         except TimeoutError:
-            logger.warning("%s: the bridge does not answer", self.full_name)
+            logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
+            return None
         finally:
-            del self._marks[mark]
+            del self._asked[asked["id"]]
 
     def _answered(self, operation: dict[str, Any]) -> None:
-        passed = self._marks.get(str(operation.get("id")))
-        if passed is not None:
-            passed.set()
+        answer = self._asked.get(str(operation.get("id")))
+        if answer is not None and not answer.done():
+            answer.set_result(operation)
 
     def heard(self, operation: dict[str, Any]) -> None:
         """Do what the bridge says."""

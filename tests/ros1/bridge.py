@@ -42,6 +42,7 @@ class Bridge(Server):
         published: operations ``publish``.
         services: by name.
         reading: cleared, nothing is read.
+        rosapi: what is said of a topic's subscribers.
         late: what the first link, a slow one, hears when a service has been withdrawn.
     """
 
@@ -53,6 +54,7 @@ class Bridge(Server):
         self.services: dict[str, Served] = {}
         self.responses: dict[str, dict[str, Any]] = {}
         self.late: dict[str, Any] | None = None
+        self.rosapi: Any = lambda _arguments: None
         self.changed = asyncio.Condition()
         self.reading = asyncio.Event()
         self.reading.set()
@@ -186,4 +188,6 @@ class Bridge(Server):
         answer = {"op": "service_response", "id": said["id"], "service": said["service"]}
         if link is self.links[0] and self.late is not None:
             await asyncio.sleep(0.5)
-        await link.send_str(json.dumps({**answer, "values": "no such service", "result": False}))
+        values = self.rosapi(said["args"]) if said["service"] == "/rosapi/subscribers" else None
+        values = values or {"values": "no such service", "result": False}
+        await link.send_str(json.dumps({**answer, **values}))

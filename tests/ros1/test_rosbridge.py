@@ -213,6 +213,33 @@ async def test_a_bridge_that_reads_no_more_is_left(
     await node.wait_connected(60)
 
 
+async def test_who_hears_pictures(bridge: Bridge) -> None:
+    subscribers: Any = {"values": {"subscribers": ["/viewer"]}, "result": True}
+    bridge.rosapi = lambda asked: subscribers if asked == {"topic": image.name} else None
+    async with node_of(bridge) as node:
+        image, text = node.publisher("~/image", IMAGE), node.publisher("~/text", STRING)
+        await node.wait_connected(60)
+        assert image.heard
+        assert text.heard
+        await asyncio.sleep(5)
+        assert image.heard
+        subscribers = {"values": {"subscribers": []}, "result": True}
+        await asyncio.sleep(5)
+        assert not image.heard
+        assert text.heard
+        image.publish(data=b"abc")  # it may be said all the same
+        await bridge.until(lambda: bridge.published)
+        for nothing in (None, {"values": "none", "result": False}, {"values": {}}, {}):
+            subscribers = nothing
+            await asyncio.sleep(5)
+            assert image.heard
+            subscribers = {"values": {"subscribers": []}, "result": True}
+            await bridge.restart()
+            await node.wait_connected(60)
+            await asyncio.sleep(5)
+            assert not image.heard
+
+
 async def test_what_ros1_has_not_is_left_out(
     bridge: Bridge, node: RosbridgeNode, caplog: pytest.LogCaptureFixture
 ) -> None:
