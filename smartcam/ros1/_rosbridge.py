@@ -324,7 +324,8 @@ class RosbridgeNode(Server):
         All that it said before was heard by then.
         """
         asked = question(service, arguments)
-        answer = self._asked[asked["id"]] = asyncio.get_running_loop().create_future()
+        answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._asked[asked["id"]] = answer
         try:
             async with asyncio.timeout(ASK_TIMEOUT):
                 self.say(encoded(asked))

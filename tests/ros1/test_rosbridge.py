@@ -215,7 +215,7 @@ async def test_a_bridge_that_reads_no_more_is_left(
 
 async def test_who_hears_pictures(bridge: Bridge) -> None:
     subscribers: Any = {"values": {"subscribers": ["/viewer"]}, "result": True}
-    bridge.rosapi = lambda asked: subscribers if asked == {"topic": image.name} else None
+    bridge.rosapi = lambda asked: subscribers if asked == {"topic": "/line1/cam3/image"} else None
     async with node_of(bridge) as node:
         image, text = node.publisher("~/image", IMAGE), node.publisher("~/text", STRING)
         await node.wait_connected(60)
