@@ -177,6 +177,9 @@ class BridgeLink:
                 await self._carry(web)
         except link_errors() as exc:
             return str(getattr(exc, "os_error", exc)) or type(exc).__name__
+        except Exception as exc:  # a fault of ours: the next link may do without
+            logger.exception("%s ! the link", self.url)
+            return f"{type(exc).__name__}: {exc}"
         return "it closed the link"
 
     async def _carry(self, web: aiohttp.ClientWebSocketResponse) -> None:

@@ -276,7 +276,7 @@ class RosbridgeNode(Server):
 
     def came(self) -> None:
         """Advertise everything to a new bridge."""
-        self._on_change(self)
+        self._tell_change()
         for publisher in self._publishers.values():
             if publisher.exists:
                 self.say(encoded(publisher.advertisement()))
@@ -285,6 +285,12 @@ class RosbridgeNode(Server):
         self.begin(listen_for_subscribers(self, self._publishers))
         self._new = [one for one in self._services.values() if one.exists]
         self._change()
+
+    def _tell_change(self) -> None:
+        try:
+            self._on_change(self)
+        except Exception:
+            logger.exception("%s ! who was to be told of the bridge", self.full_name)
 
     async def _repeat_shared(self) -> None:
         within = f"{self.full_name}/"
@@ -308,7 +314,7 @@ class RosbridgeNode(Server):
 
     async def _change_services(self) -> None:
         await asyncio.sleep(0)
-        new, leaving = self._new, self._leaving
+        new, leaving = self._new, [*self._leaving]
         self._new = []
         await asyncio.gather(*(one.still() for one in leaving))
         await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
@@ -352,7 +358,7 @@ class RosbridgeNode(Server):
     async def lost(self, was: bool) -> None:
         """End what was under way for a bridge that is gone."""
         if self._running is not None and was:
-            self._on_change(self)
+            self._tell_change()
         for service in self._services.values():
             service.end_turn()
         self._new, self._changing = [], None

@@ -533,6 +533,35 @@ async def test_close_a_service(bridge: Bridge, node: RosbridgeNode) -> None:
         assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
 
 
+async def test_close_services_one_after_another(bridge: Bridge, node: RosbridgeNode) -> None:
+    services = [node.serve(f"~/trigger{one}", TRIGGER, yes) for one in range(3)]
+    await bridge.until(lambda: len(bridge.services) == 3)
+    for number, service in enumerate(services, 1):  # each while the one before is withdrawn
+        service.close()
+        await bridge.until(lambda number=number: len(bridge.services) <= 3 - number)
+        again = node.serve(f"~/again{number}", TRIGGER, yes)
+        again.close()
+    await bridge.until(lambda: not bridge.services)
+    node.serve("~/last", TRIGGER, yes)
+    assert (await bridge.call("/line1/cam3/last"))["result"] is True
+    assert not node._leaving
+    assert [*bridge.services] == ["/line1/cam3/last"]
+
+
+async def test_who_is_told_of_a_bridge_may_fail(
+    bridge: Bridge, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(_node: RosbridgeNode) -> None:
+        raise ValueError("no")
+
+    async with RosbridgeNode("a", bridge=bridge.url, backoff=FAST, on_change=fails) as node:
+        node.serve("~/trigger", TRIGGER, yes)
+        assert (await bridge.call("/a/trigger"))["result"] is True
+        await bridge.restart()
+        assert (await bridge.call("/a/trigger"))["result"] is True
+    assert caplog.text.count("ValueError: no") >= 3
+
+
 async def test_a_call_of_what_is_not_served(
     bridge: Bridge, node: RosbridgeNode, caplog: pytest.LogCaptureFixture
 ) -> None:
