@@ -244,7 +244,7 @@ class RosPublisher(RosEnd):
         self._outlet.close()
 
 
-class _Heard(NamedTuple):
+class _FromTopic(NamedTuple):
     data: bytes
     attachment: Attachment
 
@@ -272,7 +272,7 @@ class RosSubscription(RosEnd):
         self.type: MessageType = kind
         self.attachment: Attachment | None = None
         self.rejected: int = 0
-        self._queue = Subscription[_Heard](
+        self._queue = Subscription[_FromTopic](
             entity.name,
             max_queue=entity.qos.kept,
             overflow="drop_oldest",
@@ -314,7 +314,7 @@ class RosSubscription(RosEnd):
         except RosMessageError as exc:
             self._reject(exc)
             return
-        self._queue.offer(_Heard(data, attachment), 0.0, len(data))
+        self._queue.offer(_FromTopic(data, attachment), 0.0, len(data))
 
     def _reject(self, why: RosMessageError) -> None:
         self.rejected += 1
