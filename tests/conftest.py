@@ -22,6 +22,7 @@ from tests.timed_loop import TimedLoop
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+settings.register_profile("few", deadline=None, max_examples=3, derandomize=True)
 settings.register_profile("quick", deadline=None, max_examples=10, derandomize=True)
 settings.register_profile("ci", deadline=None, max_examples=50, derandomize=True)
 settings.register_profile("nightly", deadline=None, max_examples=2000, print_blob=True)
