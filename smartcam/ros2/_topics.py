@@ -120,6 +120,7 @@ class RosPublisher(RosEnd):
         self._bytes = 0
         self._publisher: Any = None
         self._patient: Any = None  # waits for room
+        self._hasty: Any = None  # leaves out who has none
         self._declare(self._make)
         self._appear()
 
@@ -176,10 +177,7 @@ class RosPublisher(RosEnd):
         Raises:
             RosError: the publisher is closed.
         """
-        if self._closed:
-            raise RosError(f"{self.name}: this publisher is closed")
-        self._number += 1
-        attachment = Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+        attachment = self._attachment()
         if len(data) <= LONG and not self._context.waits(self):
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
@@ -193,6 +191,43 @@ class RosPublisher(RosEnd):
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
         self._context.say_later(self, self._say_next)
+
+    def publish_newest(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message, except to whom one is under way already; for any thread.
+
+        For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
+        that is old. It blocks for as long as the engine takes to copy the message.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+        """
+        data = self.type.encode(said(message, fields))
+        attachment = self._attachment()
+        publisher = self._publisher if len(data) <= LONG else self._hastily()
+        quietly(publisher.put, data, attachment=attachment)
+        self.published += 1
+
+    def _attachment(self) -> bytes:
+        with self._lock:
+            if self._closed:
+                raise RosError(f"{self.name}: this publisher is closed")
+            self._number += 1
+            return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+
+    def _hastily(self) -> Any:
+        """Return what publishes long messages to whom none is under way."""
+        zenoh = self._context.zenoh.engine
+        with self._lock:
+            if self._closed:
+                raise RosError(f"{self.name}: this publisher is closed")
+            if self._hasty is None:
+                self._hasty = self._context.zenoh.session.declare_publisher(
+                    self.entity.key,
+                    congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+                    priority=zenoh.Priority.DATA_LOW,
+                )
+            return self._hasty
 
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
@@ -224,9 +259,10 @@ class RosPublisher(RosEnd):
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._bytes = 0
-            patient, self._patient = self._patient, None
-        if patient is not None:
-            quietly(patient.undeclare)
+            more, self._patient, self._hasty = (self._patient, self._hasty), None, None
+        for one in more:
+            if one is not None:
+                quietly(one.undeclare)
 
 
 class _Heard(NamedTuple):

@@ -1,0 +1,121 @@
+"""A stream of pictures on a topic, while somebody hears it: the newest only."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.backoff import Backoff
+from smartcam.exceptions import FrameFormatError, FrameTimeoutError, SmartCamError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+    from contextlib import AbstractAsyncContextManager
+
+    from smartcam.frames import Frame, FrameReader
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+LOOK: Final = 0.1
+"""Seconds between two looks whether somebody hears."""
+
+AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
+"""When a source that ended is opened again, while somebody hears."""
+
+
+class PictureStream:
+    """Reads a source while one of its topics is heard, and has each frame published.
+
+    Args:
+        name: of the camera, for the log.
+        publishers: of the topics.
+        read: opens a reader whose iteration waits for so many seconds.
+        publish: publishes a frame; the next one is taken when it is done.
+
+    Attributes:
+        frames: frames that were published.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        publishers: Sequence[Any],
+        read: Callable[[float], AbstractAsyncContextManager[FrameReader]],
+        publish: Callable[[Frame], Awaitable[None]],
+    ) -> None:
+        self.frames: int = 0
+        self._name, self._publishers = name, publishers
+        self._read, self._publish = read, publish
+        self._told = ""
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begin to look whether somebody hears."""
+        if self._task is None:
+            self._task = asyncio.get_running_loop().create_task(
+                self._run(), name=f"pictures of {self._name}"
+            )
+
+    async def close(self) -> None:
+        """Read no longer. Idempotent.
+
+        Cancellation: it ends all the same.
+        """
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    @property
+    def heard(self) -> bool:
+        """Whether somebody hears one of the topics, as far as is known."""
+        return any(getattr(one, "heard", True) for one in self._publishers)
+
+    async def _run(self) -> None:
+        while True:
+            while not self.heard:
+                await asyncio.sleep(LOOK)
+            before = self.frames
+            delays = AGAIN.delays()
+            while self.heard:
+                await self._stream()
+                if self.frames > before:
+                    before, delays = self.frames, AGAIN.delays()
+                await self._pause(next(delays))
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait before the source is opened again, for as long as somebody hears."""
+        end = asyncio.get_running_loop().time() + seconds
+        while self.heard and (left := end - asyncio.get_running_loop().time()) > 0:
+            await asyncio.sleep(min(left, LOOK))
+
+    async def _stream(self) -> None:
+        """Publish until nobody hears, or the source ends."""
+        try:
+            async with self._read(LOOK) as reader:
+                while self.heard:
+                    with contextlib.suppress(FrameTimeoutError):
+                        await self._one(await anext(reader))
+        except StopAsyncIteration:
+            self._tell("the source of pictures ended; it is tried again while somebody hears")
+        except SmartCamError as exc:
+            self._tell(str(exc))
+        except Exception:
+            logger.exception("%s ! its pictures failed", self._name)
+
+    async def _one(self, frame: Frame) -> None:
+        try:
+            await self._publish(frame)
+        except FrameFormatError as exc:  # the next one may be whole
+            self._tell(str(exc))
+            return
+        self.frames += 1
+        self._told = ""
+
+    def _tell(self, text: str) -> None:
+        """Say in the log what is wrong, once until pictures come again."""
+        if text != self._told:
+            self._told = text
+            logger.warning("%s ! %s", self._name, text)
