@@ -42,7 +42,7 @@ async def serve(file: str | None, schema: bool, options: Options) -> None:
             why = "" if value["connected"] else f"  not connected: {value['reason']}"
             options.show(value, f"{value['url']}{why}")
         async for event in events:
-            _tell(server, event, options)
+            tell(server, event, options)
 
 
 def _camera(server: FleetServer, name: str) -> dict[str, Any]:
@@ -60,7 +60,7 @@ def _camera(server: FleetServer, name: str) -> dict[str, Any]:
     }
 
 
-def _tell(server: FleetServer, event: CameraEvent, options: Options) -> None:
+def tell(server: FleetServer, event: CameraEvent, options: Options) -> None:
     """Say that a camera has come, or is gone."""
     known = event.camera in server.hosts
     if not (known and isinstance(event, (Connected, Disconnected, Reconnected))):

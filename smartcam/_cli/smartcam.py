@@ -26,6 +26,7 @@ from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
 from smartcam._cli.record import pcap, record, replay
 from smartcam._cli.running import JsonErrors
+from smartcam._cli.ros2 import ros2
 from smartcam._cli.serve import serve
 from smartcam._cli.sheet import sheet
 from smartcam._cli.terminal import counting
@@ -60,7 +61,7 @@ EPILOG = (
 
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
-    "A fleet": ("serve", "fleet"),
+    "A fleet": ("serve", "fleet", "ros2"),
     "Pictures": ("frames", "depth"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
@@ -321,7 +322,7 @@ async def demo_command(
 
 for _one in (
     *(live, probe, doctor, image, decode, calibrate, sheet),
-    *(record, replay, pcap, dissector, serve, fleet, frames, depth),
+    *(record, replay, pcap, dissector, serve, fleet, ros2, frames, depth),
 ):
     command.add_command(_one)
 

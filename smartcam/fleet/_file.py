@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, cast
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -30,6 +29,7 @@ from smartcam.fleet._address import (
     check_word,
     missing_certificates,
 )
+from smartcam.fleet._ros_file import Fields, RosCamera, RosSection, node_names
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address
 
@@ -90,13 +90,7 @@ _ENDPOINTS_SCHEMA = WithJsonSchema(
 )
 
 
-class _Fields(BaseModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(
-        extra="forbid", frozen=True, hide_input_in_errors=True
-    )
-
-
-class Retry(_Fields):
+class Retry(Fields):
     """When a camera that is not there, or was lost, is tried again."""
 
     initial: float = Field(0.1, ge=0, description="the first delay, seconds")
@@ -122,7 +116,7 @@ def _or_false(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"const": False})
 
 
-class Emulated(_Fields):
+class Emulated(Fields):
     """Emulated cameras, to try a plant on a desk."""
 
     count: int = Field(1, ge=1, le=MOST_CAMERAS, description="how many")
@@ -132,7 +126,7 @@ class Emulated(_Fields):
     seed: int = Field(1, ge=0, description="of the first one's noise; each next one has one more")
 
 
-class FramesEntry(_Fields):
+class FramesEntry(Fields):
     """Where a camera's frames come from."""
 
     url: str = Field(description="v4l2:///dev/video0, rtsp://HOST/..., or a file beside this one")
@@ -199,7 +193,7 @@ def _or_url(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"type": "string"})
 
 
-class CameraEntry(_Fields):
+class CameraEntry(Fields):
     """A camera, or several emulated ones."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(
@@ -233,6 +227,9 @@ class CameraEntry(_Fields):
         description="where its pictures come from: a URL, or a mapping with more",
         json_schema_extra=_or_url,
     )
+    ros2: RosCamera = Field(
+        RosCamera.model_validate({}), description="how it is seen in ROS 2, if the fleet is"
+    )
     reconnect: Annotated[Retry | None, BeforeValidator(_never)] = Field(
         Retry.model_validate({}),
         description="when a lost camera is tried again; false: never",
@@ -257,7 +254,7 @@ class CameraEntry(_Fields):
         Raises:
             ConfigurationError: an option cannot work.
         """
-        own = {"url", "emulated", "model", "reconnect", "frames"}
+        own = {"url", "emulated", "model", "reconnect", "frames", "ros2"}
         options: dict[str, Any] = self.model_dump(exclude=own)
         reconnect = None if self.reconnect is None else self.reconnect.backoff()
         return CameraSettings.make(
@@ -265,7 +262,7 @@ class CameraEntry(_Fields):
         )
 
 
-class History(_Fields):
+class History(Fields):
     """What is kept of each camera's last results, for programs that were cut off for a while."""
 
     results: int = Field(20_000, ge=1, le=10_000_000, description="results")
@@ -300,7 +297,7 @@ def _names(schema: dict[str, Any]) -> None:
     schema["propertyNames"] = {"pattern": f"^{CHUNK}{tail}$", "maxLength": MOST_NAME}
 
 
-class FleetFile(_Fields):
+class FleetFile(Fields):
     """The cameras that one agent shares."""
 
     fleet: Word = Field("plant", description="name of the fleet; several agents may be of one")
@@ -321,6 +318,9 @@ class FleetFile(_Fields):
     )
     history: History = Field(
         History.model_validate({}), description="what is kept of each camera's last results"
+    )
+    ros2: RosSection | None = Field(
+        None, description="have the cameras seen in ROS 2; {} is enough"
     )
     cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
         description="by name, such as line1/cam3; emulated ones at a name that ends in /**",
@@ -430,6 +430,15 @@ def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
             yield place, str(exc)
         for where, text in _of_entry(name, entry, taken, folder):
             yield (*place, *where), text
+    if file.ros2 is not None:
+        yield from _of_ros(found)
+
+
+def _of_ros(found: dict[str, Planned]) -> Iterator[Mistake]:
+    try:
+        node_names([*found])
+    except ValueError as exc:
+        yield ("cameras",), str(exc)
 
 
 def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
@@ -462,6 +471,10 @@ def _of_entry(
         yield from _of_scenario(folder / entry.emulated.scenario)
     if entry.frames is not None:
         yield from _of_frames(entry.frames, folder)
+    try:
+        entry.ros2.load_calibration(folder)
+    except (SmartCamError, OSError) as exc:
+        yield ("ros2", "calibration"), str(exc)
     if entry.reconnect is not None:
         try:
             entry.reconnect.backoff()

@@ -216,6 +216,7 @@ class Fleet:
         around: what it stands on while it is open.
         timeout: seconds for coming to it.
         options: of the cameras, as :func:`smartcam.connect` takes them.
+        guest: the end of the bus is another's, which opens and closes it.
     """
 
     def __init__(
@@ -226,9 +227,11 @@ class Fleet:
         around: contextlib.AbstractAsyncContextManager[object] | None,
         timeout: float,
         options: Mapping[str, Any],
+        *,
+        guest: bool = False,
     ) -> None:
         self._address = address
-        self._program = Program(bus, fleet)
+        self._program = Program(bus, fleet, guest=guest)
         self._around, self._timeout = around, timeout
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}

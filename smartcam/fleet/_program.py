@@ -56,6 +56,7 @@ class Program:
         bus: an end of its own.
         fleet: the name of its fleet; None for the only one that has what is looked for.
         camera: what is looked for: a camera's name, or a pattern.
+        guest: the end is another's, which opens and closes it.
 
     Attributes:
         name: which no other program has; it begins with what a person would call it.
@@ -65,8 +66,11 @@ class Program:
 
     keys: Keys
 
-    def __init__(self, bus: Bus, fleet: str | None, camera: str = "**") -> None:
+    def __init__(
+        self, bus: Bus, fleet: str | None, camera: str = "**", *, guest: bool = False
+    ) -> None:
         self.bus: Bus = bus
+        self._guest = guest
         self._fleet, self._camera = fleet, camera
         self.name: str = f"{_own_name()}-{secrets.token_hex(6)}"
         self._calls = 0
@@ -82,7 +86,8 @@ class Program:
             ConfigurationError: there are several.
         """
         deadline = asyncio.get_running_loop().time() + timeout
-        await self.bus.open(timeout)
+        if not self._guest:
+            await self.bus.open(timeout)
         self.keys = Keys(self._fleet or await self._find(deadline, timeout))
         self._declared = [
             self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
@@ -122,7 +127,8 @@ class Program:
         self.frames.close()
         for handle in declared:
             handle.close()
-        await self.bus.close()
+        if not self._guest:
+            await self.bus.close()
 
     def next_call(self) -> int:
         """Return the number of the next call; each is given once."""

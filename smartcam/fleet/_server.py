@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from smartcam._server import Server
 from smartcam._zenoh import BusLink, with_ports
@@ -16,6 +16,7 @@ from smartcam.fleet._agent import Agent
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
+from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus
     from smartcam.fleet._file import Planned
     from smartcam.fleet._host import Host
+    from smartcam.fleet._ros import RosFleet
     from smartcam.settings import CameraSettings
 
 OPEN_TIMEOUT = 10.0
@@ -40,22 +42,26 @@ class FleetServer(Server):
     Args:
         file: the path of a fleet file, or what stands in one.
         bus: an end of another bus than the file says.
+        folder: that paths in it are in, where it is not a path itself.
 
     Raises:
         ConfigurationError: something in it cannot work.
         MissingExtraError: PyYAML, or the bus' engine, is not installed.
     """
 
-    def __init__(self, file: str | Path | FleetFile, *, bus: Bus | None = None) -> None:
+    def __init__(
+        self, file: str | Path | FleetFile, *, bus: Bus | None = None, folder: Path | None = None
+    ) -> None:
         self.file: FleetFile = file if isinstance(file, FleetFile) else load_fleet(file)
-        self._folder = Path() if isinstance(file, FleetFile) else Path(file).parent
+        self._folder = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
             self._plan = self.file.plan()
         except ValueError as exc:
             raise ConfigurationError(f"fleet {self.file.fleet}: {exc}") from exc
         listen, connect = self.file.endpoints
         self._listen, self._connect = listen, connect = with_ports(listen), connect
-        self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates))
+        self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
+        self._ros: RosFleet | None = None
         self._agent: Agent | None = None
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
@@ -95,11 +101,37 @@ class FleetServer(Server):
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
+            if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
+                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
             self._agent, self._stack = agent, stack.pop_all()
+
+    def _more(self) -> dict[str, Any]:
+        """Return further settings of the engine."""
+        if self.file.ros2 is None:
+            return {}
+        from smartcam.ros2._context import SETTINGS
+
+        return dict(SETTINGS)
+
+    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
+        from smartcam.fleet._ros import RosFleet
+
+        file, own = self.file, self.file.agent_name
+        said = {planned.name: planned.entry.ros2 for planned in self._plan}
+        found = {name: one.load_calibration(self._folder) for name, one in said.items()}
+        return RosFleet(
+            bus,
+            file.fleet,
+            self.address,
+            file.ros2 or RosSection(),
+            cameras=said,
+            calibrations={name: one for name, one in found.items() if one is not None},
+            wanted=lambda agent, _camera: agent == own,
+        )
 
     async def stop(self) -> None:
         """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
-        self._agent = None
+        self._agent = self._ros = None
         await self._stack.aclose()
         for stream in self._events:
             stream.end(None)
@@ -147,6 +179,11 @@ class FleetServer(Server):
     def name(self) -> str:
         """The agent's name."""
         return "" if self._agent is None else self._agent.name
+
+    @property
+    def ros_nodes(self) -> list[str]:
+        """The full names of its cameras' nodes in ROS 2, if it has any."""
+        return [] if self._ros is None else self._ros.names
 
     @property
     def hosts(self) -> dict[str, Host]:

@@ -39,6 +39,7 @@ class RosGraph:
         self._domain = domain
         self._entities: dict[str, Entity] = {}
         self._by_gid: dict[bytes, Entity] = {}
+        self._by_name: dict[tuple[str, str], dict[str, Entity]] = {}
         self._listeners: list[Callable[[Entity, bool], None]] = []
         self._declared: ZenohDeclared | None = None
         self._told = False
@@ -80,6 +81,10 @@ class RosGraph:
         if known is not None:
             del self._entities[token]
             self._by_gid.pop(known.gid, None)
+            ends = self._by_name[known.name, known.kind]
+            del ends[token]
+            if not ends:
+                del self._by_name[known.name, known.kind]
             self._tell(known, False)
             return
         try:
@@ -94,6 +99,7 @@ class RosGraph:
             return
         self._entities[token] = entity
         self._by_gid[entity.gid] = entity
+        self._by_name.setdefault((entity.name, entity.kind), {})[token] = entity
         self._tell(entity, True)
 
     def _tell(self, entity: Entity, present: bool) -> None:
@@ -132,7 +138,7 @@ class RosGraph:
             kind: ``"MP"`` who publishes, ``"MS"`` who subscribes, ``"SS"`` who serves, ``"SC"`` who
                 calls.
         """
-        return [one for one in self if one.kind == kind and one.name == name]
+        return list(self._by_name.get((name, kind), {}).values())
 
     def of_node(self, full_name: str) -> list[Entity]:
         """Return the ends of a node, as ``ros2 node info``."""

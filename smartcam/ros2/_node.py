@@ -10,6 +10,7 @@ from smartcam._zenoh import ZenohDeclared
 from smartcam.exceptions import RosError
 from smartcam.ros2._context import ROUTER, RosContext
 from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
+from smartcam.ros2._parameters import RosParameters
 from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._services import RosClient, RosService
 from smartcam.ros2._tokens import CLIENT, NODE, PUBLISHER, SERVICE, SUBSCRIPTION, Entity
@@ -50,7 +51,11 @@ class Node(Server):
         domain: the number that keeps systems apart; None for the variable ``ROS_DOMAIN_ID``.
         distribution: of ROS, whose messages are spoken: its type hashes are part of all names.
         context: what it shares with other nodes of this process, instead of these.
+        parameters: whether other nodes see its parameters, which are six services and a topic.
         open_timeout: seconds for coming to the router.
+
+    Attributes:
+        parameters: what it has of them.
 
     Raises:
         ConfigurationError: a name, domain or distribution cannot be.
@@ -67,6 +72,7 @@ class Node(Server):
         domain: int | None = None,
         distribution: str = "jazzy",
         context: RosContext | None = None,
+        parameters: bool = True,
         open_timeout: float = OPEN_TIMEOUT,
     ) -> None:
         self.name: str = check_node(name)
@@ -78,6 +84,7 @@ class Node(Server):
         self._id = 0
         self._token: ZenohDeclared | None = None
         self._ends: set[RosEnd] = set()
+        self.parameters: RosParameters = RosParameters(self, served=parameters)
 
     @property
     def full_name(self) -> str:
@@ -116,6 +123,11 @@ class Node(Server):
         except BaseException:
             await self.context.close()
             raise
+        try:
+            self.parameters.open()
+        except BaseException:
+            await self.stop()
+            raise
 
     async def stop(self) -> None:
         """Close it, with all that it publishes, hears, serves and calls. Idempotent."""
@@ -128,6 +140,7 @@ class Node(Server):
         token.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
+                await self.parameters.close()
                 for one in services:
                     await one.wait_closed()
         except TimeoutError:

@@ -20,7 +20,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.ros2._attachment import Attachment
-from smartcam.ros2._tokens import CLIENT
+from smartcam.ros2._tokens import CLIENT, SERVICE
 from smartcam.ros2._topics import RosEnd, said
 
 if TYPE_CHECKING:
@@ -185,7 +185,8 @@ class RosClient(RosEnd):
     @property
     def served(self) -> bool:
         """Whether somebody serves it, as far as is known."""
-        return not self._closed and bool(self._querier.matching_status)
+        ends = self._context.graph.ends(self.name, SERVICE)
+        return not self._closed and any(one.key == self.entity.key for one in ends)
 
     async def wait_served(self, timeout: float = 10.0) -> None:
         """Wait until somebody serves it.
@@ -199,7 +200,7 @@ class RosClient(RosEnd):
                     self._check_open()
                     await asyncio.sleep(LOOK_AGAIN)
         except TimeoutError as exc:
-            others = [one.ros_type for one in self._context.graph.ends(self.name, "SS")]
+            others = [one.ros_type for one in self._context.graph.ends(self.name, SERVICE)]
             what = f", but somebody serves {', '.join(others)}" if others else ""
             raise ServiceTimeoutError(
                 f"{self.name}: nobody serves {self.type.name} {self.type.hash} there within "

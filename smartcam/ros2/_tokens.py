@@ -21,7 +21,7 @@ ADMIN = "@ros2_lv"
 
 NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = KINDS = ("NN", "MP", "MS", "SS", "SC")
 
-_NODE_PARTS, _ENDPOINT_PARTS = 9, 13
+_NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # newer ones may name backends of buffers, too
 
 
 def pattern(domain: int) -> str:
@@ -99,10 +99,10 @@ class Entity:
         """
         parts = token.split("/")
         wanted = _NODE_PARTS if parts[5:6] == [NODE] else _ENDPOINT_PARTS
-        if len(parts) != wanted or parts[0] != ADMIN or parts[5] not in KINDS:
+        if len(parts) not in wanted or parts[0] != ADMIN or parts[5] not in KINDS:
             raise ValueError(
                 f"token {token!r:.200}: expected {ADMIN}/DOMAIN/ZID/NODE/ID/KIND/..., KIND one of "
-                f"{' '.join(KINDS)}, of {_NODE_PARTS} parts for a node and {_ENDPOINT_PARTS} else"
+                f"{' '.join(KINDS)}, of 9 parts for a node and 13 else"
             )
         domain, zid, node_id, number = int(parts[1]), parts[2], int(parts[3]), int(parts[4])
         enclave, namespace, node = (_demangled(one) for one in parts[6:9])

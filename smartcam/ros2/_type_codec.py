@@ -7,15 +7,17 @@ of the encapsulation do not count for alignment.
 
 from __future__ import annotations
 
+import functools
 import struct
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from smartcam.ros2._type_definitions import NUMBERS, Field
+from smartcam.ros2._type_definitions import NUMBERS, MessageField
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.ros2._types import MessageType
 
 Numbers: TypeAlias = "np.ndarray[Any, np.dtype[Any]]"
@@ -25,24 +27,23 @@ _FLAGS: Final = {True: 1, False: 0}
 _SIZES: Final = {code: struct.calcsize(f"<{code}") for code in "bBhHiIqQfd?"}
 
 
-class Misfit(ValueError):
+class MisfitError(ValueError):
     """Bytes or a value that do not fit; only within the room."""
 
 
-class _Run:
-    """The eight forms of a run of ``(code of struct, alignment)``."""
+@functools.lru_cache(4096)
+def _forms(parts: tuple[tuple[str, int], ...], order: str) -> tuple[struct.Struct, ...]:
+    """Return the eight forms of a run of ``(code of struct, alignment)``."""
+    return tuple(_form(parts, order, start - len(HEAD)) for start in range(8))
 
-    def __init__(self, parts: list[tuple[str, int]], order: str) -> None:
-        self.forms = tuple(self._form(parts, order, start) for start in range(8))
 
-    @staticmethod
-    def _form(parts: list[tuple[str, int]], order: str, start: int) -> struct.Struct:
-        text, place = [order], start - len(HEAD)
-        for code, alignment in parts:
-            pad = -place % alignment
-            text.append("x" * pad + code)
-            place += pad + struct.calcsize(f"<{code}")
-        return struct.Struct("".join(text))
+def _form(parts: tuple[tuple[str, int], ...], order: str, place: int) -> struct.Struct:
+    text = [order]
+    for code, alignment in parts:
+        pad = -place % alignment
+        text.append("x" * pad + code)
+        place += pad + (int(code[:-1]) if code.endswith("s") else _SIZES[code])
+    return struct.Struct("".join(text))
 
 
 class _Writer:
@@ -73,7 +74,7 @@ class _Writer:
 
     def flush(self) -> None:
         if self.run:
-            forms = self.name(_Run(self.run, self.order).forms, "R")
+            forms = self.name(_forms(tuple(self.run), self.order), "R")
             self.line(f"s = {forms}[pos & 7]")
             self.move(", ".join(self.values))
             self.line("pos += s.size")
@@ -97,24 +98,24 @@ def packed(value: Any, code: str, least: int, most: int) -> Any:
     """Return the bytes of numbers, of which there are ``least`` to ``most`` (0 is any)."""
     if isinstance(value, bytes | bytearray | memoryview):
         if code not in "bB":
-            raise Misfit(f"bytes are no numbers of {code}")
+            raise MisfitError(f"bytes are no numbers of {code}")
         data: Any = bytes(value) if least or not value else memoryview(value).cast("B")
         count = len(data)
     elif isinstance(value, np.ndarray):
         if value.ndim != 1:
-            raise Misfit(f"expected numbers in one row, got {value.shape}")
+            raise MisfitError(f"expected numbers in one row, got {value.shape}")
         count = len(value)
         array = _array(value, np.dtype(f"<{code}"))
         data = array.tobytes() if least else array.view(np.uint8)
     else:
         if isinstance(value, str | dict):
-            raise Misfit(f"expected numbers, got {type(value).__name__}")
+            raise MisfitError(f"expected numbers, got {type(value).__name__}")
         if code == "?":
             value = [_FLAGS[one] for one in value]
         data = struct.pack(f"<{len(value)}{code}", *value)
         count = len(value)
     if count < least or (most and count > most):
-        raise Misfit(f"expected {least or f'up to {most}'} numbers, got {count}")
+        raise MisfitError(f"expected {least or f'up to {most}'} numbers, got {count}")
     return data
 
 
@@ -124,14 +125,14 @@ def _array(value: Numbers, kind: np.dtype[Any]) -> Numbers:
             with np.errstate(over="ignore"):
                 cast = value.astype(kind)
             if bool(np.any(np.isinf(cast) & np.isfinite(value))):
-                raise Misfit(f"numbers out of the range of {kind}")
+                raise MisfitError(f"numbers out of the range of {kind}")
         elif kind.kind in "iu" and value.dtype.kind in "iu":
             limits = np.iinfo(kind)
             if value.size and not (limits.min <= value.min() and value.max() <= limits.max):
-                raise Misfit(f"numbers out of the range of {kind}")
+                raise MisfitError(f"numbers out of the range of {kind}")
             cast = value.astype(kind)
         else:
-            raise Misfit(f"expected an array of {kind}, got {value.dtype}")
+            raise MisfitError(f"expected an array of {kind}, got {value.dtype}")
         value = cast
     return np.ascontiguousarray(value)
 
@@ -139,22 +140,22 @@ def _array(value: Numbers, kind: np.dtype[Any]) -> Numbers:
 def text_bytes(text: str, limit: int) -> bytes:
     """Return a string's bytes with its end."""
     if not isinstance(text, str):
-        raise Misfit(f"expected a string, got {type(text).__name__}")
+        raise MisfitError(f"expected a string, got {type(text).__name__}")
     if "\0" in text:
-        raise Misfit("a string with NUL in it")
+        raise MisfitError("a string with NUL in it")
     data = text.encode()
     if limit and len(data) > limit:
-        raise Misfit(f"expected up to {limit} bytes of text, got {len(data)}")
+        raise MisfitError(f"expected up to {limit} bytes of text, got {len(data)}")
     return data + b"\0"
 
 
 def counted(value: Any, least: int, most: int) -> int:
     """Return how many messages or strings there are."""
     if not isinstance(value, list | tuple):
-        raise Misfit(f"expected a list, got {type(value).__name__}")
+        raise MisfitError(f"expected a list, got {type(value).__name__}")
     count = len(value)
     if count < least or (most and count > most):
-        raise Misfit(f"expected {least or f'up to {most}'}, got {count}")
+        raise MisfitError(f"expected {least or f'up to {most}'}, got {count}")
     return count
 
 
@@ -172,7 +173,7 @@ class _Encoder(_Writer):
         for field in kind.fields:
             self.field(kind, field, f"{value}.{field.attribute}")
 
-    def field(self, kind: MessageType, field: Field, value: str) -> None:
+    def field(self, kind: MessageType, field: MessageField, value: str) -> None:
         if field.shape:
             self.many(kind, field, value)
         elif field.nested:
@@ -191,7 +192,7 @@ class _Encoder(_Writer):
             flag = code == "?"
             self.fixed("B" if flag else code, _SIZES[code], f"F[{value}]" if flag else value)
 
-    def many(self, kind: MessageType, field: Field, value: str) -> None:
+    def many(self, kind: MessageType, field: MessageField, value: str) -> None:
         array = field.shape == "array"
         least = field.size if array else 0
         name = self.name()
@@ -204,7 +205,7 @@ class _Encoder(_Writer):
                 return
             self.fixed("I", 4, f"len({name}) // {size}")
             self.flush()
-            if size == 8:  # noqa: PLR2004
+            if size == 8:
                 self.line(f"if len({name}):")
                 self.indent += 1
                 self.fixed("0s", size, "b''")
@@ -228,7 +229,7 @@ class _Encoder(_Writer):
 
 
 def encoder(kind: MessageType) -> Callable[[Any], bytes]:
-    """Return the function that makes bytes of a message; it raises what ``struct`` does, or Misfit."""
+    """Return the function that makes bytes of a message; it raises MisfitError and others."""
     writer = _Encoder()
     writer.names["HEAD"] = HEAD
     writer.line("parts = [HEAD]")
@@ -251,21 +252,23 @@ def read_text(data: Any, start: int, size: int, limit: int) -> str:
         return ""
     end = start + size
     if end > len(data):
-        raise Misfit(f"a string of {size} bytes at {start}, where {len(data) - start} are left")
+        raise MisfitError(
+            f"a string of {size} bytes at {start}, where {len(data) - start} are left"
+        )
     text = str(data[start : end - 1], "utf-8")
     if data[end - 1] or "\0" in text:
-        raise Misfit(f"a string of {size} bytes at {start} without NUL at its end, or within")
+        raise MisfitError(f"a string of {size} bytes at {start} without NUL at its end, or within")
     if limit and size - 1 > limit:
-        raise Misfit(f"expected up to {limit} bytes of text, got {size - 1}")
+        raise MisfitError(f"expected up to {limit} bytes of text, got {size - 1}")
     return text
 
 
 def read_numbers(data: Any, start: int, count: int, kind: np.dtype[Any], most: int) -> Any:
     """Return ``count`` numbers as a view of the bytes; of the other byte order, as a copy."""
     if most and count > most:
-        raise Misfit(f"expected up to {most} numbers, got {count}")
+        raise MisfitError(f"expected up to {most} numbers, got {count}")
     if count * kind.itemsize > len(data) - start:
-        raise Misfit(
+        raise MisfitError(
             f"{count} numbers of {kind} at {start}, where {len(data) - start} bytes are left"
         )
     if not count:
@@ -276,16 +279,16 @@ def read_numbers(data: Any, start: int, count: int, kind: np.dtype[Any], most: i
 def own_numbers(array: Numbers) -> Numbers:
     """Return numbers in this machine's byte order; flags are looked at."""
     if array.dtype.kind == "b" and array.view(np.uint8).max() > 1:
-        raise Misfit("a flag is neither 0 nor 1")
+        raise MisfitError("a flag is neither 0 nor 1")
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
 def checked_count(count: int, most: int, left: int) -> int:
     """Return how many items follow, each of a byte or more."""
     if most and count > most:
-        raise Misfit(f"expected up to {most} items, got {count}")
+        raise MisfitError(f"expected up to {most} items, got {count}")
     if count > left:
-        raise Misfit(f"{count} items where {left} bytes are left")
+        raise MisfitError(f"{count} items where {left} bytes are left")
     return count
 
 
@@ -311,7 +314,7 @@ class _Decoder(_Writer):
         parts = [self.field(kind, field) for field in kind.fields]
         return f"{self.name(kind.cls, 'C')}({', '.join(parts)})"
 
-    def field(self, kind: MessageType, field: Field) -> str:
+    def field(self, kind: MessageType, field: MessageField) -> str:
         if field.shape:
             return self.many(kind, field)
         if field.nested:
@@ -329,7 +332,7 @@ class _Decoder(_Writer):
         self.fixed("B" if flag else code, _SIZES[code], name)
         return f"F[{name}]" if flag else name
 
-    def many(self, kind: MessageType, field: Field) -> str:
+    def many(self, kind: MessageType, field: MessageField) -> str:
         array = field.shape == "array"
         name, count = self.name(), self.name()
         if field.type in NUMBERS:
@@ -340,7 +343,7 @@ class _Decoder(_Writer):
                 return f"own_numbers(frombuffer({name}, {dtype}))"
             self.fixed("I", 4, count)
             self.flush()
-            if size == 8:  # noqa: PLR2004
+            if size == 8:
                 self.line(f"if {count}: pos += (4 - pos) & 7")
             self.line(f"{name} = read_numbers(data, pos, {count}, {dtype}, {field.size})")
             self.line(f"pos += {count} * {size}")

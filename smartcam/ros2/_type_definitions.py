@@ -1,10 +1,11 @@
-"""What the messages and services of ROS are made of: texts of ``.msg`` and ``.srv`` become fields."""
+"""What messages and services are made of: texts of ``.msg`` and ``.srv`` become fields."""
 
 from __future__ import annotations
 
 import ast
 import keyword
 import re
+import struct
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -18,7 +19,7 @@ INTEGERS: Final = {
 
 NUMBERS: Final = {**INTEGERS, "float32": "f", "float64": "d", "bool": "?"}
 BASES: Final = frozenset({*NUMBERS, "string"})
-_OTHER_NAMES: Final = {"char": "uint8", "octet": "byte"}
+OTHER_NAMES: Final = {"char": "uint8", "octet": "byte"}
 
 _PART = r"[a-z](?:_?[a-z0-9]+)*"
 NAME: Final = re.compile(rf"({_PART})/(msg|srv)/([A-Z][A-Za-z0-9]*)")
@@ -30,7 +31,7 @@ _FIELD: Final = re.compile(
 _OLD_NAMES: Final = {"Header": "std_msgs/msg/Header"}
 
 
-class Field(NamedTuple):
+class MessageField(NamedTuple):
     """One field: ``shape`` is "" (one value), "array" (of ``size``) or "sequence" (up to ``size``).
 
     Attributes:
@@ -64,12 +65,16 @@ class Field(NamedTuple):
         return self.type + limit + (f"[{bound}{self.size or ''}]" if self.shape else "")
 
 
+EMPTY: Final = MessageField("structure_needs_at_least_one_member", "uint8")
+"""What a message without fields has in its description and its bytes."""
+
+
 @dataclass(frozen=True, slots=True)
 class Definition:
     """A message's fields and constants."""
 
     name: str
-    fields: tuple[Field, ...]
+    fields: tuple[MessageField, ...]
     constants: dict[str, Any]
 
     def needs(self) -> set[str]:
@@ -99,7 +104,7 @@ def parse_message(name: str, text: str) -> Definition:
         ConfigurationError: its text is no message.
     """
     package = name.partition("/")[0]
-    fields: dict[str, Field] = {}
+    fields: dict[str, MessageField] = {}
     constants: dict[str, Any] = {}
     for number, line in enumerate(text.splitlines(), 1):
         said = line.strip()
@@ -125,12 +130,12 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
         ConfigurationError: its text is no service.
     """
     parts = re.split(r"(?m)^---\s*$", text)
-    if len(parts) != 2:  # noqa: PLR2004
+    if len(parts) != 2:
         raise ConfigurationError(f"{name}: expected one line --- between request and response")
     return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
 
 
-def _parse_line(package: str, line: str) -> tuple[Field, bool]:
+def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
     matched = _FIELD.fullmatch(line) or _FIELD.fullmatch(line.partition("#")[0].strip())
     if matched is None:
         raise ValueError("expected a type and a name")
@@ -142,7 +147,7 @@ def _parse_line(package: str, line: str) -> tuple[Field, bool]:
     if bound and not size:
         raise ValueError("expected how many after <=")
     shape = "" if size is None else "array" if size and not bound else "sequence"
-    field = Field(matched["name"], kind, shape, int(size or 0), limit)
+    field = MessageField(matched["name"], kind, shape, int(size or 0), limit)
     if shape == "array" and not field.size:
         raise ValueError("an array of none")
     value = matched["constant"] if matched["constant"] is not None else matched["default"]
@@ -153,7 +158,7 @@ def _parse_line(package: str, line: str) -> tuple[Field, bool]:
 
 
 def _full_name(package: str, said: str) -> str:
-    said = _OTHER_NAMES.get(said, said)
+    said = OTHER_NAMES.get(said, said)
     if said in ("wstring", "float128"):
         raise ValueError(f"{said} is not supported")
     if said in BASES:
@@ -167,7 +172,7 @@ def _full_name(package: str, said: str) -> str:
     return said
 
 
-def _value(field: Field, text: str | None, *, whole: bool) -> Any:
+def _value(field: MessageField, text: str | None, *, whole: bool) -> Any:
     """Return a constant or default; a constant's text is the ``whole`` rest of its line."""
     if text is None or not (text := text.strip()) or (not whole and text.startswith("#")):
         return None
@@ -175,12 +180,30 @@ def _value(field: Field, text: str | None, *, whole: bool) -> Any:
         quoted = re.match(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"", text)
         if quoted is None:
             return text if whole else text.partition("#")[0].strip()
-        return ast.literal_eval(quoted[0])
+        return _fitting(field, [ast.literal_eval(quoted[0])])[0]
     if field.type != "string":
         text = text.partition("#")[0].strip()
         text = re.sub(r"(?i)\btrue\b", "True", re.sub(r"(?i)\bfalse\b", "False", text))
     value = ast.literal_eval(text)
+    value = value if field.shape else [value]
     one = float if field.type.startswith("float") else bool if field.type == "bool" else None
-    if field.shape:
-        return [one(x) for x in value] if one else list(value)
-    return one(value) if one else value
+    values = [one(x) for x in value] if one else list(value)
+    return _fitting(field, values) if field.shape else _fitting(field, values)[0]
+
+
+def _fitting(field: MessageField, values: list[Any]) -> list[Any]:
+    if field.nested:
+        raise ValueError("a message has no default")
+    most = field.size or len(values)
+    if len(values) > most or (field.shape == "array" and len(values) != most):
+        raise ValueError(f"expected {field.size} values, got {len(values)}")
+    for value in values:
+        if field.type == "string":
+            if not isinstance(value, str) or (field.limit and len(value.encode()) > field.limit):
+                raise ValueError(f"{value!r:.40} is no {field.type}")
+        else:
+            try:
+                struct.pack(f"<{NUMBERS[field.type]}", value)
+            except (struct.error, OverflowError, TypeError) as exc:
+                raise ValueError(f"{value!r:.40} is no {field.type}") from exc
+    return values

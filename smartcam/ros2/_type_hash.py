@@ -10,7 +10,7 @@ import hashlib
 import json
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.ros2._type_definitions import Definition, Field
+from smartcam.ros2._type_definitions import EMPTY, Definition, MessageField
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,11 +25,9 @@ _IDS: Final = {
 }  # fmt: skip
 _BOUNDED_STRING: Final = 21
 _ARRAY, _BOUNDED, _SEQUENCE = 48, 96, 144
-EMPTY: Final = Field("structure_needs_at_least_one_member", "uint8")
-"""What a message without fields has in its description and its bytes."""
 
 
-def _field(field: Field) -> dict[str, Any]:
+def _field(field: MessageField) -> dict[str, Any]:
     number = _NESTED if field.nested else _IDS[field.type]
     if field.limit:
         number = _BOUNDED_STRING
@@ -78,9 +76,9 @@ def event_of(name: str) -> Definition:
     return Definition(
         f"{name}_Event",
         (
-            Field("info", "service_msgs/msg/ServiceEventInfo"),
-            Field("request", f"{name}_Request", "sequence", 1),
-            Field("response", f"{name}_Response", "sequence", 1),
+            MessageField("info", "service_msgs/msg/ServiceEventInfo"),
+            MessageField("request", f"{name}_Request", "sequence", 1),
+            MessageField("response", f"{name}_Response", "sequence", 1),
         ),
         {},
     )
@@ -89,5 +87,5 @@ def event_of(name: str) -> Definition:
 def service_of(name: str) -> Definition:
     """Return a service as its hash sees it."""
     parts = ("request", "response", "event")
-    fields = tuple(Field(f"{part}_message", f"{name}_{part.title()}") for part in parts)
+    fields = tuple(MessageField(f"{part}_message", f"{name}_{part.title()}") for part in parts)
     return Definition(name, fields, {})

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import functools
 import importlib
-import threading
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.ros2._type_definitions import NUMBERS, Definition, Field
+from smartcam.ros2._type_definitions import EMPTY, OTHER_NAMES, Definition, MessageField
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,12 +23,24 @@ DISTRIBUTIONS: Final = {
 
 WITHOUT_HASHES: Final = frozenset({"humble"})
 
-_DEFAULTS: Final = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
-"""What the stores leave out."""
+LACKING: Final = {
+    "humble": frozenset(
+        {
+            "rcl_interfaces/srv/GetLoggerLevels",
+            "rcl_interfaces/srv/SetLoggerLevels",
+            "type_description_interfaces/srv/GetTypeDescription",
+        }
+    )
+}
+"""Which of the texts here a distribution does not have."""
 
-_OTHER_NAMES: Final = {"char": "uint8", "octet": "byte"}
+_DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
+    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
+    ("sensor_msgs/msg/NavSatStatus", "status"): "STATUS_UNKNOWN",
+}
+"""What the stores leave out; a name is a constant's, and nothing where there is none of it."""
+
 _NAME, _ARRAY, _SEQUENCE = 2, 3, 4
-_EMPTY: Final = "structure_needs_at_least_one_member"
 
 
 @functools.cache
@@ -57,21 +68,23 @@ def stored(distribution: str) -> Mapping[str, Any]:
 
 def read_stored(name: str, said: Any) -> Definition:
     """Return what a store says of a message."""
-    constants, fields = said
-    return Definition(
-        name,
-        tuple(_field(name, one, kind) for one, kind in fields if one != _EMPTY),
-        {one: value for one, _, value in constants},
-    )
+    constants = {one: value for one, _, value in said[0]}
+    fields = []
+    for one, kind in said[1]:
+        if one != EMPTY.name:
+            default = _DEFAULTS.get((name, one))
+            if isinstance(default, str):
+                default = constants.get(default)
+            fields.append(_field(one, kind)._replace(default=default))
+    return Definition(name, tuple(fields), constants)
 
 
-def _field(message: str, name: str, said: Any) -> Field:
+def _field(name: str, said: Any) -> MessageField:
     shape, size = "", 0
     if said[0] in (_ARRAY, _SEQUENCE):
         shape = "array" if said[0] == _ARRAY else "sequence"
         said, size = said[1]
-    default = _DEFAULTS.get((message, name))
     if said[0] == _NAME:
-        return Field(name, said[1], shape, size, 0, default)
+        return MessageField(name, said[1], shape, size)
     kind, limit = said[1]
-    return Field(name, _OTHER_NAMES.get(kind, kind), shape, size, limit, default)
+    return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import operator
 import struct
 from collections.abc import Mapping
@@ -12,8 +11,8 @@ import numpy as np
 
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import RosMessageError
-from smartcam.ros2._type_codec import Misfit, counted, packed, text_bytes
-from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, Definition, Field
+from smartcam.ros2._type_codec import MisfitError, counted, packed, text_bytes
+from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, Definition, MessageField
 
 if TYPE_CHECKING:
     from smartcam.ros2._types import MessageType
@@ -53,8 +52,8 @@ def _same(one: Any, other: Any) -> bool:
 def _shown(value: Any) -> str:
     if isinstance(value, np.ndarray):
         text = ", ".join(map(str, value[:4].tolist()))
-        return f"[{text}{f', ... {len(value)}' if len(value) > 4 else ''}]"  # noqa: PLR2004
-    if isinstance(value, bytes | bytearray | memoryview) and len(value) > 16:  # noqa: PLR2004
+        return f"[{text}{f', ... {len(value)}' if len(value) > 4 else ''}]"
+    if isinstance(value, bytes | bytearray | memoryview) and len(value) > 16:
         return f"<{len(value)} bytes>"
     return repr(value)
 
@@ -79,7 +78,7 @@ def message_class(definition: Definition) -> type[RosMessage]:
     )
 
 
-def zero(kind: MessageType, field: Field) -> Any:
+def zero(kind: MessageType, field: MessageField) -> Any:
     """Return what a field is when nothing is said: its default, or zero."""
     default = field.default
     if field.shape:
@@ -99,8 +98,15 @@ def zero(kind: MessageType, field: Field) -> Any:
     return False if field.type == "bool" else 0 if field.type in INTEGERS else 0.0
 
 
-def fitting(kind: MessageType, field: Field, value: Any, where: str = "") -> Any:
+def fitting(kind: MessageType, field: MessageField, value: Any, where: str) -> Any:
     """Return a field's value as it is kept: mappings become messages.
+
+    Args:
+        kind: the type that has the field.
+        field: which.
+        value: what it is to be.
+        where: how the error text begins: type and place of the message, such as
+            ``sensor_msgs/msg/Image: header.``.
 
     Raises:
         RosMessageError: it does not fit.
@@ -114,54 +120,49 @@ def fitting(kind: MessageType, field: Field, value: Any, where: str = "") -> Any
             packed(value, NUMBERS[field.type], least, field.size)
             return value
         counted(value, least, field.size)
-    except (Misfit, struct.error, KeyError, TypeError, ValueError, OverflowError) as exc:
+    except (MisfitError, struct.error, KeyError, TypeError, ValueError, OverflowError) as exc:
         raise RosMessageError(
-            f"{kind.name}: {where}: expected {field}, got {_shown(value):.80} ({exc})"
+            f"{where}: expected {field}, got {_shown(value):.80} ({exc})"
         ) from exc
     one = field._replace(shape="", size=0, name="")
     return [fitting(kind, one, item, f"{where}[{place}]") for place, item in enumerate(value)]
 
 
-def _one(kind: MessageType, field: Field, value: Any, where: str) -> Any:
+def _one(kind: MessageType, field: MessageField, value: Any, where: str) -> Any:
     if field.nested:
         nested = kind.nested[field.type]
         if isinstance(value, Mapping):
-            return filled(nested, value, f"{where}.", kind)
+            return filled(nested, value, f"{where}.")
         if getattr(value, "__msgtype__", None) != nested.name:
-            raise Misfit(type(value).__name__)
+            raise MisfitError(f"a {type(value).__name__}")
         return value
     if field.type == "string":
         text_bytes(value, field.limit)
     elif field.type == "bool":
         if value not in (True, False):
-            raise Misfit("neither True nor False")
+            raise MisfitError("neither True nor False")
         return bool(value)
     elif field.type in INTEGERS:
-        if isinstance(value, bool):
-            raise Misfit("a flag is no number")
         value = operator.index(value)
         struct.pack(f"<{NUMBERS[field.type]}", value)
     else:
-        if isinstance(value, bool | str):
-            raise Misfit("no number")
         struct.pack(f"<{NUMBERS[field.type]}", value)
-        value = math.nan if value != value else float(value)  # noqa: PLR0124
+        value = float(value)
     return value
 
 
-def filled(
-    kind: MessageType, fields: Mapping[str, Any], where: str = "", outer: MessageType | None = None
-) -> Any:
+def filled(kind: MessageType, fields: Mapping[str, Any], where: str = "") -> Any:
     """Return a message of these fields, zero elsewhere.
 
     Raises:
         RosMessageError: a field is not of the type, or does not fit.
     """
+    where = where or f"{kind.name}: "
     known = {field.attribute: field for field in kind.fields}
     for name in fields:
         if name not in known:
             raise RosMessageError(
-                f"{(outer or kind).name}: {where}{name}: {kind.name} has no such field, expected "
+                f"{where}{name}: {kind.name} has no such field, expected "
                 f"{', '.join(known) or 'none'}{did_you_mean(str(name), known)}"
             )
     return kind.cls(
@@ -178,13 +179,14 @@ def check(kind: MessageType, message: Any, where: str = "") -> None:
     Raises:
         RosMessageError: a field is missing or does not fit.
     """
+    where = where or f"{kind.name}: "
     for field in kind.fields:
         try:
             value = getattr(message, field.attribute)
         except AttributeError:
             raise RosMessageError(
-                f"{kind.name}: {where}{field.name}: expected {field}, got none: "
-                f"{type(message).__name__} has no such field"
+                f"{where}{field.name}: expected {field}, got none: a {type(message).__name__} has "
+                "no such field"
             ) from None
         fitting(kind, field, value, where)
         if field.nested:

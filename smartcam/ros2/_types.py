@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Any, Final
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, RosMessageError
 from smartcam.ros2._definitions import MESSAGES, SERVICES
-from smartcam.ros2._type_codec import HEAD, Misfit, decoder, encoder
+from smartcam.ros2._type_codec import HEAD, MisfitError, decoder, encoder
 from smartcam.ros2._type_definitions import (
     Definition,
-    Field,
+    MessageField,
     parse_message,
     parse_service,
     split_name,
 )
 from smartcam.ros2._type_hash import NOT_SUPPORTED, event_of, service_of, type_hash
-from smartcam.ros2._type_stores import WITHOUT_HASHES, read_stored, stored
+from smartcam.ros2._type_stores import LACKING, WITHOUT_HASHES, read_stored, stored
 from smartcam.ros2._type_values import check, filled, message_class
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _ORDERS: Final = {b"\0\1": "<", b"\0\0": ">"}
 _MISFITS: Final = (
-    Misfit,
+    MisfitError,
     struct.error,
     KeyError,
     IndexError,
@@ -65,7 +65,7 @@ class MessageType:
     ) -> None:
         self.name = definition.name
         self.dds = dds_name(definition.name)
-        self.fields: tuple[Field, ...] = definition.fields
+        self.fields: tuple[MessageField, ...] = definition.fields
         self.constants = dict(definition.constants)
         self.nested = nested
         self.cls: type[RosMessage] = message_class(definition)
@@ -122,6 +122,8 @@ class MessageType:
         Raises:
             RosMessageError: the bytes are no such message, or too few, or too many.
         """
+        if not isinstance(data, bytes):
+            data = _flat(self.name, data)
         order = _ORDERS.get(bytes(data[:2]))
         if order is None or len(data) < len(HEAD):
             raise RosMessageError(
@@ -138,7 +140,7 @@ class MessageType:
                 f"{self.name}: {len(data)} bytes are no such message: {exc}"
             ) from exc
         left = len(data) - end
-        if left and (left > 3 or len(data) % 4 or any(data[end:])):  # noqa: PLR2004
+        if left and (left > 3 or len(data) % 4 or any(data[end:])):
             raise RosMessageError(
                 f"{self.name}: expected {end} bytes, got {len(data)}: {left} follow the message"
             )
@@ -155,14 +157,12 @@ class ServiceType:
         response: the type of its responses.
     """
 
-    def __init__(
-        self, name: str, request: MessageType, response: MessageType, get_hash: Callable[[], str]
-    ) -> None:
+    def __init__(self, name: str, types: RosTypes) -> None:
         self.name = name
         self.dds = dds_name(name)
-        self.request = request
-        self.response = response
-        self._get_hash = get_hash
+        self.request = types.message_of(f"{name}_Request")
+        self.response = types.message_of(f"{name}_Response")
+        self._types = types
 
     def __repr__(self) -> str:
         return f"<ServiceType {self.name}>"
@@ -170,7 +170,16 @@ class ServiceType:
     @functools.cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._get_hash()
+        return self._types.hash_of(service_of(self.name))
+
+    @functools.cached_property
+    def event(self) -> MessageType:
+        """What introspection publishes.
+
+        Raises:
+            ConfigurationError: the distribution has no introspection.
+        """
+        return self._types.message_of(f"{self.name}_Event")
 
 
 class RosTypes:
@@ -202,7 +211,8 @@ class RosTypes:
 
     def names(self) -> list[str]:
         """Return the names of all messages and services, sorted."""
-        return sorted({*self._stored, *MESSAGES, *SERVICES, *self._added})
+        lacking = LACKING.get(self.distribution, frozenset())
+        return sorted({*self._stored, *MESSAGES, *SERVICES, *self._added} - lacking)
 
     def message(self, name: str) -> MessageType:
         """Return a type of message, such as ``std_msgs/msg/String``.
@@ -213,7 +223,7 @@ class RosTypes:
         if (made := self._messages.get(name)) is not None:
             return made
         split_name(name, "msg")
-        return self._message(name)
+        return self.message_of(name)
 
     def service(self, name: str) -> ServiceType:
         """Return a type of service, such as ``std_srvs/srv/Trigger``.
@@ -226,19 +236,13 @@ class RosTypes:
         split_name(name, "srv")
         if self._shared is not None and name not in self._added:
             return self._shared.service(name)
-        text = self._added.get(name) or SERVICES.get(name)
-        if text is None:
+        if (text := self._service_text(name)) is None:
             raise self._unknown(name)
         with self._lock:
             if (made := self._services.get(name)) is None:
                 for definition in (*parse_service(name, text), event_of(name)):
                     self._definitions[definition.name] = definition
-                made = self._services[name] = ServiceType(
-                    name,
-                    self._message(f"{name}_Request"),
-                    self._message(f"{name}_Response"),
-                    functools.partial(self._hash, service_of(name)),
-                )
+                made = self._services[name] = ServiceType(name, self)
         return made
 
     def add(self, name: str, text: str) -> None:
@@ -256,7 +260,7 @@ class RosTypes:
         with self._lock:
             if name in self.names():
                 if kind == "srv":
-                    there: Any = parse(name, self._added.get(name) or SERVICES[name])
+                    there: Any = parse(name, self._service_text(name) or "")
                 else:
                     there = self.definition(name)
                 if _fields(there) != _fields(said):
@@ -287,24 +291,31 @@ class RosTypes:
             self._definitions[name] = made
         return made
 
-    def _message(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
+    def message_of(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
+        """Return a message's type; for this module, as what follows."""
         if (made := self._messages.get(name)) is not None:
             return made
         if self._shared is not None and name not in self._added and name not in self._definitions:
-            return self._shared._message(name)
+            return self._shared.message_of(name)
         if name in within:
             raise ConfigurationError(f"{name} has itself within: {' > '.join((*within, name))}")
         with self._lock:
             if (made := self._messages.get(name)) is None:
                 definition = self.definition(name)
                 nested = {
-                    one: self._message(one, (*within, name)) for one in sorted(definition.needs())
+                    one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
                 }
-                get_hash = functools.partial(self._hash, definition)
+                get_hash = functools.partial(self.hash_of, definition)
                 made = self._messages[name] = MessageType(definition, nested, get_hash)
         return made
 
-    def _hash(self, definition: Definition) -> str:
+    def _service_text(self, name: str) -> str | None:
+        if name in self._added:
+            return self._added[name]
+        return None if name in LACKING.get(self.distribution, ()) else SERVICES.get(name)
+
+    def hash_of(self, definition: Definition) -> str:
+        """Return a type's hash."""
         if self.distribution in WITHOUT_HASHES:
             return NOT_SUPPORTED
         return type_hash(definition, self.definition)
@@ -324,6 +335,14 @@ class _Shared(RosTypes):
 @functools.cache
 def _shared(distribution: str) -> _Shared:
     return _Shared(distribution)
+
+
+def _flat(name: str, data: object) -> memoryview:
+    """Return bytes of other kinds of buffers, one after the other."""
+    if not isinstance(data, bytearray | memoryview):
+        raise RosMessageError(f"{name}: expected bytes, got {type(data).__name__}")
+    view = memoryview(data)
+    return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
 
 
 def _fields(said: Any) -> Any:

@@ -1,0 +1,98 @@
+"""``smartcam ros2``: the cameras of a fleet as nodes of ROS 2."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from pydantic import ValidationError
+
+from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam.exceptions import ConfigurationError
+from smartcam.settings import is_fleet
+
+if TYPE_CHECKING:
+    from smartcam.fleet._ros_file import RosSection
+
+
+@click.command(
+    help="Have cameras seen in ROS 2, as nodes of programs that use rmw_zenoh, until Ctrl-C or "
+    'SIGTERM. A fleet file is served as by "smartcam serve", and a fleet\'s URL, fleet://HOST, '
+    "means the cameras of a fleet that is served already. Prints one line per camera, its node. "
+    'What "ros2" in a fleet file says counts where an option says nothing. Needs the extra "ros2", '
+    "and no ROS."
+)
+@click.argument("place", metavar="FLEET")
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 0xFFFFFFFF),
+    help="The domain's number; default ROS_DOMAIN_ID, or 0.",
+)
+@click.option("--namespace", help="In front of the cameras' names, such as /plant.")
+@click.option(
+    "--distribution",
+    type=click.Choice(["humble", "jazzy", "kilted", "lyrical", "rolling"]),
+    help="Of ROS, whose type hashes are spoken; default jazzy.",
+)
+@runs(*OUTPUT, interrupted=0, terminated=0)
+async def ros2(
+    place: str,
+    domain: int | None,
+    namespace: str | None,
+    distribution: str | None,
+    options: Options,
+) -> None:
+    """Have cameras seen in ROS 2."""
+    said = {"domain": domain, "namespace": namespace, "distribution": distribution}
+    given = {name: value for name, value in said.items() if value is not None}
+    if is_fleet(place):
+        await _of_fleet(place, given, options)
+    else:
+        await _served(place, given, options)
+
+
+async def _served(path: str, given: dict[str, object], options: Options) -> None:
+    from smartcam._cli.serve import tell
+    from smartcam.fleet import load_fleet
+    from smartcam.fleet._server import FleetServer
+
+    file = load_fleet(path)
+    already = {} if file.ros2 is None else file.ros2.model_dump(exclude_unset=True)
+    file = file.model_copy(update={"ros2": _section({**already, **given})})
+    async with FleetServer(file, folder=Path(path).parent) as server:
+        await server.wait_tried()
+        events = server.events()
+        _show(server.ros_nodes, server.address.url, options)
+        async for event in events:
+            tell(server, event, options)
+
+
+async def _of_fleet(url: str, given: dict[str, object], options: Options) -> None:
+    from smartcam.fleet._address import FleetAddress
+    from smartcam.fleet._ros import ros_of
+
+    address = FleetAddress.parse(url)
+    if address.camera:
+        raise ConfigurationError(
+            f"fleet address {url!r} is a camera's: expected that of the fleet, fleet://HOST[:PORT]"
+        )
+    async with ros_of(address, _section(given)) as ros:
+        _show(ros.names, address.url, options)
+        await asyncio.Event().wait()
+
+
+def _section(given: dict[str, object]) -> RosSection:
+    from smartcam.fleet._ros_file import RosSection
+
+    try:
+        return RosSection.model_validate(given)
+    except ValidationError as exc:
+        (first, *_) = exc.errors()
+        raise ConfigurationError(f"--{first['loc'][0]}: {first['msg']}") from exc
+
+
+def _show(names: list[str], url: str, options: Options) -> None:
+    for name in names:
+        options.show({"node": name, "fleet": url}, name)

@@ -1,0 +1,216 @@
+"""The services of a camera's node: the thesis' six, those of std_srvs, and a typed trigger.
+
+An error never leaves a call without a reply where the reply has a field for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.interpreters._base import resolve
+from smartcam.ros2._camera_reading import calibrated, in_pixels, localizations_in_metres
+from smartcam.ros2._camera_thesis import ManagedCamera, ThesisServices, said_spec, seconds
+from smartcam.ros2._messages import as_json, error_text, utf8
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.camera import Camera
+    from smartcam.ros2._camera_results import CameraResults
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+MOST_RESULTS: Final = 1000
+"""Results that one answer brings."""
+
+MOST_INPUT: Final = 1 << 16
+MOST_SPEC: Final = 10_000
+CLOSE_TIMEOUT: Final = 5.0
+
+
+class CameraServices:
+    """Serves a camera; calls go to it as those of any program do.
+
+    Two calls at once are as two programs': one trigger after the other, each within its own
+    timeout. A caller that goes away ends its call, and the camera stays usable.
+
+    Args:
+        camera: it.
+        node: its node.
+        results: of the camera, which are published.
+        life: the node's life cycle.
+        device_url: where the camera itself is, for a fleet's, whose own address is the fleet's.
+        publish_status: publish the status on a topic, none for an empty text; None: that cannot be.
+    """
+
+    def __init__(
+        self,
+        camera: Camera[Any],
+        node: Any,
+        results: CameraResults,
+        life: ManagedCamera,
+        *,
+        device_url: Callable[[], str | None] | None = None,
+        publish_status: Callable[[str], None] | None = None,
+    ) -> None:
+        self._camera, self._node, self._results = camera, node, results
+        self._thesis = ThesisServices(
+            camera, node, results, life, device_url=device_url, publish_status=publish_status
+        )
+        self._triggers: dict[str, Callable[[], Awaitable[str]]] = {
+            "trigger": self._trigger,
+            "start": self._start,
+            "stop": self._stop,
+            "reset_errors": self._reset_errors,
+            "reboot": self._reboot,
+        }
+        self._served: list[Any] = []
+
+    def start(self) -> None:
+        """Serve. Idempotent.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        if self._served:
+            return
+        try:
+            for name, do in self._thesis.table.items():
+                self._serve(name, f"smartcam_msgs/srv/{name}", self._in_fields(do, named=True))
+            for name, tell in self._triggers.items():
+                self._serve(name, "std_srvs/srv/Trigger", self._in_words(lambda _, do=tell: do()))
+            self._serve("run", "std_srvs/srv/SetBool", self._in_words(self._run))
+            typed = self._in_fields(self._trigger_results, named=False)
+            self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed)
+        except BaseException:
+            self._withdraw()
+            raise
+
+    async def close(self) -> None:
+        """Serve no more; calls under way are given up. Idempotent, bounded."""
+        served = self._withdraw()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                for one in served:
+                    if hasattr(one, "wait_closed"):
+                        await one.wait_closed()
+        except TimeoutError:
+            logger.warning("%s ! a call does not end", self._node.full_name)
+
+    def _withdraw(self) -> list[Any]:
+        served, self._served = self._served, []
+        for one in served:
+            one.close()
+        return served
+
+    # ------------------------------------------------------------------ errors become fields
+
+    def _serve(self, name: str, kind: str, handler: Any) -> None:
+        response = self._node.types.service(kind).response
+        errors = any(field.name == "error" for field in response.fields)
+
+        async def answer(request: Any) -> Any:
+            fields = await handler(request)
+            if not errors and fields.get("error"):
+                logger.warning("%s/%s ! %s", self._node.full_name, name, fields["error"])
+            if not errors:
+                fields.pop("error", None)
+            return response.new(**fields)
+
+        self._served.append(self._node.serve(f"~/{name}", kind, answer))
+
+    def _in_fields(
+        self, do: Callable[[Any], Awaitable[dict[str, Any]]], *, named: bool
+    ) -> Callable[[Any], Awaitable[dict[str, Any]]]:
+        """Return what answers with the fields of ``do``, or with ``error``."""
+
+        async def handler(request: Any) -> dict[str, Any]:
+            try:
+                if named:
+                    self._thesis.check_name(request.camera_name)
+                return {"error": "", **await do(request)}
+            except Exception as exc:  # noqa: BLE001 - whatever it is, the caller hears of it
+                return {"error": self._told(exc)}
+
+        return handler
+
+    def _in_words(
+        self, do: Callable[[Any], Awaitable[str]]
+    ) -> Callable[[Any], Awaitable[dict[str, Any]]]:
+        """Return what answers with ``success`` and what ``do`` says, or the error."""
+
+        async def handler(request: Any) -> dict[str, Any]:
+            try:
+                return {"success": True, "message": await do(request)}
+            except Exception as exc:  # noqa: BLE001 - whatever it is, the caller hears of it
+                return {"success": False, "message": self._told(exc)}
+
+        return handler
+
+    def _told(self, error: Exception) -> str:
+        if not isinstance(error, SmartCamError):
+            logger.error("%s ! a service failed", self._node.full_name, exc_info=error)
+            return error_text(RuntimeError(f"{type(error).__name__}: {error}"))
+        return error_text(error)
+
+    # ------------------------------------------------------------------ std_srvs
+
+    async def _trigger(self) -> str:
+        return utf8(as_json(await self._camera.trigger()))
+
+    async def _start(self) -> str:
+        await self._camera.start()
+        return ""
+
+    async def _stop(self) -> str:
+        await self._camera.stop()
+        return ""
+
+    async def _run(self, request: Any) -> str:
+        return await (self._start() if request.data else self._stop())
+
+    async def _reset_errors(self) -> str:
+        return str(await self._camera.reset_errors())
+
+    async def _reboot(self) -> str:
+        await self._camera.reboot()
+        return ""
+
+    # ------------------------------------------------------------------ typed
+
+    async def _trigger_results(self, request: Any) -> dict[str, Any]:
+        camera = self._camera
+        wanted, spec = request.results_per_trigger or 1, said_spec(request.interpret_as)
+        self._check(request, wanted, spec)
+        results = await camera.trigger(
+            request.application_id or None,
+            interpret_as=spec,
+            input=bytes(request.input) or None,
+            timeout=seconds(camera, request.timeout, DEFAULT_TRIGGER_TIMEOUT),
+            when_busy="refuse" if request.refuse_when_busy else "wait",
+            results_per_trigger=wanted,
+        )
+        make = self._results.messages.result
+        found = [make(one, localizations_in_metres(camera, one, spec)) for one in results]
+        return {"results": found}
+
+    def _check(self, request: Any, wanted: int, spec: str | None) -> None:
+        name = self._camera.name
+        for what, got, most in (
+            ("results_per_trigger", wanted, MOST_RESULTS),
+            ("bytes of input", len(request.input), MOST_INPUT),
+            ("characters of interpret_as", len(spec or ""), MOST_SPEC),
+        ):
+            if got > most:
+                raise ConfigurationError(f"{name}: {what}: expected {most} at most, got {got}")
+        if spec is not None and in_pixels(resolve(spec)):
+            application = request.application_id or self._camera.active_application or 0
+            if not calibrated(self._camera, application):
+                raise ConfigurationError(
+                    f"{name}: interpret_as {spec!r:.80}: expected lengths, since poses in ROS are "
+                    "in metres, got pixels"
+                )

@@ -1,0 +1,48 @@
+"""What tests of ROS 2 share: two nodes, with TCP between them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+from smartcam._zenoh import with_ports
+from smartcam.ros2 import Node, RosContext
+
+PATIENCE = 60.0
+"""Seconds that only a failure takes."""
+
+STRING = "std_msgs/msg/String"
+TRIGGER = "std_srvs/srv/Trigger"
+SET_BOOL = "std_srvs/srv/SetBool"
+
+
+def free_place() -> str:
+    """Return an endpoint that nobody listens on."""
+    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    return place
+
+
+@contextlib.asynccontextmanager
+async def two_nodes(**more: Any) -> AsyncIterator[tuple[Node, Node]]:
+    """Give ``/line1/cam3``, which is the router, too, and ``/viewer``, connected to it."""
+    place = free_place()
+    async with (
+        Node("cam3", namespace="line1", context=RosContext(listen=place, domain=7), **more) as here,
+        Node("viewer", connect=place, domain=7, **more) as there,
+    ):
+        yield here, there
+
+
+async def until(true: Callable[[], object]) -> None:
+    """Wait until something is true."""
+    async with asyncio.timeout(PATIENCE):
+        while not true():  # noqa: ASYNC110 - of what nothing tells
+            await asyncio.sleep(0.005)
+
+
+async def soon(waits: Any) -> Any:
+    """Return what comes."""
+    async with asyncio.timeout(PATIENCE):
+        return await waits
