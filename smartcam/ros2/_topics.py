@@ -126,10 +126,14 @@ class RosPublisher(RosEnd):
 
     def _make(self, session: Any) -> Any:
         zenoh, qos = self._context.zenoh.engine, self.entity.qos
-        drop = zenoh.CongestionControl.DROP
-        block = zenoh.CongestionControl.BLOCK
+        congestion = zenoh.CongestionControl
         how: dict[str, Any] = {
-            "congestion_control": block if qos.depth is None and qos.reliable else drop,
+            "congestion_control": congestion.BLOCK
+            if qos.depth is None and qos.reliable
+            # of what is latched a long message has to come whole, which DROP does not do
+            else congestion.BLOCK_FIRST
+            if qos.latched
+            else congestion.DROP,
             "reliability": zenoh.Reliability.RELIABLE
             if qos.reliable
             else zenoh.Reliability.BEST_EFFORT,
