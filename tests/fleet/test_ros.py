@@ -1,0 +1,138 @@
+"""Cameras of a fleet as nodes of ROS 2, on the fleet's own session."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import smartcam
+import smartcam.fleet
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet import FleetFile
+from smartcam.fleet._address import FleetAddress
+from smartcam.fleet._file import load_fleet
+from smartcam.fleet._ros import ros_of
+from smartcam.fleet._ros_file import RosSection
+from smartcam.ros2 import Node, QoS
+from smartcam.ros2._qos import LATCHED
+from tests.ros2.roskit import PATIENCE, TRIGGER, free_place, soon, until
+
+pytestmark = pytest.mark.real_time
+
+EMULATED = {"emulated": {}, "application": 7, "interpret_as": "localizations"}
+STATUS = "smartcam_msgs/msg/CameraStatus"
+POSES = "geometry_msgs/msg/PoseArray"
+
+
+def plant(place: str, cameras: dict[str, Any], **more: Any) -> FleetFile:
+    return FleetFile.model_validate({"listen": place, "cameras": cameras, "ros2": {}, **more})
+
+
+async def test_a_plant_is_seen_and_used_from_ros() -> None:
+    place = free_place()
+    file = plant(place, {"line-1/**": {**EMULATED, "emulated": {"count": 2}}}, ros2={"domain": 9})
+    async with (
+        smartcam.fleet.serve(file) as server,
+        Node("viewer", connect=place, domain=9) as viewer,
+    ):
+        names = ["/line_1/cam1", "/line_1/cam2"]
+        assert server.ros_nodes == names
+        await until(lambda: viewer.graph.nodes() == [*names, "/viewer"])
+
+        status = viewer.subscribe(
+            "/line_1/cam2/status", "smartcam_msgs/msg/CameraStatus", qos=LATCHED
+        )
+        async with asyncio.timeout(PATIENCE):
+            async for said in status:
+                if said.ready and said.application_id == 7:
+                    break
+        assert said.camera_name == "line-1/cam2"
+
+        state = viewer.client("/line_1/cam2/get_state", "lifecycle_msgs/srv/GetState")
+        async with asyncio.timeout(PATIENCE):
+            while (await state.call()).current_state.label != "active":  # noqa: ASYNC110
+                await asyncio.sleep(0.02)
+
+        poses = viewer.subscribe("/line_1/cam2/localizations", POSES, qos=QoS(depth=5))
+        others = viewer.subscribe("/line_1/cam1/localizations", POSES, qos=QoS(depth=5))
+        publishers = {one.node.full_name: one for one in server._ros.nodes.values()}  # type: ignore[union-attr]
+        await until(lambda: publishers["/line_1/cam2"].results._publishers["localizations"].heard)
+        direct = smartcam.connect(server.urls["line-1/cam2"])
+        async with direct as camera:
+            result = await camera.trigger()
+            message = await soon(anext(poses))
+            assert message.header.frame_id == "line_1_cam2"
+            assert [(one.position.x, one.position.y) for one in message.poses] == [
+                pytest.approx((one.pose.position.x, one.pose.position.y)) for one in result.value
+            ]
+        assert not others.statistics().offered
+
+        calls = viewer.client("/line_1/cam1/trigger", TRIGGER)
+        reply = await soon(calls.call(timeout=PATIENCE))
+        assert reply.success, reply.message
+        assert len((await soon(anext(others))).poses) >= 1
+    assert server.ros_nodes == []
+
+
+async def test_a_node_goes_with_its_agent_and_comes_with_it() -> None:
+    place, other = free_place(), free_place()
+    async with Node("viewer", listen=place) as viewer:
+        for _ in range(2):
+            file = FleetFile.model_validate(
+                {"connect": place, "listen": other, "cameras": {"cam": EMULATED}, "ros2": {}}
+            )
+            async with smartcam.fleet.serve(file):
+                await until(lambda: "/cam" in viewer.graph.nodes())
+                assert viewer.graph.services()["/cam/trigger"] == [TRIGGER]
+            await until(lambda: viewer.graph.nodes() == ["/viewer"])
+            assert "/cam/trigger" not in viewer.graph.services()
+
+
+async def test_a_fleet_that_is_served_already_is_seen_by_its_url() -> None:
+    place = free_place()
+    file = FleetFile.model_validate({"listen": place, "cameras": {"line1/cam": EMULATED}})
+    async with smartcam.fleet.serve(file) as server:
+        assert server.ros_nodes == []
+        address = FleetAddress.parse(f"fleet://{place.partition('/')[2]}")
+        section = RosSection(domain=3, namespace="plant", autostart=False)
+        async with (
+            ros_of(address, section) as ros,
+            Node("viewer", connect=place, domain=3) as viewer,
+        ):
+            assert ros.names == ["/plant/line1/cam"]
+            state = viewer.client("/plant/line1/cam/get_state", "lifecycle_msgs/srv/GetState")
+            reply = await soon(state.call(timeout=PATIENCE))
+            assert reply.current_state.label == "unconfigured"
+            file = FleetFile.model_validate(
+                {"connect": place, "agent": "late", "cameras": {"line2/cam": EMULATED}}
+            )
+            async with smartcam.fleet.serve(file):
+                await until(lambda: "/plant/line2/cam" in viewer.graph.nodes())
+
+
+async def test_in_one_process_there_is_no_ros() -> None:
+    file = plant("tcp/127.0.0.1:0", {"cam": EMULATED})
+    async with smartcam.fleet.open(file) as fleet:
+        assert [camera.name for camera in fleet] == ["cam"]
+
+
+WRONG = {
+    "cameras: a-b and a_b would both be /a_b in ROS": "ros2: {}\ncameras: {a-b: E, a_b: E}",
+    "ros2.domain": "ros2: {domain: -1}\ncameras: {a: E}",
+    "ros2.distribution": "ros2: {distribution: foxy}\ncameras: {a: E}",
+    "ros2.namespace": "ros2: {namespace: 1x}\ncameras: {a: E}",
+    "cameras.a.ros2.calibration": "cameras: {a: {emulated: {}, ros2: {calibration: none.json}}}",
+    "cameras.a.ros2.frame": "cameras: {a: {emulated: {}, ros2: {frame: x}}}",
+}
+
+
+@pytest.mark.parametrize(("text", "file"), WRONG.items())
+def test_a_wrong_file_is_told(text: str, file: str, tmp_path: Path) -> None:
+    path = tmp_path / "plant.yaml"
+    path.write_text(file.replace("E", "{emulated: {}}"))
+    with pytest.raises(ConfigurationError) as told:
+        load_fleet(path)
+    assert text in str(told.value).replace(" > ", ".")
