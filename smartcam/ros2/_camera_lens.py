@@ -10,7 +10,8 @@ from urllib.parse import unquote, urlsplit
 
 from smartcam.calibration.formats._cameras import MAX_FILE, parse_camera_info, write_camera_info
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
-from smartcam.ros2._image_messages import header_fields, lens_fields, lens_from
+from smartcam.ros2._image_messages import header_fields
+from smartcam.ros2._lens_messages import lens_fields, lens_from
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -41,8 +41,8 @@ class CameraPictures:
     """Publishes what a camera sees, while somebody hears it, and serves single pictures.
 
     Topics, private to the node: ``image_raw``, ``camera_info``, ``image_raw/compressed``; services:
-    ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp: when
-    it was captured. Who is slow gets the newest, and holds up nobody.
+    ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp:
+    when it was captured. Who is slow gets the newest, and holds up nobody.
 
     Args:
         camera: the camera; None where ``frames`` is all there is.
@@ -71,7 +71,7 @@ class CameraPictures:
     ) -> None:
         if camera is None and frames is None:
             raise ConfigurationError("pictures: expected a camera or a source of frames, got none")
-        if not 1 <= quality <= 100:  # noqa: PLR2004
+        if not 1 <= quality <= 100:
             raise ConfigurationError(f"pictures: quality: expected 1 to 100, got {quality!r}")
         self._camera, self._node, self._frames, self._quality = camera, node, frames, quality
         self.frame_id: str = frame_id or f"{node.name}_optical"

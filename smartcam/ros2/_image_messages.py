@@ -1,4 +1,4 @@
-"""Pictures and lenses as ROS' messages and back; nothing here knows a node.
+"""Pictures as ROS' messages and back; nothing here knows a node.
 
 The names of encodings are those of ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
 in millimetres, 0 for none, or 32FC1 in metres, NaN for none.
@@ -6,21 +6,19 @@ in millimetres, 0 for none, or 32FC1 in metres, NaN for none.
 
 from __future__ import annotations
 
-import math
 import time
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration import CameraModel
-from smartcam.exceptions import FrameFormatError, RosMessageError
+from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, Moment, find_format
 from smartcam.frames._jpeg import jpeg_header
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration.formats._cameras import CameraInfo
+    from smartcam.calibration import CameraModel
     from smartcam.frames import PixelFormat
 
 BILLION: Final = 1_000_000_000
@@ -72,9 +70,6 @@ _FOUR: Final = {"rgba8": "RGB8", "bgra8": "BGR8", "8UC4": "BGR8"}
 """Encodings with a fourth channel, which is left out."""
 
 _DTYPES: Final = {"U": "u", "S": "i", "F": "f"}
-
-LENSES: Final = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
-"""Models of distortion, and how many coefficients each may come with."""
 
 
 # ---------------------------------------------------------------------- to ROS
@@ -221,37 +216,6 @@ def compressed_fields(frame: Frame, text: str, frame_id: str) -> dict[str, Any]:
     }
 
 
-def lens_fields(
-    lens: CameraModel | None,
-    header: dict[str, Any],
-    size: tuple[int, int],
-    *,
-    rectification: NDArray[np.float64] | None = None,
-    projection: NDArray[np.float64] | None = None,
-) -> dict[str, Any]:
-    """Return the fields of ``sensor_msgs/CameraInfo``.
-
-    Args:
-        lens: None: it was not calibrated: K, D, R and P are zero then, as ROS has it.
-        header: that of the picture.
-        size: width and height of the picture, pixels.
-        rectification: (3, 3), from the camera's frame into the rectified one; None: the same.
-        projection: (3, 4), of the rectified picture, pixels; None: the lens without its distortion.
-    """
-    fields: dict[str, Any] = {"header": header, "width": size[0], "height": size[1]}
-    if lens is None:
-        return fields
-    turn = np.eye(3) if rectification is None else rectification
-    straight = np.column_stack([lens.matrix, np.zeros(3)]) if projection is None else projection
-    return fields | {
-        "distortion_model": lens.distortion_model,
-        "d": np.array(lens.distortion, np.float64),
-        "k": np.ravel(lens.matrix),
-        "r": np.ravel(turn),
-        "p": np.ravel(straight),
-    }
-
-
 # ---------------------------------------------------------------------- from ROS
 
 
@@ -320,7 +284,7 @@ def _raw(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
     if encoding in _FOUR:
         pixels = np.ascontiguousarray(pixels_from(message)[..., :3])
         return form, width, height, 3 * width, pixels.data.cast("B")
-    if message.is_bigendian and form.depth > 8:  # noqa: PLR2004
+    if message.is_bigendian and form.depth > 8:
         swapped = np.ascontiguousarray(pixels_from(message), "<u2")
         return form, width, height, 2 * width, swapped.data.cast("B")
     return form, width, height, step, data
@@ -329,7 +293,7 @@ def _raw(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
 def _compressed(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
     data = memoryview(message.data).cast("B")
     head = bytes(data[:24])
-    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:  # noqa: PLR2004
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
         width, height = (int.from_bytes(head[at : at + 4], "big") for at in (16, 20))
         return find_format("PNG"), width, height, 0, data
     if head[:2] != b"\xff\xd8":
@@ -382,45 +346,3 @@ def _samples(encoding: str) -> tuple[str, int]:
     raise FrameFormatError(
         f"ROS image: expected an encoding of numbers, such as mono8 or 32FC1, got {encoding!r:.40}"
     )
-
-
-def lens_from(message: Any) -> CameraInfo | None:
-    """Return the lens of a ``sensor_msgs/CameraInfo``, its rectification and projection.
-
-    Returns:
-        None where it was not calibrated.
-
-    Raises:
-        RosMessageError: it is of a model that smartcam does not have, binned or of a region.
-        CalibrationError: its matrix or coefficients are no lens.
-    """
-    from smartcam.calibration.formats._cameras import CameraInfo
-
-    if not message.k[0]:
-        return None
-    count = len(message.d)
-    model = message.distortion_model or "plumb_bob"
-    if model not in LENSES or (count and count not in LENSES[model]):
-        known = "; ".join(f"{name} with {' or '.join(map(str, n))}" for name, n in LENSES.items())
-        raise RosMessageError(
-            f"camera_info: expected {known} coefficients, got {model!r:.40} with {count}"
-        )
-    roi = message.roi
-    if max(message.binning_x, message.binning_y) > 1 or roi.x_offset or roi.y_offset:
-        raise RosMessageError("camera_info: expected that of the whole picture, got a part of it")
-    coefficients = np.zeros(max(LENSES[model]))
-    coefficients[:count] = message.d
-    lens = CameraModel(
-        size=(int(message.width), int(message.height)),
-        matrix=np.reshape(message.k, (3, 3)).astype(np.float64),
-        distortion=coefficients,
-        distortion_model=model,  # type: ignore[arg-type]
-    )
-    turn, projection = np.reshape(message.r, (3, 3)), np.reshape(message.p, (3, 4))
-    if not np.any(turn):
-        turn = np.eye(3)
-    if not np.any(projection):
-        projection = np.column_stack([lens.matrix, np.zeros(3)])
-    if not all(math.isfinite(one) for one in (*turn.ravel(), *projection.ravel())):
-        raise RosMessageError("camera_info: expected finite numbers in R and P")
-    return CameraInfo(lens, message.header.frame_id, turn, projection)

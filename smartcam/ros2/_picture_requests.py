@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.exceptions import FrameFormatError, RosMessageError, SmartCamError
+from smartcam.exceptions import FrameFormatError, FrameTimeoutError, RosMessageError, SmartCamError
 from smartcam.frames import Frame, FrameSource, Moment, find_format
 from smartcam.frames._bitmap import read_bitmap
 from smartcam.frames._jpeg import jpeg_header
@@ -31,7 +31,9 @@ LONGEST: Final = 60.0
 """Seconds for a picture where the request sets no limit, or a longer one."""
 
 
-async def one_frame(frames: FrameSource | None, camera: Camera[Any] | None, timeout: float) -> Frame:
+async def one_frame(
+    frames: FrameSource | None, camera: Camera[Any] | None, timeout: float
+) -> Frame:
     """Return a picture: the first that is exposed after this, or the last one of the camera.
 
     Raises:
@@ -62,7 +64,7 @@ def frame_of_file(data: bytes, source: str) -> Frame:
         except FrameFormatError as exc:
             raise FrameFormatError(f"{source}: {exc}", source=source) from exc
         height, width = pixels.shape[:2]
-        name, kept = "Mono8" if pixels.ndim == 2 else "RGB8", pixels.data.cast("B")  # noqa: PLR2004
+        name, kept = "Mono8" if pixels.ndim == 2 else "RGB8", pixels.data.cast("B")
         stride = pixels.nbytes // height
     return Frame(
         data=kept,
@@ -121,8 +123,13 @@ class PictureRequests:
         if asked < 0:
             raise RosMessageError(f"timeout: expected 0 or more seconds, got {asked:g}")
         timeout = min(asked or LONGEST, LONGEST)
-        async with asyncio.timeout(timeout):
-            await self._one_at_a_time.acquire()
+        try:
+            async with asyncio.timeout(timeout):
+                await self._one_at_a_time.acquire()
+        except TimeoutError as exc:
+            raise FrameTimeoutError(
+                f"no picture in {timeout:g} s: those that were asked for before took as long"
+            ) from exc
         try:
             await self._lens.load()
             frame = await asyncio.to_thread(prepared, await self._take(timeout))
@@ -134,8 +141,14 @@ class PictureRequests:
                     "this camera gives no other"
                 )
             image, info = self._publishers(request.response_namespace)
-            info.publish(self._lens.fields(frame))
-            image.publish(image_fields(frame, self._frame_id))
+            fields = image_fields(frame, self._frame_id)
+            if hasattr(image, "publish_encoded"):
+                data = await asyncio.to_thread(image.type.encode, fields)
+                info.publish(self._lens.fields(frame))
+                image.publish_encoded(data)
+            else:
+                info.publish(self._lens.fields(frame))
+                image.publish(fields)
         finally:
             self._one_at_a_time.release()
         return stamp_fields(frame.utc)

@@ -75,7 +75,7 @@ class PictureStream:
 
     async def _run(self) -> None:
         while True:
-            while not self.heard:
+            while not self.heard:  # noqa: ASYNC110 - nothing tells of it
                 await asyncio.sleep(LOOK)
             before = self.frames
             delays = AGAIN.delays()
@@ -87,9 +87,10 @@ class PictureStream:
 
     async def _pause(self, seconds: float) -> None:
         """Wait before the source is opened again, for as long as somebody hears."""
-        end = asyncio.get_running_loop().time() + seconds
-        while self.heard and (left := end - asyncio.get_running_loop().time()) > 0:
-            await asyncio.sleep(min(left, LOOK))
+        loop = asyncio.get_running_loop()
+        end = loop.time() + seconds
+        while self.heard and loop.time() < end:  # noqa: ASYNC110 - nothing tells of it
+            await asyncio.sleep(LOOK)
 
     async def _stream(self) -> None:
         """Publish until nobody hears, or the source ends."""
