@@ -77,8 +77,9 @@ _DTYPES: Final = {"U": "u", "S": "i", "F": "f"}
 
 def stamp_fields(utc: float) -> dict[str, int]:
     """Return a time, seconds since 1970, as the fields of ``builtin_interfaces/Time``."""
-    nanoseconds = max(0, round(utc * BILLION))
-    return {"sec": nanoseconds // BILLION, "nanosec": nanoseconds % BILLION}
+    whole = int(max(utc, 0.0))
+    more = round(max(utc - whole, 0.0) * BILLION)  # apart, since both together lose digits
+    return {"sec": whole + more // BILLION, "nanosec": more % BILLION}
 
 
 def header_fields(utc: float, frame_id: str) -> dict[str, Any]:

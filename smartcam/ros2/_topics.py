@@ -83,9 +83,12 @@ class RosEnd:
             return
         self._closed = True
         self._context.remove(self.entity)
+        self._withdraw()
+        self._on_close(self)
+
+    def _withdraw(self) -> None:
         for declared in reversed(self._declared):  # the token first
             declared.close()
-        self._on_close(self)
 
     async def __aenter__(self) -> Self:
         return self
@@ -120,7 +123,8 @@ class RosPublisher(RosEnd):
         self._bytes = 0
         self._publisher: Any = None
         self._patient: Any = None  # waits for room
-        self._hasty: Any = None  # leaves out who has none
+        self._hasty: Any = None  # leaves out whom one is under way to
+        self._using = 0  # threads that are in the engine; it forbids to undeclare meanwhile
         self._declare(self._make)
         self._appear()
 
@@ -207,10 +211,7 @@ class RosPublisher(RosEnd):
             RosError: the publisher is closed.
         """
         data = self.type.encode(said(message, fields))
-        attachment = self._attachment()
-        publisher = self._publisher if len(data) <= LONG else self._hastily()
-        quietly(publisher.put, data, attachment=attachment)
-        self.published += 1
+        self._put(self._hastily if len(data) > LONG else None, data, self._attachment())
 
     def _attachment(self) -> bytes:
         with self._lock:
@@ -219,20 +220,6 @@ class RosPublisher(RosEnd):
             self._number += 1
             return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
-    def _hastily(self) -> Any:
-        """Return what publishes long messages to whom none is under way."""
-        zenoh = self._context.zenoh.engine
-        with self._lock:
-            if self._closed:
-                raise RosError(f"{self.name}: this publisher is closed")
-            if self._hasty is None:
-                self._hasty = self._context.zenoh.session.declare_publisher(
-                    self.entity.key,
-                    congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
-                    priority=zenoh.Priority.DATA_LOW,
-                )
-            return self._hasty
-
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
         with self._lock:
@@ -240,33 +227,70 @@ class RosPublisher(RosEnd):
                 return
             data, attachment = self._waiting.popleft()
             self._bytes -= len(data)
-        self._patiently().put(data, attachment=attachment)
-        self.published += 1
+        # what is latched has to be kept, by the one that does so
+        self._put(None if self.entity.qos.latched else self._patiently, data, attachment)
+
+    def _put(self, make: Callable[[], Any] | None, data: bytes, attachment: bytes) -> None:
+        """Hand a message to the engine; in a thread, which may wait there."""
+        with self._lock:
+            if self._closed:
+                return
+            self._using += 1
+        try:
+            publisher = self._publisher if make is None else make()
+            publisher.put(data, attachment=attachment)
+            self.published += 1
+        except self._context.zenoh.engine.ZError as exc:
+            logger.debug("%s: the engine: %s", self.name, exc)
+        finally:
+            with self._lock:
+                self._using -= 1
+                last = self._closed and not self._using
+            if last:
+                self._undeclare()
 
     def _patiently(self) -> Any:
         """Return what publishes long messages: it waits for room, behind all else."""
-        zenoh = self._context.zenoh.engine
-        if self.entity.qos.latched:
-            return self._publisher  # which has to keep them
         if self._patient is None:
-            self._patient = self._context.zenoh.session.declare_publisher(
-                self.entity.key,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,
-            )
+            self._patient = self._long(self._context.zenoh.engine.CongestionControl.BLOCK)
         return self._patient
 
-    def close(self) -> None:
-        """Be gone; what waits to be said is not said any more. Idempotent."""
-        super().close()
+    def _hastily(self) -> Any:
+        """Return what publishes long messages to whom none is under way."""
+        if self._hasty is None:
+            self._hasty = self._long(self._context.zenoh.engine.CongestionControl.BLOCK_FIRST)
+        return self._hasty
+
+    def _long(self, congestion_control: Any) -> Any:
+        return self._context.zenoh.session.declare_publisher(
+            self.entity.key,
+            congestion_control=congestion_control,
+            priority=self._context.zenoh.engine.Priority.DATA_LOW,
+        )
+
+    def _withdraw(self) -> None:
+        """What waits to be said is not said any more."""
+        self._declared.pop().close()  # the token
         with self._lock:
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._bytes = 0
+            busy = self._using
+        if busy:  # the thread undeclares the others, which their session must not touch either
+            for one in self._declared:
+                self._context.zenoh.forget(one)
+        else:
+            self._undeclare()
+
+    def _undeclare(self) -> None:
+        with self._lock:
+            declared, self._declared = self._declared, []
             more, self._patient, self._hasty = (self._patient, self._hasty), None, None
-        for one in more:
-            if one is not None:
-                quietly(one.undeclare)
+        for one in declared:
+            one.close()
+        for publisher in more:
+            if publisher is not None:
+                quietly(publisher.undeclare)
 
 
 class _Heard(NamedTuple):
