@@ -436,9 +436,17 @@ class _LoopBell:
 
 
 class ZenohDeclared:
-    """Something that is declared at the engine until it is closed, or its session is."""
+    """Something that is declared at the engine until it is closed, or its session is.
 
-    def __init__(self, end: ZenohSession) -> None:
+    Args:
+        end: the session.
+        by_dropping: it ends with its last reference, and this has the only one: to undeclare an
+            advanced end the binding holds the interpreter while it waits for a thread that may
+            wait for the interpreter; to drop one it gives the interpreter free.
+    """
+
+    def __init__(self, end: ZenohSession, *, by_dropping: bool = False) -> None:
+        self._by_dropping = by_dropping
         self._end = end
         self._closed = False
         self._it: Any = None
@@ -458,7 +466,9 @@ class ZenohDeclared:
         if not self._closed:
             self._closed = True
             self._end.forget(self)
-            quietly(self._it.undeclare)
+            it, self._it = self._it, None
+            if not self._by_dropping:
+                quietly(it.undeclare)
 
 
 def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:

@@ -8,17 +8,18 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from smartcam.exceptions import ConfigurationError, UnsupportedError
+from smartcam.exceptions import ConfigurationError, RosError, UnsupportedError
 from smartcam.frames import Codecs, FrameSource
 from smartcam.ros2._camera_lens import CameraLens
 from smartcam.ros2._image_messages import (
+    ENCODINGS,
     compressed_fields,
     compression,
     image_fields,
     prepared,
 )
 from smartcam.ros2._picture_requests import PictureRequests, one_frame
-from smartcam.ros2._picture_stream import PictureStream
+from smartcam.ros2._picture_stream import PictureStream, say_newest
 from smartcam.ros2._qos import DRIVER
 
 if TYPE_CHECKING:
@@ -177,7 +178,10 @@ class CameraPictures:
     async def _publish_raw(self, frame: Frame) -> None:
         self._size = (frame.width, frame.height)
         if _heard(self._image):
-            await self._in_thread(self._image, lambda: image_fields(prepared(frame), self.frame_id))
+            ready = frame
+            if frame.format.name not in ENCODINGS:
+                ready = await self._in_thread(lambda: prepared(frame))
+            await say_newest(self._image, image_fields(ready, self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_small(self, frame: Frame) -> None:
@@ -190,8 +194,7 @@ class CameraPictures:
             small = await self._codecs.png(small)
         elif way.how == "jpeg":
             small = await self._codecs.jpeg(small, quality=self._quality)
-        fields = compressed_fields(small, way.text(), self.frame_id)
-        await self._in_thread(self._small, lambda: fields)
+        await say_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
         await self._publish_info(frame)
 
     async def _publish_info(self, frame: Frame) -> None:
@@ -203,16 +206,11 @@ class CameraPictures:
             await self._lens.load()
             self._info.publish(self._lens.fields(frame))
 
-    async def _in_thread(self, publisher: Any, fields: Callable[[], dict[str, Any]]) -> None:
-        """Publish in the thread for it, where the publisher can; what is under way is finished."""
+    async def _in_thread(self, work: Callable[[], Value]) -> Value:
+        """Have the thread for it do something; what is under way is finished."""
         if self._thread is None:
-            return
-        loop = asyncio.get_running_loop()
-        newest = getattr(publisher, "publish_newest", None)
-        if newest is None:
-            publisher.publish(await loop.run_in_executor(self._thread, fields))
-        else:
-            await loop.run_in_executor(self._thread, lambda: newest(fields()))
+            raise RosError("these pictures are closed")
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
 
 
 def _heard(publisher: Any) -> bool:

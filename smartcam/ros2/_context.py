@@ -75,7 +75,7 @@ class RosContext:
         self._numbers = 0
         self._ends: dict[tuple[str, str], list[Entity]] = {}
         self._lock = threading.Lock()
-        self._thread: ThreadPoolExecutor | None = None
+        self._threads: dict[str, ThreadPoolExecutor] = {}
         self._long: collections.Counter[object] = collections.Counter()
         self._stop_listening: Callable[[], None] = _nothing
 
@@ -106,9 +106,9 @@ class RosContext:
         self._stop_listening()
         self._stop_listening = _nothing
         self.graph.close()
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread.shutdown(wait=False, cancel_futures=True)
+        for thread in self._threads.values():
+            thread.shutdown(wait=False)  # what waits sees that it is closed, and takes itself back
+        self._threads.clear()
         if self._owns:
             await self.zenoh.close()
 
@@ -152,19 +152,20 @@ class RosContext:
                 other.hash,
             )
 
-    # ------------------------------------------------------------------ what is long
+    # ------------------------------------------------------------------ what may wait
 
     def waits(self, owner: object) -> bool:
-        """Whether long messages of an owner wait to be said."""
+        """Whether messages of an owner wait to be said."""
         return bool(self._long[owner])
 
-    def say_later(self, owner: object, say: Callable[[], int]) -> None:
-        """Have a thread call ``say``, which waits for room and returns the bytes it has said."""
-        if self._thread is None:
-            self._thread = ThreadPoolExecutor(1, "smartcam-ros2")
+    def say_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
+        """Have the thread of a lane call ``say``, which may wait for room; in order."""
+        thread = self._threads.get(lane)
+        if thread is None:
+            thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")
         with self._lock:
             self._long[owner] += 1
-        self._thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner))
+        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner))
 
     def _said(self, owner: object) -> None:
         with self._lock:

@@ -13,11 +13,11 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._cloud_messages import cloud_fields, depth_fields, disparity_fields, points_of
 from smartcam.ros2._image_messages import array_fields, header_fields
 from smartcam.ros2._lens_messages import lens_fields
-from smartcam.ros2._picture_stream import PictureStream
+from smartcam.ros2._picture_stream import PictureStream, say_newest
 from smartcam.ros2._qos import DRIVER
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
+    from collections.abc import AsyncIterator, Callable
 
     from smartcam.depth import DepthFrame, StereoDepth
 
@@ -121,21 +121,9 @@ class DepthTopics:
         if self._thread is None or not heard:
             return
         loop = asyncio.get_running_loop()
-        made = await loop.run_in_executor(self._thread, self._say, frame, heard)
-        for name, fields in made.items():
-            heard[name].publish(fields)
-
-    def _say(self, frame: DepthFrame, heard: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        """Publish in the thread for it; return what the publisher has to be given in the loop."""
-        left: dict[str, dict[str, Any]] = {}
         for name, publisher in heard.items():
-            newest = getattr(publisher, "publish_newest", None)
-            fields = self._fields(name, frame)
-            if newest is None:
-                left[name] = fields
-            else:
-                newest(fields)
-        return left
+            fields = await loop.run_in_executor(self._thread, self._fields, name, frame)
+            await say_newest(publisher, fields)
 
     def _fields(self, name: str, frame: DepthFrame) -> dict[str, Any]:
         header = header_fields(frame.utc, self.frame_id)

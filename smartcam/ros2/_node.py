@@ -10,11 +10,13 @@ from smartcam._zenoh import ZenohDeclared
 from smartcam.exceptions import RosError
 from smartcam.ros2._context import ROUTER, RosContext
 from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
+from smartcam.ros2._parameter_client import CALL_TIMEOUT, ParameterClient
 from smartcam.ros2._parameters import RosParameters
 from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
 from smartcam.ros2._services import RosClient, RosService
 from smartcam.ros2._tokens import CLIENT, NODE, PUBLISHER, SERVICE, SUBSCRIPTION, Entity
 from smartcam.ros2._topics import RosEnd, RosPublisher, RosSubscription
+from smartcam.ros2._type_description import TypeDescriptions
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -51,7 +53,7 @@ class Node(Server):
         domain: the number that keeps systems apart; None for the variable ``ROS_DOMAIN_ID``.
         distribution: of ROS, whose messages are spoken: its type hashes are part of all names.
         context: what it shares with other nodes of this process, instead of these.
-        parameters: whether other nodes see its parameters, which are six services and a topic.
+        parameters: whether other nodes see its parameters and types, by seven services and a topic.
         open_timeout: seconds for coming to the router.
 
     Attributes:
@@ -85,6 +87,11 @@ class Node(Server):
         self._token: ZenohDeclared | None = None
         self._ends: set[RosEnd] = set()
         self.parameters: RosParameters = RosParameters(self, served=parameters)
+        self._descriptions = (
+            TypeDescriptions(self, lambda: [end.entity for end in self._ends])
+            if parameters
+            else None
+        )
 
     @property
     def full_name(self) -> str:
@@ -125,6 +132,8 @@ class Node(Server):
             raise
         try:
             self.parameters.open()
+            if self._descriptions is not None:
+                self._descriptions.open()
         except BaseException:
             await self.stop()
             raise
@@ -226,6 +235,18 @@ class Node(Server):
         kind = self.types.service(type)
         entity = self._end(CLIENT, service, "service", kind.dds, kind.hash, qos)
         return self._kept(RosClient(self.context, entity, kind, self._ends.discard))
+
+    def parameters_of(self, name: str, *, timeout: float = CALL_TIMEOUT) -> ParameterClient:
+        """Return what lists, gets, describes and sets another node's parameters.
+
+        Args:
+            name: the node's, absolute or relative to the namespace.
+            timeout: seconds for one call.
+
+        Raises:
+            ConfigurationError: the name cannot be.
+        """
+        return ParameterClient(self, resolve(name, self.namespace, self.name, "node"), timeout)
 
     def _kept(self, end: End) -> End:
         self._ends.add(end)

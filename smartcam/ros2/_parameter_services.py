@@ -134,7 +134,8 @@ class ParameterServices:
 
     async def _list(self, request: Any) -> dict[str, Any]:
         _check_count(request.prefixes)
-        names, prefixes = [], {}
+        names: list[str] = []
+        prefixes: dict[str, None] = {}
         for place, name in enumerate(self._parameters.names(), 1):
             if _listed(name, request.prefixes, request.depth):
                 names.append(name)

@@ -54,9 +54,9 @@ class _Declared:
         name = self.description.name
         if self.description.read_only and not by_node:
             raise ConfigurationError(f"parameter {name!r} cannot be set: it is read-only")
-        value = typed(name, given, self.value.number)
-        if value.value is None:
+        if given is None or (isinstance(given, Typed) and given.value is None):
             raise ConfigurationError(f"parameter {name!r} cannot be unset: it is {self.value.type}")
+        value = typed(name, given, self.value.number)
         if value.number != self.value.number:
             raise ConfigurationError(
                 f"parameter {name!r} is {self.value.type}, it cannot be set to {value}"

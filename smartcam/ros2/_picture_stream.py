@@ -120,3 +120,12 @@ class PictureStream:
         if text != self._told:
             self._told = text
             logger.warning("%s ! %s", self._name, text)
+
+
+async def say_newest(publisher: Any, fields: dict[str, Any]) -> None:
+    """Publish the newest; a node of ROS 1 has a queue of its own for that."""
+    newest = getattr(publisher, "publish_newest", None)
+    if newest is None:
+        publisher.publish(fields)
+    else:
+        await newest(fields)

@@ -6,7 +6,9 @@ kept by an advanced publisher, and asked for by an advanced subscriber.
 
 from __future__ import annotations
 
+import asyncio
 import collections
+import concurrent.futures
 import logging
 import threading
 import time
@@ -34,15 +36,16 @@ LONG = 1 << 16
 MOST_WAITING = 1 << 26
 """Bytes of a topic's messages that wait to be said, or to be read."""
 
-HEARTBEAT = 0.5
-"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
-
 
 def said(message: object, fields: dict[str, Any]) -> object:
     """Return what is to be said: a message, or the fields of one."""
     if message is not None and fields:
         raise RosMessageError("expected a message or its fields, got both")
     return fields if message is None else message
+
+
+HEARTBEAT = 0.5
+"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
 
 
 class RosEnd:
@@ -66,8 +69,8 @@ class RosEnd:
         """The absolute name of the topic or service."""
         return self.entity.name
 
-    def _declare(self, how: Callable[[Any], Any]) -> ZenohDeclared:
-        declared = ZenohDeclared(self._context.zenoh).of(how)
+    def _declare(self, how: Callable[[Any], Any], *, by_dropping: bool = False) -> ZenohDeclared:
+        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).of(how)
         self._declared.append(declared)
         return declared
 
@@ -83,12 +86,9 @@ class RosEnd:
             return
         self._closed = True
         self._context.remove(self.entity)
-        self._withdraw()
-        self._on_close(self)
-
-    def _withdraw(self) -> None:
         for declared in reversed(self._declared):  # the token first
             declared.close()
+        self._on_close(self)
 
     async def __aenter__(self) -> Self:
         return self
@@ -122,22 +122,21 @@ class RosPublisher(RosEnd):
         self._waiting: collections.deque[tuple[bytes, bytes]] = collections.deque()
         self._bytes = 0
         self._publisher: Any = None
+        qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
+        self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
         self._patient: Any = None  # waits for room
-        self._hasty: Any = None  # leaves out whom one is under way to
-        self._using = 0  # threads that are in the engine; it forbids to undeclare meanwhile
-        self._declare(self._make)
+        self._hasty: Any = None  # leaves out to whom one is under way
+        self._lane = "latched" if qos.latched else "long"
+        self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
         self._appear()
 
     def _make(self, session: Any) -> Any:
         zenoh, qos = self._context.zenoh.engine, self.entity.qos
-        congestion = zenoh.CongestionControl
+        drop = zenoh.CongestionControl.DROP
+        block = zenoh.CongestionControl.BLOCK
+        waits = qos.latched or (qos.depth is None and qos.reliable)
         how: dict[str, Any] = {
-            "congestion_control": congestion.BLOCK
-            if qos.depth is None and qos.reliable
-            # of what is latched a long message has to come whole, which DROP does not do
-            else congestion.BLOCK_FIRST
-            if qos.latched
-            else congestion.DROP,
+            "congestion_control": block if waits else drop,
             "reliability": zenoh.Reliability.RELIABLE
             if qos.reliable
             else zenoh.Reliability.BEST_EFFORT,
@@ -186,7 +185,7 @@ class RosPublisher(RosEnd):
             RosError: the publisher is closed.
         """
         attachment = self._attachment()
-        if len(data) <= LONG and not self._context.waits(self):
+        if self._direct and len(data) <= LONG and not self._context.waits(self):
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
             return
@@ -198,27 +197,63 @@ class RosPublisher(RosEnd):
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
-        self._context.say_later(self, self._say_next)
+        self._context.say_later(self, self._say_next, self._lane)
 
-    def publish_newest(self, message: object = None, /, **fields: Any) -> None:
-        """Publish a message, except to whom one is under way already; for any thread.
+    async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message, except to whom one is under way already.
 
         For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
-        that is old. It blocks for as long as the engine takes to copy the message.
+        that is old. It returns when the engine has copied the message; a thread encodes it. A
+        publisher has either these or those of :meth:`publish`.
 
         Raises:
             RosMessageError: it is no message of the type.
             RosError: the publisher is closed.
+
+        Cancellation: the message is published or not.
         """
-        data = self.type.encode(said(message, fields))
-        self._put(self._hastily if len(data) > LONG else None, data, self._attachment())
+        what, attachment = said(message, fields), self._attachment()
+        self._lane = "newest"
+        done: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+        def say() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                self._say_newest(what, attachment)
+            except BaseException as exc:  # noqa: BLE001 - told to who waits
+                done.set_exception(exc)
+            else:
+                done.set_result(None)
+
+        self._context.say_later(self, say, self._lane)
+        await asyncio.wrap_future(done)
 
     def _attachment(self) -> bytes:
-        with self._lock:
-            if self._closed:
-                raise RosError(f"{self.name}: this publisher is closed")
-            self._number += 1
-            return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+        if self._closed:
+            raise RosError(f"{self.name}: this publisher is closed")
+        self._number += 1
+        return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+
+    def _say_newest(self, what: object, attachment: bytes) -> None:
+        """Encode and say a message; in the thread for it."""
+        data = self.type.encode(what)
+        if self._closed:
+            return
+        put = self._hastily if len(data) > LONG else self._publisher.put
+        quietly(put, data, attachment=attachment)
+        self.published += 1
+
+    def _hastily(self, data: bytes, attachment: bytes) -> None:
+        """Have the engine send a long message to all to whom none is under way."""
+        if self._hasty is None:
+            zenoh = self._context.zenoh.engine
+            self._hasty = self._context.zenoh.session.declare_publisher(
+                self.entity.key,
+                congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        self._hasty.put(data, attachment=attachment)
 
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
@@ -227,70 +262,43 @@ class RosPublisher(RosEnd):
                 return
             data, attachment = self._waiting.popleft()
             self._bytes -= len(data)
-        # what is latched has to be kept, by the one that does so
-        self._put(None if self.entity.qos.latched else self._patiently, data, attachment)
-
-    def _put(self, make: Callable[[], Any] | None, data: bytes, attachment: bytes) -> None:
-        """Hand a message to the engine; in a thread, which may wait there."""
-        with self._lock:
-            if self._closed:
-                return
-            self._using += 1
-        try:
-            publisher = self._publisher if make is None else make()
-            publisher.put(data, attachment=attachment)
-            self.published += 1
-        except self._context.zenoh.engine.ZError as exc:
-            logger.debug("%s: the engine: %s", self.name, exc)
-        finally:
-            with self._lock:
-                self._using -= 1
-                last = self._closed and not self._using
-            if last:
-                self._undeclare()
+        self._patiently().put(data, attachment=attachment)
+        self.published += 1
 
     def _patiently(self) -> Any:
         """Return what publishes long messages: it waits for room, behind all else."""
+        zenoh = self._context.zenoh.engine
+        if self.entity.qos.latched:
+            return self._publisher  # which has to keep them
         if self._patient is None:
-            self._patient = self._long(self._context.zenoh.engine.CongestionControl.BLOCK)
+            self._patient = self._context.zenoh.session.declare_publisher(
+                self.entity.key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA_LOW,
+            )
         return self._patient
 
-    def _hastily(self) -> Any:
-        """Return what publishes long messages to whom none is under way."""
-        if self._hasty is None:
-            self._hasty = self._long(self._context.zenoh.engine.CongestionControl.BLOCK_FIRST)
-        return self._hasty
-
-    def _long(self, congestion_control: Any) -> Any:
-        return self._context.zenoh.session.declare_publisher(
-            self.entity.key,
-            congestion_control=congestion_control,
-            priority=self._context.zenoh.engine.Priority.DATA_LOW,
-        )
-
-    def _withdraw(self) -> None:
-        """What waits to be said is not said any more."""
-        self._declared.pop().close()  # the token
+    def close(self) -> None:
+        """Be gone; what waits to be said is not said any more. Idempotent."""
+        if self._closed:
+            return
+        super().close()
         with self._lock:
             self.dropped += len(self._waiting)
             self._waiting.clear()
             self._bytes = 0
-            busy = self._using
-        if busy:  # the thread undeclares the others, which their session must not touch either
-            for one in self._declared:
-                self._context.zenoh.forget(one)
+        if self._context.waits(self):  # its thread may be at it, and does that when it is done
+            self._context.say_later(self, self._take_back, self._lane)
         else:
-            self._undeclare()
+            self._take_back()
 
-    def _undeclare(self) -> None:
-        with self._lock:
-            declared, self._declared = self._declared, []
-            more, self._patient, self._hasty = (self._patient, self._hasty), None, None
-        for one in declared:
-            one.close()
-        for publisher in more:
-            if publisher is not None:
-                quietly(publisher.undeclare)
+    def _take_back(self) -> None:
+        for one in (self._patient, self._hasty):
+            if one is not None:
+                quietly(one.undeclare)
+        self._patient = self._hasty = None
+        self._publisher = None
+        self._outlet.close()
 
 
 class _Heard(NamedTuple):
@@ -327,7 +335,7 @@ class RosSubscription(RosEnd):
             overflow="drop_oldest",
             max_queue_bytes=MOST_WAITING,
         )
-        self._declare(self._make)
+        self._declare(self._make, by_dropping=entity.qos.latched)
         self._appear()
 
     def _make(self, session: Any) -> Any:

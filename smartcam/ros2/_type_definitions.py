@@ -62,7 +62,11 @@ class MessageField(NamedTuple):
         """Say its type as a ``.msg`` does."""
         limit = f"<={self.limit}" if self.limit else ""
         bound = "<=" if self.shape == "sequence" and self.size else ""
-        return self.type + limit + (f"[{bound}{self.size or ''}]" if self.shape else "")
+        return (
+            self.type.replace("/msg/", "/")
+            + limit
+            + (f"[{bound}{self.size or ''}]" if self.shape else "")
+        )
 
 
 EMPTY: Final = MessageField("structure_needs_at_least_one_member", "uint8")
@@ -71,11 +75,21 @@ EMPTY: Final = MessageField("structure_needs_at_least_one_member", "uint8")
 
 @dataclass(frozen=True, slots=True)
 class Definition:
-    """A message's fields and constants."""
+    """A message's fields and constants.
+
+    Attributes:
+        kinds: the types of its constants.
+    """
 
     name: str
     fields: tuple[MessageField, ...]
     constants: dict[str, Any]
+    kinds: dict[str, str]
+
+    def text(self) -> str:
+        """Return its fields and constants as a ``.msg`` has them, without defaults."""
+        constants = (f"{self.kinds[name]} {name}={one}\n" for name, one in self.constants.items())
+        return "".join((*constants, *(f"{field} {field.name}\n" for field in self.fields)))
 
     def needs(self) -> set[str]:
         """Return the messages that are in it."""
@@ -97,6 +111,12 @@ def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
     return matched[1], matched[2], matched[3]
 
 
+def dds_name(name: str) -> str:
+    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
+    package, kind, own = name.split("/")
+    return f"{package}::{kind}::dds_::{own}_"
+
+
 def parse_message(name: str, text: str) -> Definition:
     """Return what a ``.msg`` says.
 
@@ -106,6 +126,7 @@ def parse_message(name: str, text: str) -> Definition:
     package = name.partition("/")[0]
     fields: dict[str, MessageField] = {}
     constants: dict[str, Any] = {}
+    kinds: dict[str, str] = {}
     for number, line in enumerate(text.splitlines(), 1):
         said = line.strip()
         if not said or said.startswith("#"):
@@ -115,12 +136,12 @@ def parse_message(name: str, text: str) -> Definition:
             if field.name in fields or field.name in constants:
                 raise ValueError(f"there are two {field.name}")
             if constant:
-                constants[field.name] = field.default
+                constants[field.name], kinds[field.name] = field.default, field.type
             else:
                 fields[field.name] = field
         except (ValueError, SyntaxError) as exc:
             raise ConfigurationError(f"{name}, line {number}: {said!r:.80}: {exc}") from exc
-    return Definition(name, tuple(fields.values()), constants)
+    return Definition(name, tuple(fields.values()), constants, kinds)
 
 
 def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
@@ -133,6 +154,13 @@ def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
     if len(parts) != 2:
         raise ConfigurationError(f"{name}: expected one line --- between request and response")
     return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
+
+
+def bare(said: Any) -> Any:
+    """Return the fields of a message, or of a service's two, without defaults."""
+    if isinstance(said, tuple):
+        return [bare(one) for one in said]
+    return [one._replace(default=None) for one in said.fields]
 
 
 def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:

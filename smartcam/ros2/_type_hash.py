@@ -65,9 +65,9 @@ def description(definition: Definition, find: Callable[[str], Definition]) -> di
     }
 
 
-def type_hash(definition: Definition, find: Callable[[str], Definition]) -> str:
+def hash_of_description(described: dict[str, Any]) -> str:
     """Return the hash of a message or service, ``RIHS01_`` and 64 digits."""
-    text = json.dumps(description(definition, find))
+    text = json.dumps(described)
     return f"RIHS01_{hashlib.sha256(text.encode()).hexdigest()}"
 
 
@@ -81,6 +81,7 @@ def event_of(name: str) -> Definition:
             MessageField("response", f"{name}_Response", "sequence", 1),
         ),
         {},
+        {},
     )
 
 
@@ -88,4 +89,4 @@ def service_of(name: str) -> Definition:
     """Return a service as its hash sees it."""
     parts = ("request", "response", "event")
     fields = tuple(MessageField(f"{part}_message", f"{name}_{part.title()}") for part in parts)
-    return Definition(name, fields, {})
+    return Definition(name, fields, {}, {})

@@ -76,7 +76,8 @@ def read_stored(name: str, said: Any) -> Definition:
             if isinstance(default, str):
                 default = constants.get(default)
             fields.append(_field(one, kind)._replace(default=default))
-    return Definition(name, tuple(fields), constants)
+    kinds: dict[str, str] = {one: str(OTHER_NAMES.get(kind, kind)) for one, kind, _ in said[0]}
+    return Definition(name, tuple(fields), constants, kinds)
 
 
 def _field(name: str, said: Any) -> MessageField:
@@ -86,5 +87,6 @@ def _field(name: str, said: Any) -> MessageField:
         said, size = said[1]
     if said[0] == _NAME:
         return MessageField(name, said[1], shape, size)
+    kind: str
     kind, limit = said[1]
     return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)

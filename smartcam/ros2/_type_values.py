@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import operator
 import struct
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
 from smartcam._suggestions import did_you_mean
-from smartcam.exceptions import RosMessageError
 from smartcam.ros2._type_codec import MisfitError, counted, packed, text_bytes
 from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, Definition, MessageField
 
@@ -25,7 +24,7 @@ class RosMessage:
     ``uint8[]``.
     """
 
-    __slots__ = ()
+    __slots__: tuple[str, ...] = ()
     __msgtype__: ClassVar[str] = ""
     __hash__ = None  # type: ignore[assignment]
 
@@ -37,6 +36,10 @@ class RosMessage:
     def __repr__(self) -> str:
         parts = (f"{one}={_shown(getattr(self, one))}" for one in self.__slots__)
         return f"{type(self).__name__}({', '.join(parts)})"
+
+
+_LONG = 16
+"""What is longer is not shown whole."""
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -51,10 +54,10 @@ def _same(one: Any, other: Any) -> bool:
 
 def _shown(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        text = ", ".join(map(str, value[:4].tolist()))
-        return f"[{text}{f', ... {len(value)}' if len(value) > 4 else ''}]"
-    if isinstance(value, bytes | bytearray | memoryview) and len(value) > 16:
-        return f"<{len(value)} bytes>"
+        text = ", ".join(map(str, value[:_LONG].tolist()))
+        return f"[{text}{f', ... of {len(value)}' if len(value) > _LONG else ''}]"
+    if isinstance(value, bytes | bytearray | memoryview | list | tuple) and len(value) > _LONG:
+        return f"<{type(value).__name__} of {len(value)}>"
     return repr(value)
 
 
@@ -78,118 +81,206 @@ def message_class(definition: Definition) -> type[RosMessage]:
     )
 
 
-def zero(kind: MessageType, field: MessageField) -> Any:
-    """Return what a field is when nothing is said: its default, or zero."""
-    default = field.default
+class LocatedError(MisfitError):
+    """A field's value does not fit; ``path`` says which, from the outermost message on."""
+
+    def __init__(self, text: str, place: str) -> None:
+        super().__init__(text)
+        self.path = [place]
+
+    def __str__(self) -> str:
+        return f"{''.join(reversed(self.path)).lstrip('.')}: {self.args[0]}"
+
+
+def _located(exc: Exception, field: MessageField, value: Any, place: str = "") -> LocatedError:
+    """Return the error of a field, or of one within it, with its place."""
+    if not isinstance(exc, LocatedError):
+        return LocatedError(f"expected {field}, got {_shown(value):.80} ({exc})", place)
+    exc.path.append(place)
+    return exc
+
+
+_MISFITS: Final = (MisfitError, struct.error, KeyError, TypeError, ValueError, OverflowError)
+
+
+# -- zero values --------------------------------------------------------------------------------
+
+
+def zero_maker(kind: MessageType) -> Callable[[], RosMessage]:
+    """Return the function that makes a message of defaults and zeros."""
+    names: dict[str, Any] = {}
+    made: Callable[[], RosMessage] = eval(f"lambda: {_zeros(kind, names)}", names)  # noqa: S307
+    return made
+
+
+def _zeros(kind: MessageType, names: dict[str, Any]) -> str:
+    parts = [_zero(kind, field, names) for field in kind.fields]
+    return f"{_named(kind.cls, names)}({', '.join(parts)})"
+
+
+def _named(value: Any, names: dict[str, Any]) -> str:
+    names[name := f"v{len(names)}"] = value
+    return name
+
+
+def _zero(kind: MessageType, field: MessageField, names: dict[str, Any]) -> str:
+    """Return the expression of what a field is when nothing is said."""
     if field.shape:
         count = field.size if field.shape == "array" else 0
         if field.type in NUMBERS:
             dtype = np.dtype(f"={NUMBERS[field.type]}")
-            return np.zeros(count, dtype) if default is None else np.array(default, dtype)
-        if default is not None:
-            return list(default)
-        return [zero(kind, field._replace(shape="")) for _ in range(count)]
+            usual = field.default
+            array = np.zeros(count, dtype) if usual is None else np.array(usual, dtype)
+            return f"{_named(array, names)}.copy()"
+        if field.default is not None:
+            return repr(list(field.default))
+        one = field._replace(shape="")
+        return f"[{', '.join(_zero(kind, one, names) for _ in range(count))}]"
     if field.nested:
-        return kind.nested[field.type].new()
-    if default is not None:
-        return default
-    if field.type == "string":
-        return ""
-    return False if field.type == "bool" else 0 if field.type in INTEGERS else 0.0
+        return _zeros(kind.nested[field.type], names)
+    if field.default is not None:
+        return repr(field.default)
+    return _ZERO.get(field.type, "0")
 
 
-def fitting(kind: MessageType, field: MessageField, value: Any, where: str) -> Any:
-    """Return a field's value as it is kept: mappings become messages.
-
-    Args:
-        kind: the type that has the field.
-        field: which.
-        value: what it is to be.
-        where: how the error text begins: type and place of the message, such as
-            ``sensor_msgs/msg/Image: header.``.
-
-    Raises:
-        RosMessageError: it does not fit.
-    """
-    where = f"{where}{field.name}"
-    try:
-        if not field.shape:
-            return _one(kind, field, value, where)
-        least = field.size if field.shape == "array" else 0
-        if field.type in NUMBERS:
-            packed(value, NUMBERS[field.type], least, field.size)
-            return value
-        counted(value, least, field.size)
-    except (MisfitError, struct.error, KeyError, TypeError, ValueError, OverflowError) as exc:
-        raise RosMessageError(
-            f"{where}: expected {field}, got {_shown(value):.80} ({exc})"
-        ) from exc
-    one = field._replace(shape="", size=0, name="")
-    return [fitting(kind, one, item, f"{where}[{place}]") for place, item in enumerate(value)]
+_ZERO: Final = {"string": "''", "bool": "False", "float32": "0.0", "float64": "0.0"}
 
 
-def _one(kind: MessageType, field: MessageField, value: Any, where: str) -> Any:
-    if field.nested:
-        nested = kind.nested[field.type]
-        if isinstance(value, Mapping):
-            return filled(nested, value, f"{where}.")
-        if getattr(value, "__msgtype__", None) != nested.name:
-            raise MisfitError(f"a {type(value).__name__}")
-        return value
-    if field.type == "string":
-        text_bytes(value, field.limit)
-    elif field.type == "bool":
-        if value not in (True, False):
-            raise MisfitError("neither True nor False")
-        return bool(value)
-    elif field.type in INTEGERS:
-        value = operator.index(value)
-        struct.pack(f"<{NUMBERS[field.type]}", value)
-    else:
-        struct.pack(f"<{NUMBERS[field.type]}", value)
-        value = float(value)
-    return value
+# -- values that are said -----------------------------------------------------------------------
 
 
-def filled(kind: MessageType, fields: Mapping[str, Any], where: str = "") -> Any:
+def filled(kind: MessageType, fields: Mapping[str, Any]) -> Any:
     """Return a message of these fields, zero elsewhere.
 
     Raises:
-        RosMessageError: a field is not of the type, or does not fit.
+        LocatedError: a field is not of the type, or does not fit.
     """
-    where = where or f"{kind.name}: "
-    known = {field.attribute: field for field in kind.fields}
-    for name in fields:
-        if name not in known:
-            raise RosMessageError(
-                f"{where}{name}: {kind.name} has no such field, expected "
-                f"{', '.join(known) or 'none'}{did_you_mean(str(name), known)}"
-            )
-    return kind.cls(
-        *(
-            fitting(kind, field, fields[name], where) if name in fields else zero(kind, field)
-            for name, field in known.items()
-        )
-    )
+    message = kind.zero()
+    rules = kind.rules
+    for name, value in fields.items():
+        if name not in rules:
+            known = ", ".join(rules) or "none"
+            close = did_you_mean(str(name), rules)
+            text = f"{kind.name} has no such field, expected {known}{close}"
+            raise LocatedError(text, f".{name}")
+        field, rule = rules[name]
+        try:
+            setattr(message, name, rule(value))
+        except _MISFITS as exc:
+            raise _located(exc, field, value, f".{field.name}") from exc
+    return message
 
 
-def check(kind: MessageType, message: Any, where: str = "") -> None:
+def rule_of(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
+    """Return the function that returns a field's value as it is kept: mappings become messages.
+
+    It raises one of ``_MISFITS`` for what does not fit.
+    """
+    if not field.shape:
+        return _rule_of_one(kind, field)
+    least = field.size if field.shape == "array" else 0
+    if field.type in NUMBERS:
+        code = NUMBERS[field.type]
+
+        def numbers(value: Any) -> Any:
+            packed(value, code, least, field.size)
+            return value
+
+        return numbers
+    one = field._replace(shape="", size=0)
+    rule = _rule_of_one(kind, one)
+
+    def each(values: Any) -> list[Any]:
+        counted(values, least, field.size)
+        kept: list[Any] = []
+        for place, value in enumerate(values):
+            try:
+                kept.append(rule(value))
+            except _MISFITS as exc:
+                raise _located(exc, one, value, f"[{place}]") from exc
+        return kept
+
+    return each
+
+
+def _rule_of_one(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
+    if field.type in _RULES:
+        return _RULES[field.type]
+    if field.type == "string":
+
+        def text(value: Any) -> Any:
+            text_bytes(value, field.limit)
+            return value
+
+        return text
+    nested = kind.nested[field.type]
+
+    def message(value: Any) -> Any:
+        if type(value) is dict or isinstance(value, Mapping):
+            return filled(nested, value)
+        if getattr(value, "__msgtype__", None) != nested.name:
+            raise MisfitError(f"a {type(value).__name__}")
+        return value
+
+    return message
+
+
+def _flag(value: Any) -> bool:
+    if value not in (True, False):
+        raise MisfitError("neither True nor False")
+    return bool(value)
+
+
+def _integer(code: str) -> Callable[[Any], int]:
+    def rule(value: Any) -> int:
+        number = operator.index(value)
+        pack(number)
+        return number
+
+    pack = struct.Struct(f"<{code}").pack
+    return rule
+
+
+def _float32(value: Any) -> float:
+    struct.pack("<f", value)
+    return float(value)
+
+
+def _float64(value: Any) -> float:
+    if type(value) is not float:
+        struct.pack("<d", value)
+    return float(value)
+
+
+_RULES: Final[dict[str, Callable[[Any], Any]]] = {
+    **{name: _integer(code) for name, code in INTEGERS.items()},
+    "bool": _flag,
+    "float32": _float32,
+    "float64": _float64,
+}
+
+
+def check(kind: MessageType, message: Any) -> None:
     """Look at every field of a message, to say what is wrong with it.
 
     Raises:
-        RosMessageError: a field is missing or does not fit.
+        LocatedError: a field is missing or does not fit.
     """
-    where = where or f"{kind.name}: "
-    for field in kind.fields:
+    for field, rule in kind.rules.values():
+        place = f".{field.name}"
         try:
             value = getattr(message, field.attribute)
         except AttributeError:
-            raise RosMessageError(
-                f"{where}{field.name}: expected {field}, got none: a {type(message).__name__} has "
-                "no such field"
-            ) from None
-        fitting(kind, field, value, where)
+            text = f"expected {field}, got none: a {type(message).__name__} has no such field"
+            raise LocatedError(text, place) from None
+        try:
+            rule(value)
+        except _MISFITS as exc:
+            raise _located(exc, field, value, place) from exc
         if field.nested:
-            for place, one in enumerate(value if field.shape else [value]):
-                index = f"[{place}]" if field.shape else ""
-                check(kind.nested[field.type], one, f"{where}{field.name}{index}.")
+            for number, one in enumerate(value if field.shape else [value]):
+                try:
+                    check(kind.nested[field.type], one)
+                except LocatedError as exc:
+                    exc.path.append(f"{place}[{number}]" if field.shape else place)
+                    raise

@@ -15,13 +15,28 @@ from smartcam.ros2._type_codec import HEAD, MisfitError, decoder, encoder
 from smartcam.ros2._type_definitions import (
     Definition,
     MessageField,
+    bare,
+    dds_name,
     parse_message,
     parse_service,
     split_name,
 )
-from smartcam.ros2._type_hash import NOT_SUPPORTED, event_of, service_of, type_hash
+from smartcam.ros2._type_hash import (
+    NOT_SUPPORTED,
+    description,
+    event_of,
+    hash_of_description,
+    service_of,
+)
 from smartcam.ros2._type_stores import LACKING, WITHOUT_HASHES, read_stored, stored
-from smartcam.ros2._type_values import check, filled, message_class
+from smartcam.ros2._type_values import (
+    LocatedError,
+    check,
+    filled,
+    message_class,
+    rule_of,
+    zero_maker,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,12 +57,6 @@ _MISFITS: Final = (
 """What the written functions raise where a message or its bytes do not fit."""
 
 
-def dds_name(name: str) -> str:
-    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
-    package, kind, own = name.split("/")
-    return f"{package}::{kind}::dds_::{own}_"
-
-
 class MessageType:
     """A type of message; made by ``RosTypes.message`` and ``RosTypes.service``.
 
@@ -57,11 +66,12 @@ class MessageType:
         fields: name, type, shape, bounds and default of each field.
         constants: by name; attributes of ``cls``, too.
         nested: the types of the messages within by name.
-        cls: the class of its messages, made with all fields in their order.
+        cls: the class of its messages, made with all fields in their order and looked at when they
+            are encoded: the fastest way.
     """
 
     def __init__(
-        self, definition: Definition, nested: Mapping[str, MessageType], get_hash: Callable[[], str]
+        self, definition: Definition, nested: Mapping[str, MessageType], types: RosTypes
     ) -> None:
         self.name = definition.name
         self.dds = dds_name(definition.name)
@@ -69,7 +79,8 @@ class MessageType:
         self.constants = dict(definition.constants)
         self.nested = nested
         self.cls: type[RosMessage] = message_class(definition)
-        self._get_hash = get_hash
+        self._definition = definition
+        self._types = types
 
     def __repr__(self) -> str:
         return f"<MessageType {self.name}>"
@@ -77,7 +88,33 @@ class MessageType:
     @functools.cached_property
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
-        return self._get_hash()
+        return self._types.hash_of(self._definition)
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(self._definition, self._types.definition)
+
+    @functools.cached_property
+    def text(self) -> str:
+        """Its definition and those of all messages within, as recordings have it (``ros2msg``)."""
+        within = description(self._definition, self._types.definition)
+        parts = [self._definition.text()]
+        for one in within["referenced_type_descriptions"]:
+            name: str = one["type_name"]
+            head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
+            parts.append(head + self._types.definition(name).text())
+        return "".join(parts)
+
+    @functools.cached_property
+    def zero(self) -> Callable[[], RosMessage]:
+        """The function that makes a message of defaults and zeros."""
+        return zero_maker(self)
+
+    @functools.cached_property
+    def rules(self) -> dict[str, tuple[MessageField, Callable[[Any], Any]]]:
+        """Each field by its name in Python, and what a value for it has to stand."""
+        return {field.attribute: (field, rule_of(self, field)) for field in self.fields}
 
     @functools.cached_property
     def _encode(self) -> Callable[[Any], bytes]:
@@ -95,7 +132,7 @@ class MessageType:
         Raises:
             RosMessageError: there is no such field, or a value does not fit.
         """
-        return filled(self, fields)
+        return self._filled(fields)
 
     def encode(self, message: Any) -> bytes:
         """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
@@ -104,15 +141,34 @@ class MessageType:
             RosMessageError: it is of another type, or a field does not fit.
         """
         if isinstance(message, Mapping):
-            message = filled(self, message)
+            message = self._filled(message)
         elif getattr(message, "__msgtype__", None) != self.name:
             got = getattr(message, "__msgtype__", type(message).__name__)
             raise RosMessageError(f"{self.name}: expected a message of this type, got {got}")
         try:
             return self._encode(message)
         except _MISFITS as exc:
+            raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
+
+    def _flat(self, data: object) -> memoryview:
+        """Return bytes of other kinds of buffers, one after the other."""
+        if not isinstance(data, bytearray | memoryview):
+            raise RosMessageError(f"{self.name}: expected bytes, got {type(data).__name__}")
+        view = memoryview(data)
+        return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
+
+    def _filled(self, fields: Mapping[str, Any]) -> Any:
+        try:
+            return filled(self, fields)
+        except LocatedError as exc:
+            raise RosMessageError(f"{self.name}: {exc}") from exc
+
+    def _reason(self, message: Any) -> str:
+        try:
             check(self, message)
-            raise RosMessageError(f"{self.name}: a field does not fit: {exc}") from exc
+        except LocatedError as exc:
+            return str(exc)
+        return ""
 
     def decode(self, data: bytes | bytearray | memoryview) -> Any:
         """Return the message of CDR, little- or big-endian.
@@ -123,7 +179,7 @@ class MessageType:
             RosMessageError: the bytes are no such message, or too few, or too many.
         """
         if not isinstance(data, bytes):
-            data = _flat(self.name, data)
+            data = self._flat(data)
         order = _ORDERS.get(bytes(data[:2]))
         if order is None or len(data) < len(HEAD):
             raise RosMessageError(
@@ -171,6 +227,11 @@ class ServiceType:
     def hash(self) -> str:
         """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
         return self._types.hash_of(service_of(self.name))
+
+    @functools.cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(service_of(self.name), self._types.definition)
 
     @functools.cached_property
     def event(self) -> MessageType:
@@ -263,7 +324,7 @@ class RosTypes:
                     there: Any = parse(name, self._service_text(name) or "")
                 else:
                     there = self.definition(name)
-                if _fields(there) != _fields(said):
+                if bare(there) != bare(said):
                     raise ConfigurationError(
                         f"{name}: {self.distribution} has it with other fields, expected the same"
                     )
@@ -305,8 +366,7 @@ class RosTypes:
                 nested = {
                     one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
                 }
-                get_hash = functools.partial(self.hash_of, definition)
-                made = self._messages[name] = MessageType(definition, nested, get_hash)
+                made = self._messages[name] = MessageType(definition, nested, self)
         return made
 
     def _service_text(self, name: str) -> str | None:
@@ -318,7 +378,7 @@ class RosTypes:
         """Return a type's hash."""
         if self.distribution in WITHOUT_HASHES:
             return NOT_SUPPORTED
-        return type_hash(definition, self.definition)
+        return hash_of_description(description(definition, self.definition))
 
     def _unknown(self, name: str) -> ConfigurationError:
         close = did_you_mean(name, self.names())
@@ -335,17 +395,3 @@ class _Shared(RosTypes):
 @functools.cache
 def _shared(distribution: str) -> _Shared:
     return _Shared(distribution)
-
-
-def _flat(name: str, data: object) -> memoryview:
-    """Return bytes of other kinds of buffers, one after the other."""
-    if not isinstance(data, bytearray | memoryview):
-        raise RosMessageError(f"{name}: expected bytes, got {type(data).__name__}")
-    view = memoryview(data)
-    return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
-
-
-def _fields(said: Any) -> Any:
-    if isinstance(said, tuple):
-        return [_fields(one) for one in said]
-    return [one._replace(default=None) for one in said.fields]

@@ -296,7 +296,7 @@ async def test_a_call_ends_with_its_caller_which_is_killed(tmp_path: Path) -> No
 
 
 async def test_the_graph_says_who_does_what_and_forgets_who_is_gone() -> None:
-    async with two_nodes() as (here, there):
+    async with two_nodes(parameters=False) as (here, there):
         here.publisher("chatter", STRING)
         served = here.serve("~/trigger", TRIGGER, trigger)
         there.subscribe("/line1/chatter", STRING)

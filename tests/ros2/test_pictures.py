@@ -250,6 +250,10 @@ async def test_a_subscriber_that_is_stopped_holds_up_nobody() -> None:
             await shown.close()
 
 
+def there_is_a_task(name: str) -> bool:
+    return any(one.get_name().startswith(name) for one in asyncio.all_tasks())
+
+
 async def test_it_ends_in_the_middle_of_a_picture_and_once_only() -> None:
     async with pictures() as (driver, shown, here, there):
         images = there.subscribe(f"{CAM}/image_raw", IMAGE)
@@ -260,6 +264,7 @@ async def test_it_ends_in_the_middle_of_a_picture_and_once_only() -> None:
         with contextlib.suppress(asyncio.CancelledError):
             await closing
         await soon(driver.rests())
+        await until(lambda: not there_is_a_task("pictures of"))
         await shown.close()
         await until(lambda: not here.graph.ends(f"{CAM}/image_raw", "MP"))
         images.close()

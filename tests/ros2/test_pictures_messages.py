@@ -210,9 +210,7 @@ MATRIX = np.array([[600.0, 0, 5.5], [0, 610, 2.5], [0, 0, 1]])
 )
 def test_lenses_there_and_back(model: Any, count: int) -> None:
     coefficients = np.arange(1, count + 1) / 100
-    lens = CameraModel(
-        size=(12, 6), matrix=MATRIX, distortion=coefficients, distortion_model=model
-    )
+    lens = CameraModel(size=(12, 6), matrix=MATRIX, distortion=coefficients, distortion_model=model)
     message = INFO.decode(INFO.encode(lens_fields(lens, header_fields(UTC, "a"), (12, 6))))
     assert message.p.tolist() == [600.0, 0, 5.5, 0, 0, 610, 2.5, 0, 0, 0, 1, 0]
     back = lens_from(message)

@@ -152,7 +152,7 @@ BAD_FIELDS: dict[str, tuple[MessageType, dict[str, Any], str]] = {
     "other message": (
         IMAGE,
         {"header": STRING.new()},
-        "header: expected std_msgs/msg/Header, got S",
+        "header: expected std_msgs/Header, got S",
     ),
     "text for bytes": (IMAGE, {"data": "x"}, "data: expected uint8[], got 'x'"),
     "byte too large": (IMAGE, {"data": [256]}, "data: expected uint8[], got [256]"),
@@ -175,7 +175,7 @@ BAD_FIELDS: dict[str, tuple[MessageType, dict[str, Any], str]] = {
     "no list": (
         DETECTIONS,
         {"detections": {}},
-        "detections: expected vision_msgs/msg/Detection3D[]",
+        "detections: expected vision_msgs/Detection3D[]",
     ),
     "in list": (
         DETECTIONS,
@@ -190,7 +190,7 @@ BAD_FIELDS: dict[str, tuple[MessageType, dict[str, Any], str]] = {
     "beyond the bound": (
         TYPES.message("rcl_interfaces/msg/ParameterDescriptor"),
         {"integer_range": [{}, {}]},
-        "integer_range: expected rcl_interfaces/msg/IntegerRange[<=1]",
+        "integer_range: expected rcl_interfaces/IntegerRange[<=1]",
     ),
     "text too long": (
         TYPES_OF_TESTS.message("test_msgs/msg/Strings"),
@@ -239,10 +239,10 @@ def test_another_message_is_refused() -> None:
         STRING.encode("x")
     message = IMAGE.new()
     message.header = TYPES.message("std_msgs/msg/Bool").new()
-    with pytest.raises(RosMessageError, match=r"header: expected std_msgs/msg/Header, got Bool"):
+    with pytest.raises(RosMessageError, match=r"header: expected std_msgs/Header, got Bool"):
         IMAGE.encode(message)
     del message.header
-    with pytest.raises(RosMessageError, match=r"header: expected std_msgs/msg/Header, got none"):
+    with pytest.raises(RosMessageError, match=r"header: expected std_msgs/Header, got none"):
         IMAGE.encode(message)
 
 

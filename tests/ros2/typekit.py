@@ -95,16 +95,3 @@ def drawn(
         return float(np.float32(number)) if field.type == "float32" else number
 
     return kind.new(**{field.attribute: value(field) for field in kind.fields})
-
-
-def text_of(kind: MessageType) -> str:
-    """Return a message's text with those of all within, as recordings have it."""
-    ahead, seen, parts = [kind], {kind.name}, list[str]()
-    while ahead:
-        one = ahead.pop(0)
-        lines = "".join(f"{field} {field.name}\n" for field in one.fields)
-        parts.append(f"{'=' * 80}\nMSG: {one.name}\n{lines}" if parts else lines)
-        fresh = [nested for name, nested in one.nested.items() if name not in seen]
-        seen |= {nested.name for nested in fresh}
-        ahead += fresh
-    return "".join(parts)

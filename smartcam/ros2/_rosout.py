@@ -1,0 +1,176 @@
+"""What is logged, on the topic ``/rosout``."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import logging
+import threading
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.exceptions import RosError
+from smartcam.ros2._qos import QoS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.ros2._node import Node
+    from smartcam.ros2._topics import RosPublisher
+
+ROSOUT: Final = QoS(latched=True, depth=1000, lifespan=10.0)
+"""As ``rcl_qos_profile_rosout_default`` (``logging_rosout.h`` of rcl)."""
+
+MOST_WAITING = 1000
+"""Records that wait for the event loop; the oldest makes room."""
+
+MOST_TEXT = 8000
+"""Characters of a record's text."""
+
+TURN = 64
+"""Records that are published in one turn of the event loop."""
+
+DEBUG, WARN, FATAL = 10, 30, 50
+
+
+class RosOut:
+    """Publishes what is logged as ``rcl_interfaces/msg/Log``; from any thread, never waiting.
+
+    Args:
+        node: whose publisher it is, and whose name stands in the messages.
+        logger: it, and those below it, are heard.
+        level: the lowest of :mod:`logging` that is published.
+        wanted: says of a record whether it is published; None is all.
+
+    Attributes:
+        dropped: records for which there was no room.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        logger: logging.Logger,
+        *,
+        level: int = logging.WARNING,
+        wanted: Callable[[logging.LogRecord], bool] | None = None,
+    ) -> None:
+        self.dropped: int = 0
+        self._node, self._logger = node, logger
+        self._waiting: collections.deque[dict[str, Any]] = collections.deque(maxlen=MOST_WAITING)
+        self._woken = False
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._publisher: RosPublisher | None = None
+        self._handler = _Handler(self._take, level)
+        self._name = node.full_name.strip("/").replace("/", ".")
+        if wanted is not None:
+            self._handler.addFilter(wanted)
+
+    def start(self) -> None:
+        """Publish from now on. Idempotent.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        if self._publisher is None:
+            self._loop = asyncio.get_running_loop()
+            self._publisher = self._node.publisher("/rosout", "rcl_interfaces/msg/Log", qos=ROSOUT)
+            self._logger.addHandler(self._handler)
+
+    async def close(self) -> None:
+        """Publish what waits, and nothing more. Idempotent."""
+        self._logger.removeHandler(self._handler)
+        publisher = self._publisher
+        if publisher is not None:
+            while self._waiting:
+                self._publish()
+            self._publisher = None
+            publisher.close()
+
+    def _take(self, record: logging.LogRecord) -> None:
+        """Take a record in; in the thread that logs."""
+        if len(self._waiting) == MOST_WAITING:
+            self.dropped += 1
+        self._waiting.append(self._said(record))
+        if not self._woken and self._loop is not None:
+            self._woken = True
+            with contextlib.suppress(RuntimeError):  # the loop is closed, and so is all
+                self._loop.call_soon_threadsafe(self._publish)
+
+    def _said(self, record: logging.LogRecord) -> dict[str, Any]:
+        seconds, rest = divmod(round(record.created * 1e9), 1_000_000_000)
+        below = record.name.removeprefix(self._logger.name)
+        return {
+            "stamp": {"sec": seconds, "nanosec": rest},
+            "level": min(max(record.levelno // 10 * 10, DEBUG), FATAL),
+            "name": _plain(self._name + below if below.startswith(".") else self._name),
+            "msg": _plain(_text(record)),
+            "file": _plain(record.pathname),
+            "function": _plain(record.funcName or ""),
+            "line": min(max(record.lineno, 0), 0xFFFFFFFF),
+        }
+
+    def _publish(self) -> None:
+        self._woken = False  # first: what comes now wakes again
+        publisher = self._publisher
+        if publisher is None:
+            self._waiting.clear()
+            return
+        with _inside():
+            for _ in range(min(TURN, len(self._waiting))):
+                with contextlib.suppress(RosError):  # which would be logged, and come here
+                    publisher.publish(self._waiting.popleft())
+        if self._waiting and not self._woken and self._loop is not None:
+            self._woken = True
+            self._loop.call_soon(self._publish)
+
+
+class _Handler(logging.Handler):
+    """Hands records on; one that is logged while one is handed on, in the same thread, is not."""
+
+    def __init__(self, take: Callable[[logging.LogRecord], None], level: int) -> None:
+        super().__init__(level)
+        self._take = take
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Handle a record without a lock, for which threads would wait."""
+        if getattr(_here, "inside", False) or not self.filter(record):
+            return False
+        self.emit(record)
+        return True
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Hand it on."""
+        with _inside():
+            try:
+                self._take(record)
+            except Exception:  # noqa: BLE001 - as handlers of logging do
+                self.handleError(record)
+
+
+_here = threading.local()
+
+
+@contextlib.contextmanager
+def _inside() -> Iterator[None]:
+    before = getattr(_here, "inside", False)
+    _here.inside = True
+    try:
+        yield
+    finally:
+        _here.inside = before
+
+
+_formatter: Final = logging.Formatter()
+
+
+def _text(record: logging.LogRecord) -> str:
+    try:
+        return _formatter.format(record)
+    except Exception as exc:  # noqa: BLE001 - what was logged is somebody else's
+        return f"{record.msg!s} ({type(exc).__name__}: {exc})"
+
+
+def _plain(text: str) -> str:
+    """Return text as a message can have it."""
+    cut = text if len(text) <= MOST_TEXT else f"{text[:MOST_TEXT]} ..."
+    return cut.replace("\0", "\\0").encode(errors="backslashreplace").decode()
