@@ -136,6 +136,8 @@ class CameraPictures:
         Cancellation: all is closed all the same.
         """
         streams, self._streams = self._streams, []
+        for one in streams:
+            one.end()
         try:
             for one in streams:
                 await one.close()

@@ -58,15 +58,20 @@ class PictureStream:
                 self._run(), name=f"pictures of {self._name}"
             )
 
+    def end(self) -> None:
+        """Read no longer, as soon as may be. Idempotent."""
+        if self._task is not None:
+            self._task.cancel()
+
     async def close(self) -> None:
         """Read no longer. Idempotent.
 
         Cancellation: it ends all the same.
         """
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        self.end()
+        if self._task is not None:
+            await asyncio.wait([self._task])
+            self._task = None
 
     @property
     def heard(self) -> bool:
