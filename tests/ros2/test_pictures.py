@@ -449,6 +449,11 @@ class LastPicture:
         return self.file
 
 
+def images_of(node: Node) -> list[str]:
+    ends = [one.name for one in node.graph if one.kind == "MP"]
+    return [name for name in ends if name.endswith("/image_raw")]
+
+
 async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: Path) -> None:
     camera: Any = LastPicture()
     async with two_nodes() as (here, there):
@@ -463,8 +468,7 @@ async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: P
             images = there.subscribe(f"/n{number}/image_raw", IMAGE, qos=LATCHED)
             assert bytes((await soon(anext(images))).data) == bytes([number]) * 8
             images.close()
-        kept = [one for one in here.graph if one.kind == "MP" and one.name.endswith("image_raw")]
-        assert len(kept) == MOST_NAMESPACES
+        assert len(images_of(here)) == MOST_NAMESPACES
         reply = await there.client(f"{CAM}/set_camera_info", SET).call(request())
         assert reply.success, reply.status_message
         camera.file = b"GIF89a"
@@ -472,7 +476,7 @@ async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: P
         camera.waits = True
         assert "no answer" in (await client.call(response_namespace="/a")).status_message
         await shown.close()
-        await until(lambda: not [one for one in here.graph if one.kind == "MP"])
+        await until(lambda: not images_of(here))
 
 
 class Fleet(LastPicture):
