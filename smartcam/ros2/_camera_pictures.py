@@ -79,7 +79,7 @@ class CameraPictures:
         self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
         self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
         self._ends: list[Any] = []
-        self._streams: list[PictureStream] = []
+        self._streams: list[PictureStream[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=RECENT)
         self._size: tuple[int, int] | None = None
         self._codecs = Codecs(threads=1)
@@ -190,7 +190,7 @@ class CameraPictures:
         self._size = (frame.width, frame.height)
         way = compression(frame)
         small = frame
-        if way.first == "Mono8" or way.first == "RGB8":
+        if way.first:
             small = await self._codecs.converted(small, way.first)
         if way.how == "png":
             small = await self._codecs.png(small)

@@ -75,7 +75,7 @@ class DepthTopics:
         self._encoding, self._organized = depth_encoding, organized
         self._nearest = 0.0
         self._publishers: dict[str, Any] = {}
-        self._stream: PictureStream | None = None
+        self._stream: PictureStream[DepthFrame] | None = None
         self._thread: ThreadPoolExecutor | None = None
 
     def start(self) -> None:

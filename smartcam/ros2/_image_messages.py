@@ -7,7 +7,7 @@ in millimetres, 0 for none, or 32FC1 in metres, NaN for none.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -169,8 +169,8 @@ class Compression(NamedTuple):
         encoding: of the pixels that who decodes it gets.
     """
 
-    how: str
-    first: str
+    how: Literal["jpeg", "png", ""]
+    first: Literal["Mono8", "RGB8", ""]
     encoding: str
 
     def text(self) -> str:

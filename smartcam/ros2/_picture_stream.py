@@ -5,18 +5,18 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from smartcam.backoff import Backoff
 from smartcam.exceptions import FrameFormatError, FrameTimeoutError, SmartCamError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
     from contextlib import AbstractAsyncContextManager
 
-    from smartcam.frames import Frame, FrameReader
-
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+Item = TypeVar("Item")
 
 LOOK: Final = 0.1
 """Seconds between two looks whether somebody hears."""
@@ -25,7 +25,7 @@ AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
 """When a source that ended is opened again, while somebody hears."""
 
 
-class PictureStream:
+class PictureStream(Generic[Item]):
     """Reads a source while one of its topics is heard, and has each frame published.
 
     Args:
@@ -42,8 +42,8 @@ class PictureStream:
         self,
         name: str,
         publishers: Sequence[Any],
-        read: Callable[[float], AbstractAsyncContextManager[FrameReader]],
-        publish: Callable[[Frame], Awaitable[None]],
+        read: Callable[[float], AbstractAsyncContextManager[AsyncIterator[Item]]],
+        publish: Callable[[Item], Awaitable[None]],
     ) -> None:
         self.frames: int = 0
         self._name, self._publishers = name, publishers
@@ -111,7 +111,7 @@ class PictureStream:
         except Exception:
             logger.exception("%s ! its pictures failed", self._name)
 
-    async def _one(self, frame: Frame) -> None:
+    async def _one(self, frame: Item) -> None:
         try:
             await self._publish(frame)
         except FrameFormatError as exc:  # the next one may be whole

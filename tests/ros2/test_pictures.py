@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import smartcam.frames
+from smartcam import Backoff
 from smartcam.calibration import CameraModel
 from smartcam.calibration.formats import read_cameras, write_camera_info
 from smartcam.exceptions import (
@@ -172,7 +173,7 @@ async def test_what_ends_or_fails_is_told_once_and_tried_again(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(picture_stream, "LOOK", 0.01)
-    monkeypatch.setattr(picture_stream, "AGAIN", picture_stream.Backoff(initial=0.01, maximum=0.02))
+    monkeypatch.setattr(picture_stream, "AGAIN", Backoff(initial=0.01, maximum=0.02))
     async with pictures() as (driver, _, _, there):
         images = there.subscribe(f"{CAM}/image_raw", IMAGE)
         await given(driver, frame(1))
