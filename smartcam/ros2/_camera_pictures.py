@@ -104,6 +104,7 @@ class CameraPictures:
         if self._thread is not None:
             return
         self._thread = ThreadPoolExecutor(1, "smartcam-ros2-pictures")
+        self._codecs = Codecs(threads=1)
         self._codecs.begin()
         node = self._node
         if self.streams:

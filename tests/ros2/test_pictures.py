@@ -101,6 +101,11 @@ async def test_the_device_streams_while_somebody_hears() -> None:
         infos.close()
         await soon(driver.rests())
         assert driver.calls == ["open", "start", "stop"]
+        await shown.close()
+        shown.start()
+        images = there.subscribe(f"{CAM}/image_raw", IMAGE)
+        await given(driver, frame(3))
+        assert (await soon(anext(images))).data[0] == 3
 
 
 async def test_two_hear_all_that_is_offered_and_only_the_last_one_ends_it() -> None:
