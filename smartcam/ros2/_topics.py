@@ -240,12 +240,14 @@ class RosPublisher(RosEnd):
         data = self.type.encode(what)
         if self._closed:
             return
-        put = self._hastily if len(data) > LONG else self._publisher.put
-        quietly(put, data, attachment=attachment)
+        quietly(self._hastily, data, attachment)
         self.published += 1
 
     def _hastily(self, data: bytes, attachment: bytes) -> None:
-        """Have the engine send a long message to all to whom none is under way."""
+        """Have the engine send a message to all to whom none is under way.
+
+        By a publisher of its own, since the session may take the other one back meanwhile.
+        """
         if self._hasty is None:
             zenoh = self._context.zenoh.engine
             self._hasty = self._context.zenoh.session.declare_publisher(

@@ -10,7 +10,7 @@ from typing import Any
 from smartcam._zenoh import with_ports
 from smartcam.ros2 import Node, RosContext
 
-PATIENCE = 8.0
+PATIENCE = 60.0
 """Seconds that only a failure takes."""
 
 STRING = "std_msgs/msg/String"
