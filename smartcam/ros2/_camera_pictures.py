@@ -19,7 +19,7 @@ from smartcam.ros2._image_messages import (
     prepared,
 )
 from smartcam.ros2._picture_requests import PictureRequests, one_frame
-from smartcam.ros2._picture_stream import PictureStream, say_newest
+from smartcam.ros2._picture_stream import HeardPictures, say_newest
 from smartcam.ros2._qos import DRIVER
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class CameraPictures:
         self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
         self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
         self._ends: list[Any] = []
-        self._streams: list[PictureStream[Frame]] = []
+        self._streams: list[HeardPictures[Frame]] = []
         self._stamps: collections.deque[float] = collections.deque(maxlen=RECENT)
         self._size: tuple[int, int] | None = None
         self._codecs = Codecs(threads=1)
@@ -117,8 +117,8 @@ class CameraPictures:
             self._image, self._info, self._small = image, info, small
             name = node.full_name
             self._streams = [
-                PictureStream(name, (image, info), self._read, self._publish_raw),
-                PictureStream(
+                HeardPictures(name, (image, info), self._read, self._publish_raw),
+                HeardPictures(
                     name, (small,), partial(self._read, encoding="jpeg"), self._publish_small
                 ),
             ]

@@ -13,7 +13,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._cloud_messages import cloud_fields, depth_fields, disparity_fields, points_of
 from smartcam.ros2._image_messages import array_fields, header_fields
 from smartcam.ros2._lens_messages import lens_fields
-from smartcam.ros2._picture_stream import PictureStream, say_newest
+from smartcam.ros2._picture_stream import HeardPictures, say_newest
 from smartcam.ros2._qos import DRIVER
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class DepthTopics:
         self._encoding, self._organized = depth_encoding, organized
         self._nearest = 0.0
         self._publishers: dict[str, Any] = {}
-        self._stream: PictureStream[DepthFrame] | None = None
+        self._stream: HeardPictures[DepthFrame] | None = None
         self._thread: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
@@ -86,7 +86,7 @@ class DepthTopics:
             self._publishers[name] = self._node.publisher(f"~/{name}", kind, qos=DRIVER)
         self._thread = ThreadPoolExecutor(1, "smartcam-ros2-depth")
         publishers = list(self._publishers.values())
-        self._stream = PictureStream(self._node.full_name, publishers, self._read, self._publish)
+        self._stream = HeardPictures(self._node.full_name, publishers, self._read, self._publish)
         self._stream.start()
 
     async def close(self) -> None:

@@ -25,7 +25,7 @@ AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
 """When a source that ended is opened again, while somebody hears."""
 
 
-class PictureStream(Generic[Item]):
+class HeardPictures(Generic[Item]):
     """Reads a source while one of its topics is heard, and has each frame published.
 
     Args:
