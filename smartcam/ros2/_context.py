@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import collections
+import itertools
 import logging
 import os
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +37,33 @@ SETTINGS: Mapping[str, Any] = {
     "scouting/gossip/enabled": True,
 }
 """Of a session of Zenoh that ROS nodes stand on, as rmw_zenoh's own have them."""
+
+
+PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
+"""Of long messages of which the newest counts. The engine has one of each priority and link under
+way; topics take turns, so that the two pictures of a pair do not meet in one."""
+
+PAUSE, RATE = 0.002, 5e8
+"""Seconds, and bytes a second, that a link which is well needs until the engine has taken one."""
+
+
+class NewestSlot:
+    """A thread, and a priority, for long messages of which the newest counts.
+
+    Attributes:
+        lane: the thread.
+        priority: the engine's.
+    """
+
+    def __init__(self, priority: str) -> None:
+        self.lane: str = f"newest-{priority.lower()}"
+        self.priority: str = priority
+        self._free = 0.0
+
+    def wait(self, size: int) -> None:
+        """Wait until the message before should be taken; ``size`` bytes come now."""
+        time.sleep(max(0.0, self._free - time.monotonic()))
+        self._free = time.monotonic() + PAUSE + size / RATE
 
 
 class RosContext:
@@ -77,6 +106,7 @@ class RosContext:
         self._lock = threading.Lock()
         self._threads: dict[str, ThreadPoolExecutor] = {}
         self._long: collections.Counter[object] = collections.Counter()
+        self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
     async def open(self, timeout: float) -> None:
@@ -153,6 +183,10 @@ class RosContext:
             )
 
     # ------------------------------------------------------------------ what may wait
+
+    def slot(self) -> NewestSlot:
+        """Return the slot of one more topic of which the newest counts."""
+        return next(self._slots)
 
     def waits(self, owner: object) -> bool:
         """Whether messages of an owner wait to be said."""

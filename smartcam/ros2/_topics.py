@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.models import SubscriberStatistics
-    from smartcam.ros2._context import RosContext
+    from smartcam.ros2._context import NewestSlot, RosContext
     from smartcam.ros2._tokens import Entity
     from smartcam.ros2._types import MessageType
 
@@ -126,6 +126,7 @@ class RosPublisher(RosEnd):
         self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
         self._patient: Any = None  # waits for room
         self._hasty: Any = None  # leaves out to whom one is under way
+        self._slot: NewestSlot | None = None
         self._lane = "latched" if qos.latched else "long"
         self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
         self._appear()
@@ -184,6 +185,7 @@ class RosPublisher(RosEnd):
         Raises:
             RosError: the publisher is closed.
         """
+        self._check_open()
         attachment = self._attachment()
         if self._direct and len(data) <= LONG and not self._context.waits(self):
             quietly(self._publisher.put, data, attachment=attachment)
@@ -200,11 +202,10 @@ class RosPublisher(RosEnd):
         self._context.say_later(self, self._say_next, self._lane)
 
     async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
-        """Publish a message, except to whom one is under way already.
+        """Publish a message; a long one except to whom one is under way already.
 
         For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
-        that is old. It returns when the engine has copied the message; a thread encodes it. A
-        publisher has either these or those of :meth:`publish`.
+        that is old. It returns when the engine has copied the message; a thread encodes it.
 
         Raises:
             RosMessageError: it is no message of the type.
@@ -212,15 +213,17 @@ class RosPublisher(RosEnd):
 
         Cancellation: the message is published or not.
         """
-        what, attachment = said(message, fields), self._attachment()
-        self._lane = "newest"
+        what, _ = said(message, fields), self._check_open()
+        if self._slot is None:
+            self._slot = self._context.slot()
+            self._lane = self._slot.lane
         done: concurrent.futures.Future[None] = concurrent.futures.Future()
 
         def say() -> None:
             if not done.set_running_or_notify_cancel():
                 return
             try:
-                self._say_newest(what, attachment)
+                self._say_newest(self.type.encode(what))
             except BaseException as exc:  # noqa: BLE001 - told to who waits
                 done.set_exception(exc)
             else:
@@ -229,33 +232,36 @@ class RosPublisher(RosEnd):
         self._context.say_later(self, say, self._lane)
         await asyncio.wrap_future(done)
 
-    def _attachment(self) -> bytes:
-        if self._closed:
-            raise RosError(f"{self.name}: this publisher is closed")
-        self._number += 1
-        return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+    def _say_newest(self, data: bytes) -> None:
+        """Say a message; in the thread for it.
 
-    def _say_newest(self, what: object, attachment: bytes) -> None:
-        """Encode and say a message; in the thread for it."""
-        data = self.type.encode(what)
-        if self._closed:
+        A long one by a publisher of its own, whose messages the engine leaves out for each link
+        that has one of the same priority under way; so they have a little time between them.
+        """
+        slot, publisher = self._slot, self._publisher
+        if self._closed or slot is None:
             return
-        quietly(self._hastily, data, attachment)
+        attachment = self._attachment()
+        if len(data) > LONG:
+            if self._hasty is None:
+                zenoh = self._context.zenoh.engine
+                self._hasty = self._context.zenoh.session.declare_publisher(
+                    self.entity.key,
+                    congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+                    priority=getattr(zenoh.Priority, slot.priority),
+                )
+            publisher = self._hasty
+            slot.wait(len(data))
+        quietly(publisher.put, data, attachment=attachment)
         self.published += 1
 
-    def _hastily(self, data: bytes, attachment: bytes) -> None:
-        """Have the engine send a message to all to whom none is under way.
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RosError(f"{self.name}: this publisher is closed")
 
-        By a publisher of its own, since the session may take the other one back meanwhile.
-        """
-        if self._hasty is None:
-            zenoh = self._context.zenoh.engine
-            self._hasty = self._context.zenoh.session.declare_publisher(
-                self.entity.key,
-                congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
-                priority=zenoh.Priority.DATA_LOW,
-            )
-        self._hasty.put(data, attachment=attachment)
+    def _attachment(self) -> bytes:
+        self._number += 1
+        return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
