@@ -39,6 +39,10 @@ SETTINGS: Mapping[str, Any] = {
 """Of a session of Zenoh that ROS nodes stand on, as rmw_zenoh's own have them."""
 
 
+CALM, MOST_DIRECT = 0.01, 8
+"""Seconds, and messages in that time that the event loop hands to the engine itself: it would drop
+those beyond. A thread does the others, which waits for room."""
+
 PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
 """Of long messages of which the newest counts. The engine has one of each priority and link under
 way; topics take turns, so that the two pictures of a pair do not meet in one."""
@@ -106,6 +110,8 @@ class RosContext:
         self._lock = threading.Lock()
         self._threads: dict[str, ThreadPoolExecutor] = {}
         self._long: collections.Counter[object] = collections.Counter()
+        self._in_lane: collections.Counter[str] = collections.Counter()
+        self._calm_since, self._said_directly, self._crowded = 0.0, 0, 0.0
         self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
@@ -192,6 +198,18 @@ class RosContext:
         """Whether messages of an owner wait to be said."""
         return bool(self._long[owner])
 
+    def calm(self) -> bool:
+        """Whether the event loop may hand one more short message to the engine."""
+        now = time.monotonic()
+        if self._in_lane["short"] or now - self._crowded < CALM:
+            # the thread may wait in the engine, and would have the loop wait, too; and the engine
+            # has just been full
+            return False
+        if now - self._calm_since > CALM:
+            self._calm_since, self._said_directly = now, 0
+        self._said_directly += 1
+        return self._said_directly <= MOST_DIRECT
+
     def say_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
         """Have the thread of a lane call ``say``, which may wait for room; in order."""
         thread = self._threads.get(lane)
@@ -199,10 +217,14 @@ class RosContext:
             thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")
         with self._lock:
             self._long[owner] += 1
-        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner))
+            self._in_lane[lane] += 1
+        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner, lane))
 
-    def _said(self, owner: object) -> None:
+    def _said(self, owner: object, lane: str) -> None:
         with self._lock:
+            self._in_lane[lane] -= 1
+            if lane == "short":
+                self._crowded = time.monotonic()
             self._long[owner] -= 1
             if not self._long[owner]:
                 del self._long[owner]

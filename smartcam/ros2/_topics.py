@@ -44,6 +44,9 @@ def said(message: object, fields: dict[str, Any]) -> object:
     return fields if message is None else message
 
 
+MOST_SHORT = 10_000
+"""Short messages of a topic that wait to be said; of long ones as many as its depth says."""
+
 HEARTBEAT = 0.5
 """Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
 
@@ -124,10 +127,10 @@ class RosPublisher(RosEnd):
         self._publisher: Any = None
         qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
         self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._patient: Any = None  # waits for room
+        self._patient: dict[str, Any] = {}  # by lane: what waits for room
         self._hasty: Any = None  # leaves out to whom one is under way
         self._slot: NewestSlot | None = None
-        self._lane = "latched" if qos.latched else "long"
+        self._lane = "latched" if qos.latched else "short"
         self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
         self._appear()
 
@@ -187,14 +190,18 @@ class RosPublisher(RosEnd):
         """
         self._check_open()
         attachment = self._attachment()
-        if self._direct and len(data) <= LONG and not self._context.waits(self):
+        waits = self._context.waits(self)
+        if len(data) > LONG and self._lane == "short" and not waits:
+            self._lane = "long"  # from now on: a short one would overtake it
+        if self._direct and self._lane == "short" and not waits and self._context.calm():
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
             return
+        most = MOST_SHORT if self._lane == "short" else self.entity.qos.kept
         with self._lock:
             self._waiting.append((data, attachment))
             self._bytes += len(data)
-            while len(self._waiting) > self.entity.qos.kept or self._bytes > MOST_WAITING:
+            while len(self._waiting) > most or self._bytes > MOST_WAITING:
                 if len(self._waiting) == 1:
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
@@ -274,17 +281,17 @@ class RosPublisher(RosEnd):
         self.published += 1
 
     def _patiently(self) -> Any:
-        """Return what publishes long messages: it waits for room, behind all else."""
-        zenoh = self._context.zenoh.engine
+        """Return what waits for room: for long messages behind all else."""
+        zenoh, lane = self._context.zenoh.engine, self._lane
         if self.entity.qos.latched:
             return self._publisher  # which has to keep them
-        if self._patient is None:
-            self._patient = self._context.zenoh.session.declare_publisher(
+        if lane not in self._patient:
+            self._patient[lane] = self._context.zenoh.session.declare_publisher(
                 self.entity.key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,
+                priority=zenoh.Priority.DATA if lane == "short" else zenoh.Priority.DATA_LOW,
             )
-        return self._patient
+        return self._patient[lane]
 
     def close(self) -> None:
         """Be gone; what waits to be said is not said any more. Idempotent."""
@@ -301,10 +308,10 @@ class RosPublisher(RosEnd):
             self._take_back()
 
     def _take_back(self) -> None:
-        for one in (self._patient, self._hasty):
+        for one in (*self._patient.values(), self._hasty):
             if one is not None:
                 quietly(one.undeclare)
-        self._patient = self._hasty = None
+        self._patient, self._hasty = {}, None
         self._publisher = None
         self._outlet.close()
 
