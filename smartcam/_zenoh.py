@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import ctypes
 import functools
 import io
 import json
@@ -31,11 +32,13 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
-    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "(rx:(handover:app),acc:(handover:app),net:(handover:app),tx:(worker_threads:1),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: one for everything, which halves the CPU time of a call; its callbacks here only
-put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
+"""Zenoh's threads: as few as can be, which halves the CPU time of a call; its callbacks here only
+put what comes into a queue. What sends has one of its own: the other waits for it where an answer
+is longer than a queue (128 KiB of tokens, which 20 nodes of ROS have), and would wait for itself
+until the link is given up. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
@@ -266,7 +269,9 @@ class ZenohSession:
             return
         for one in tuple(self._declared):
             one.close()
-        closing = self._loop.run_in_executor(None, _end, session, self._threads())
+        closing = self._loop.run_in_executor(
+            None, _end, session, self._threads(), bool(self._link.listen)
+        )
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.shield(closing)
@@ -482,10 +487,17 @@ def _refuse(query: Any, why: str) -> None:
     quietly(query.drop)
 
 
-def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:
-    """Say what is to be said yet, then end the session."""
+def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
+    """Say what is to be said yet, then end the session.
+
+    A router that is closed is never freed: its last reference would wait for an engine's thread,
+    and hold the interpreter, which that thread may wait for to tell another session of this process
+    something. It is 16 KiB.
+    """
     for one in threads:
         one.shutdown()
+    if router:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()
 
 
