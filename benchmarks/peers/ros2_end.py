@@ -1,7 +1,8 @@
-"""An end of ROS 2 in a process of its own: ``python -m benchmarks.peers.ros2_end KIND PORT FOLDER``.
+"""An end of ROS 2 in a process of its own.
 
-KIND is ``smartcam``, ``sdk`` (zenoh-ros2-sdk) or ``zenoh`` (bare, with bytes that are ready). It
-does what the lines of JSON on its standard input say, and answers each by one. The end with a
+``python -m benchmarks.peers.ros2_end KIND PORT FOLDER``: KIND is ``smartcam``, ``sdk``
+(zenoh-ros2-sdk) or ``zenoh`` (bare, with bytes that are ready). It does what the lines of JSON on
+its standard input say, and answers each by one. The end with a
 source or a server of smartcam or of bare Zenoh is the router at PORT; those of the SDK, which
 cannot be one, meet at smartcam's. FOLDER is where the SDK finds its message definitions.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -182,7 +184,9 @@ class SdkEnd(End):
         def answer(request: Any) -> Any:
             return server.response_msg_class(success=request.data, message="as asked")
 
-        texts = dict(zip(("request_definition", "response_definition"), SET_BOOL_TEXTS, strict=True))
+        texts = dict(
+            zip(("request_definition", "response_definition"), SET_BOOL_TEXTS, strict=True)
+        )
         server = ROS2ServiceServer(SERVICE, SET_BOOL, answer, **texts, **self._place)
         self._kept.append(server)
 
@@ -306,9 +310,7 @@ class ZenohEnd(End):
 
         def call() -> None:
             came.clear()
-            self._querier.get(
-                self._direct(hear), payload=self._request, attachment=bytes(33)
-            )
+            self._querier.get(self._direct(hear), payload=self._request, attachment=bytes(33))
             if not came.wait(LIMIT) or found.pop() != self._reply:
                 raise TimeoutError("no reply came")
 
@@ -412,11 +414,12 @@ def write_definitions(folder: Path) -> None:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
+    git = shutil.which("git") or "git"
     who = ("-c", "user.name=bench", "-c", "user.email=bench@localhost")
     for repository in {Path(name).parts[0] for name in DEFINITIONS}:
         if not (folder / repository / ".git").exists():
             for command in (("init", "-q", "-b", "jazzy"), ("add", "."), ("commit", "-qm", "it")):
-                subprocess.run(["git", *who, *command], cwd=folder / repository, check=True)
+                subprocess.run([git, *who, *command], cwd=folder / repository, check=True)
 
 
 KINDS = {"smartcam": SmartcamEnd, "sdk": SdkEnd, "zenoh": ZenohEnd}
