@@ -123,7 +123,7 @@ class End:
         process.stdin.flush()
         line = process.stdout.readline()
         if not line:
-            raise RuntimeError(f"{process.args}: it ended at {do}")
+            raise RuntimeError(f"a peer on port {self.port} ended at {do}")
         return json.loads(line)
 
     def close(self) -> None:
@@ -289,6 +289,10 @@ async def _detections(plan: Plan, pair: Pair) -> list[Comparison]:
             },
             unit="ms",
         )
+        published = count * (plan.rounds + 1)
+        await asyncio.sleep(0.2)
+        heard = pair.far("heard")
+        assert published >= heard >= 0.9 * published, (heard, published)
     case, goal = "Detection3DArray of ten", Goal("at most", 0.15, "ms")
     writes, reads = series["rosbags writes"], series["rosbags reads"]
     return [

@@ -405,7 +405,11 @@ class SmartcamEnd(End):
 
     async def hear(self, topic: str, kind: str) -> None:
         """Hear a topic, and leave what comes."""
-        self._kept.append((await self._open(listen=False)).subscribe(topic, kind))
+        self._heard = (await self._open(listen=False)).subscribe(topic, kind)
+
+    def heard(self) -> int:
+        """Return how many messages came there."""
+        return int(self._heard.statistics().offered)
 
 
 def write_definitions(folder: Path) -> None:

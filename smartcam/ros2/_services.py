@@ -77,7 +77,7 @@ class RosService(RosEnd):
             lambda session: session.declare_queryable(entity.key, direct(on_query), complete=True)
         )
         self._appear()
-        self._stop_listening = context.graph.listen(self._on_graph)
+        self._stop_listening = context.watch(self.name, CLIENT, self._on_graph)
 
     def _take(self, query: Any, data: bytes, extra: bytes | None) -> None:
         self.calls += 1
@@ -129,7 +129,7 @@ class RosService(RosEnd):
 
     def _on_graph(self, entity: Entity, present: bool) -> None:
         """Give up what was called by who is gone."""
-        if present or entity.kind != CLIENT or entity.name != self.name:
+        if present:
             return
         for task, gid in self._tasks.items():
             if gid == entity.gid:
