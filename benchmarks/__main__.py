@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"no benchmark is called {', '.join(unknown)}")
     if options.rounds < 1:
         parser.error("--rounds: 1 or more")
-    plan = Plan(rounds=2, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
+    plan = Plan(rounds=1, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
     comparisons: list[Comparison] = []
     curves: list[Curve] = []
     for name in options.names or BENCHMARKS:

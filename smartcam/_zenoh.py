@@ -32,13 +32,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
-    "(rx:(handover:app),acc:(handover:app),net:(handover:app),tx:(worker_threads:1),"
+    "(rx:(handover:app),acc:(handover:app),net:(worker_threads:2),tx:(worker_threads:1),"
     "app:(worker_threads:1))"
 )
 """Zenoh's threads: as few as can be, which halves the CPU time of a call; its callbacks here only
-put what comes into a queue. What sends has one of its own: the other waits for it where an answer
-is longer than a queue (128 KiB of tokens, which 20 nodes of ROS have), and would wait for itself
-until the link is given up. The variable ZENOH_RUNTIME goes before it."""
+put what comes into a queue. What sends has one of its own: the one for what comes waits for it
+where an answer is longer than a queue (128 KiB, which the tokens of 20 nodes of ROS are), and would
+wait for itself until the link is given up. Its inner tasks have two of their own: where a latched
+publisher is closed, the binding waits for such a task and lets no thread of Python run meanwhile,
+also not the one that is to call back. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
@@ -240,6 +242,8 @@ class ZenohSession:
             opening.add_done_callback(_close_late)
             raise
         self._end_lingering()
+        self._waiting.clear()
+        self._bytes, self._woken = 0, False
         self._bell = _LoopBell.on(loop, self._drain)
         return self
 
@@ -426,7 +430,7 @@ class _LoopBell:
 
     def ring(self) -> None:
         """Have the loop call; once, however often it is rung before."""
-        with contextlib.suppress(ValueError):  # it is closed, and nobody hears any more
+        with contextlib.suppress(ValueError, OSError):  # closed: nobody hears any more
             self._file.write(_ONE)
 
     def _hear(self) -> None:

@@ -33,7 +33,8 @@ PUBLIC = [
     "MissingExtraError", "NotRunningError", "Observer", "OvertriggeredError", "PluginError",
     "Pose", "Position", "ProtocolError", "Quaternion", "Reconnected", "RecordingError",
     "RemoteProtocolError",
-    "ResponseTimeoutError", "Result", "SmartCamError", "SmartCamera", "Statistics", "Status",
+    "ResponseTimeoutError", "Result", "RosError", "RosMessageError", "ServiceCallError",
+    "ServiceTimeoutError", "SmartCamError", "SmartCamera", "Statistics", "Status",
     "StatusChanged", "SubscriberOverflowError", "TriggerError", "TriggerTimeoutError",
     "UnsupportedError", "WrongApplicationError", "__version__", "connect", "emulator",
     "exceptions", "frames", "interpreters", "layout", "models", "protocols",
@@ -113,7 +114,7 @@ MOST_PUBLIC = 445
 """Names in all, a name that stands in two places counted once. A third of them are words: messages,
 faults of a camera, rules of a link, errors."""
 
-MOST_AT_THE_TOP = 64
+MOST_AT_THE_TOP = 68
 
 
 def test_top_level_exports_are_pinned() -> None:

@@ -1,4 +1,4 @@
-"""``smartcam record``, ``replay`` and ``pcap``: a camera's run in a file, and out of it."""
+"""``smartcam record``, ``replay``, ``pcap``, ``bag``: a camera's run in a file, and out of it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from smartcam.backoff import Backoff
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     CameraFaultError,
+    ConfigurationError,
     ConnectionClosedError,
     ConnectionLostError,
     ConnectionTakenError,
@@ -27,14 +28,16 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.fleet import FleetCamera
-from smartcam.recording import Recorder, load_recording, write_pcap
+from smartcam.recording import BagRecorder, Recorder, load_recording, write_pcap
 from smartcam.recording import replay as replay_camera
+from smartcam.recording._bag_recording import BagConversion
+from smartcam.ros2._camera_reading import in_pixels, own_interpreter
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from smartcam.camera import Camera
-    from smartcam.recording import Recording
+    from smartcam.recording import BagCounts, Recording
 
 _camera = click.option(
     "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
@@ -44,11 +47,18 @@ _camera = click.option(
 @click.command(
     help="Record everything a camera says to an MCAP file, until Ctrl-C, --count or --seconds: "
     "frames, results, events, errors; of a fleet's camera no frames, and the results of every "
-    "program's triggers. A lost link is made again, and the recording goes on. "
+    "program's triggers. With --bag also, or only, as a rosbag2 for ROS 2. A lost link is made "
+    "again, and the recording goes on. "
     f"{CONNECTS}"
 )
 @click.argument("url")
-@option("--output", required=True)
+@option("--output")
+@click.option(
+    "--bag",
+    metavar="FOLDER",
+    type=click.Path(),
+    help="Write a rosbag2 (MCAP): results, localizations, status and diagnostics as ROS messages.",
+)
 @option("--force")
 @click.option(
     "--every", type=SECONDS, metavar="SECONDS", help="Send a trigger every so many seconds."
@@ -57,43 +67,84 @@ _camera = click.option(
 @option("--application")
 @option("--interpret-as", help="How to read results; default raw: bytes, kept as hex.")
 @runs("--y-down", "--count", "--seconds", "--timeout", *OUTPUT, interrupted=0)
-async def record(url: str, output: str, force: bool, every: float | None, options: Options) -> None:
+async def record(
+    url: str,
+    output: str | None,
+    bag: str | None,
+    force: bool,
+    every: float | None,
+    options: Options,
+) -> None:
     """Record a camera."""
-    recorder = Recorder(output, overwrite=force)
-    with options.camera(url, observers=[recorder], reconnect=Backoff()) as unopened:
-        await _record(unopened, recorder, every, options)
+    recorders = _recorders(output, bag, force=force)
+    with options.camera(url, observers=recorders, reconnect=Backoff()) as unopened:
+        await _record(unopened, recorders, every, options)
+
+
+def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Recorder]:
+    """Return what is to be written."""
+    recorders: list[Recorder] = []
+    if output is not None:
+        recorders.append(Recorder(output, overwrite=force))
+    if bag is not None:
+        if output is not None and Path(output).resolve().parent == Path(bag).resolve():
+            raise ConfigurationError(f"--output {output}: it would be in the bag's own folder")
+        recorders.append(BagRecorder(bag, overwrite=force))
+    if not recorders:
+        raise click.UsageError("Missing option '-o' / '--output', or '--bag'.")
+    return recorders
 
 
 async def _record(
-    unopened: Camera, recorder: Recorder, every: float | None, options: Options
+    unopened: Camera, recorders: list[Recorder], every: float | None, options: Options
 ) -> None:
-    recorder.open()
-    options.remark(unopened)
+    opened: list[Recorder] = []
     facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
-    recorder.describe(unopened.name, **{name: fact for name, fact in facts.items() if fact})
     try:
+        for recorder in recorders:
+            recorder.open()
+            opened.append(recorder)
+        options.remark(unopened)
+        _describe(recorders, unopened.name, **{name: fact for name, fact in facts.items() if fact})
         # subscribed, so that every container is interpreted
         results = unopened.results(max_queue=1)
         async with unopened as camera:
             if isinstance(camera, FleetCamera):
                 # its frames, which would tell, are its agent's
                 dialect = camera.capabilities.dialect
-                recorder.describe(camera.name, dialect=dialect, endian=camera.endian)
+                _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
+                # what its agent knows of them, where it was not said here
+                read = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
+                if in_pixels(own_interpreter(camera, camera.active_application)):
+                    read["pixels"] = True
+                _describe(recorders, camera.name, **{name: on for name, on in read.items() if on})
             elif every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "
                     "while it is recorded: --every SECONDS"
                 )
-            value = {"url": camera.url, "file": str(recorder.path)}
-            options.show(value, f"recording {camera.url} to {recorder.path}, Ctrl-C to end")
-            jobs: list[Coroutine[Any, Any, None]] = [_watch_disk(recorder)]
-            jobs.append(_count(results, recorder, options.count))
+            paths = {_word(recorder): str(recorder.path) for recorder in recorders}
+            options.show(
+                {"url": camera.url, **paths},
+                f"recording {camera.url} to {' and '.join(paths.values())}, Ctrl-C to end",
+            )
+            jobs: list[Coroutine[Any, Any, None]] = [*map(_watch_disk, recorders)]
+            jobs.append(_count(results, recorders[0], options.count))
             if every is not None:
                 jobs.append(_trigger(camera, every, options.step(DEFAULT_TRIGGER_TIMEOUT)))
             async with counting(camera):
                 await first(jobs, options.seconds)
     finally:
-        await _end(recorder, unopened, options)
+        await _end_all(opened, unopened, options)
+
+
+def _describe(recorders: list[Recorder], camera: str, **facts: object) -> None:
+    for recorder in recorders:
+        recorder.describe(camera, **facts)
+
+
+def _word(recorder: Recorder) -> str:
+    return "bag" if isinstance(recorder, BagRecorder) else "file"
 
 
 async def _watch_disk(recorder: Recorder) -> None:
@@ -134,16 +185,34 @@ async def _trigger(camera: Camera, every: float, timeout: float) -> None:
         await asyncio.sleep(when - loop.time())
 
 
+async def _end_all(recorders: list[Recorder], camera: Camera, options: Options) -> None:
+    """End each file; where one of them failed, the others are ended all the same."""
+    async with contextlib.AsyncExitStack() as stack:
+        for recorder in reversed(recorders):
+            stack.push_async_callback(_end, recorder, camera, options)
+
+
 async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
     """End the file, and tell what is in it; without a session there is no file."""
     path = recorder.path
     await asyncio.to_thread(recorder.close)
-    if camera.statistics().sessions:
+    if isinstance(recorder, BagRecorder):
+        if camera.statistics().sessions:
+            _show_bag(path, recorder.bag_counts, options)
+        else:
+            recorder.remove()
+    elif camera.statistics().sessions:
         counts, size = recorder.counts._asdict(), path.stat().st_size
         told = ", ".join(f"{kind} {number}" for kind, number in counts.items())
         options.show({"file": str(path), **counts, "bytes": size}, f"{path}: {told}; {size} bytes")
     elif path.is_file() and not path.is_symlink():
         path.unlink()
+
+
+def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
+    told = counts._asdict()
+    text = ", ".join(f"{kind} {number}" for kind, number in told.items())
+    options.show({"bag": str(path), **told}, f"{path}: {text}")
 
 
 @click.command(
@@ -216,6 +285,48 @@ async def pcap(
     """Show a recording to Wireshark."""
     count = write_pcap(_loaded(recording), output, camera=camera, overwrite=force)
     options.show({"file": output, "packets": count}, f"{output}: {count} packets")
+
+
+@click.command(
+    help="Make a rosbag2 of a recording: an MCAP file with ROS 2 messages in a folder, in the "
+    "recorded order and with the recorded times. Values are as recorded; with --interpret-as or "
+    "--calibration each result's bytes are read again, and those that do not fit go in with why."
+)
+@click.argument("recording", metavar="RUN.mcap", type=click.Path())
+@click.option(
+    "-o", "--output", metavar="FOLDER", type=click.Path(), required=True, help="The bag's folder."
+)
+@option("--force", help="Take the place of a bag that is there.")
+@_camera
+@option("--interpret-as", help="How to read the results again; default as recorded.")
+@runs("--y-down", "--calibration", *OUTPUT)
+async def bag(
+    recording: str, output: str, force: bool, camera: str | None, options: Options
+) -> None:
+    """Show a recording to ROS 2."""
+    loaded = _loaded(recording)
+    reading = options.reading(fleet=True) if options.calibration or options.y_down else {}
+    conversion = BagConversion(
+        loaded,
+        Path(output),
+        camera=camera,
+        interpret_as=options.interpret_as,
+        y_down=reading.get("y_down"),
+        calibration=reading.get("calibration"),
+        overwrite=force,
+    )
+    with contextlib.closing(conversion.steps()) as steps:
+        for place, _ in enumerate(steps):
+            if not place % 32:
+                await asyncio.sleep(0)  # where it can be cut off
+    counts = conversion.counts
+    if counts.unread:
+        click.echo(
+            f"smartcam: note: {counts.unread} of {counts.results} results could not be read: "
+            "their messages say why",
+            err=True,
+        )
+    _show_bag(output, counts, options)
 
 
 def _loaded(path: str) -> Recording:

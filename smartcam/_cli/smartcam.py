@@ -24,9 +24,10 @@ from smartcam._cli.live import live, serve_page
 from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, application, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
-from smartcam._cli.record import pcap, record, replay
-from smartcam._cli.running import JsonErrors
+from smartcam._cli.record import bag, pcap, record, replay
+from smartcam._cli.ros1 import ros1
 from smartcam._cli.ros2 import ros2
+from smartcam._cli.running import JsonErrors
 from smartcam._cli.serve import serve
 from smartcam._cli.sheet import sheet
 from smartcam._cli.terminal import counting
@@ -61,11 +62,11 @@ EPILOG = (
 
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
-    "A fleet": ("serve", "fleet", "ros2"),
+    "A fleet": ("serve", "fleet", "ros2", "ros1"),
     "Pictures": ("frames", "depth"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
-    "Recordings": ("record", "replay", "pcap", "dissector"),
+    "Recordings": ("record", "replay", "pcap", "bag", "dissector"),
     "Without a camera": ("demo",),
 }
 """What ``--help`` lists where."""
@@ -322,7 +323,7 @@ async def demo_command(
 
 for _one in (
     *(live, probe, doctor, image, decode, calibrate, sheet),
-    *(record, replay, pcap, dissector, serve, fleet, ros2, frames, depth),
+    *(record, replay, pcap, bag, dissector, serve, fleet, ros2, ros1, frames, depth),
 ):
     command.add_command(_one)
 

@@ -57,6 +57,7 @@ class RosFleet(Server):
         address: where it is.
         section: how the cameras are seen.
         cameras: what is said of single cameras, by name.
+        settings: what the agent tells their sessions, by name, where that is known.
         calibrations: of cameras whose results are to be the robot's.
         wanted: whether a camera, of an agent, is to be seen.
 
@@ -73,10 +74,12 @@ class RosFleet(Server):
         section: RosSection,
         *,
         cameras: Mapping[str, RosCamera] | None = None,
+        settings: Mapping[str, CameraSettings] | None = None,
         calibrations: Mapping[str, Calibration] | None = None,
         wanted: Callable[[str, str], bool] = lambda _agent, _camera: True,
     ) -> None:
         self._section, self._said, self._wanted = section, dict(cameras or {}), wanted
+        self._settings = dict(settings or {})
         self.context: RosContext = RosContext(
             bus, domain=section.domain, distribution=section.distribution
         )
@@ -120,7 +123,7 @@ class RosFleet(Server):
             await old.stop()
         try:
             node = self._node(name)
-            made = CameraNode(camera, node, options=self._options(name))
+            made = CameraNode(camera, node, options=self._options(name, camera))
             await made.start()
         except SmartCamError as exc:
             logger.warning("%s ! it is not seen in ROS: %s", name, exc)
@@ -136,12 +139,14 @@ class RosFleet(Server):
         above = self._section.namespace.rstrip("/")
         return Node(own, namespace=f"{above}/{namespace}", context=self.context)
 
-    def _options(self, name: str) -> CameraNodeOptions:
+    def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
         said = self._said.get(name, RosCamera())
         return CameraNodeOptions(
             frame_id=said.frame_id or as_name(name).replace("/", "_"),
             parent_frame=said.parent_frame or "",
             autostart=self._section.autostart,
+            settings=self._settings.get(name),
+            heard=lambda: camera.met,
         )
 
     @property

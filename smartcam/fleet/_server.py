@@ -102,7 +102,7 @@ class FleetServer(Server):
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
             if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
+                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus, cameras))
             self._agent, self._stack = agent, stack.pop_all()
 
     def _more(self) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class FleetServer(Server):
 
         return dict(SETTINGS)
 
-    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
+    def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
 
         file, own = self.file, self.file.agent_name
@@ -125,6 +125,7 @@ class FleetServer(Server):
             self.address,
             file.ros2 or RosSection(),
             cameras=said,
+            settings=cameras,
             calibrations={name: one for name, one in found.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
         )

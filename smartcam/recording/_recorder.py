@@ -17,7 +17,7 @@ import stat
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import smartcam
 from smartcam._locks import try_lock
@@ -77,10 +77,24 @@ class Counts(NamedTuple):
     errors: int = 0
 
 
-class _Description(NamedTuple):
+class Description(NamedTuple):
     """Facts about a camera, for the file's metadata."""
 
     facts: dict[str, str]
+
+
+class _Written(Protocol):
+    """What the thread writes to."""
+
+    def start(self) -> None: ...
+
+    def add(self, item: Item | Description, /) -> None: ...
+
+    def flush(self) -> None: ...
+
+    def finish(self) -> None: ...
+
+    def close(self) -> None: ...
 
 
 class Recorder(Observer):
@@ -108,12 +122,12 @@ class Recorder(Observer):
         self.path: Path = Path(path)
         self._overwrite = overwrite
         self._more = threading.Condition()
-        self._items: list[Item | _Description] = []
+        self._items: list[Item | Description] = []
         self._waiting = 0  # bytes in it
         self._counts = dict.fromkeys(KINDS, 0)
         self._taking = False
         self._closing = False
-        self._file: _File | None = None
+        self._file: _Written | None = None
         self._thread: threading.Thread | None = None
         self._failure: concurrent.futures.Future[RecordingError] = concurrent.futures.Future()
 
@@ -129,9 +143,19 @@ class Recorder(Observer):
         """
         if self._thread is not None:
             raise ConfigurationError(f"recording {self.path}: opened before; make a new recorder")
+        self._file = self._make_file()
+        self._taking = True
+        self._thread = threading.Thread(
+            target=self._write_all, name=f"smartcam.recorder[{self.path.name}]", daemon=True
+        )
+        self._thread.start()
+        return self
+
+    def _make_file(self) -> _Written:
+        """Make the file; raises as :meth:`open`."""
         writer = load_extra("mcap.writer")
         try:
-            stream = _opened(self.path, overwrite=self._overwrite)
+            stream = opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
             raise ConfigurationError(
                 f"recording {self.path}: the file is there already; overwrite (--force) takes its "
@@ -142,13 +166,7 @@ class Recorder(Observer):
         except (OSError, ValueError) as exc:
             reason = exc.strerror if isinstance(exc, OSError) else exc
             raise ConfigurationError(f"recording {self.path}: {reason}") from exc
-        self._file = _File(stream, writer)
-        self._taking = True
-        self._thread = threading.Thread(
-            target=self._write_all, name=f"smartcam.recorder[{self.path.name}]", daemon=True
-        )
-        self._thread.start()
-        return self
+        return _File(stream, writer)
 
     def close(self) -> None:
         """Write what waits and end the file; idempotent.
@@ -204,7 +222,7 @@ class Recorder(Observer):
         Its address and dialect are kept by themselves, with every session.
         """
         texts = {name: str(fact) for name, fact in facts.items() if fact is not None}
-        self._put(_Description({"camera": camera, **texts}), 0)
+        self._put(Description({"camera": camera, **texts}), 0)
 
     # ------------------------------------------------------------------ the observer
 
@@ -230,7 +248,7 @@ class Recorder(Observer):
             "errors",
         )
 
-    def _put(self, item: Item | _Description, size: int, kind: str | None = None) -> None:
+    def _put(self, item: Item | Description, size: int, kind: str | None = None) -> None:
         with self._more:
             if not self._taking:
                 return
@@ -276,7 +294,7 @@ class Recorder(Observer):
         except Exception as exc:  # noqa: BLE001 - a thread that ends silently would be worse
             self._fail(f"unexpected {exc!r}", exc)
 
-    def _write_some(self, file: _File) -> bool:
+    def _write_some(self, file: _Written) -> bool:
         """Wait for something, write it; return whether that was the last."""
         with self._more:
             self._more.wait_for(lambda: self._items or self._closing)
@@ -289,7 +307,7 @@ class Recorder(Observer):
         return over
 
 
-def _opened(path: Path, *, overwrite: bool) -> IO[bytes]:
+def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
     """Open a file for one recorder; what was in it is gone when it is ours, not before.
 
     Raises:
@@ -333,10 +351,10 @@ class _File:
         self._writer.add_metadata(FILE_METADATA, facts)
         self.flush()
 
-    def add(self, item: Item | _Description) -> None:
+    def add(self, item: Item | Description) -> None:
         """Write one thing; it is on the disk after the next :meth:`flush`."""
         match item:
-            case _Description(facts):
+            case Description(facts):
                 self._describe(facts)
             case TraceEntry():
                 self._message("frames", item.camera, item.at, item)

@@ -40,7 +40,7 @@ def calibrated(camera: Camera[Any], application: int) -> bool:
 
 
 def localizations_in_metres(
-    camera: Camera[Any], result: Result[Any], spec: object = None
+    camera: Camera[Any], result: Result[Any], spec: str | None = None
 ) -> list[Localization] | None:
     """Return a result's localizations; None where it has none, or has them in pixels.
 

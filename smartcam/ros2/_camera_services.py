@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
     from smartcam.ros2._camera_results import CameraResults
+    from smartcam.settings import Address
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
@@ -43,8 +44,7 @@ class CameraServices:
         node: its node.
         results: of the camera, which are published.
         life: the node's life cycle.
-        device_url: where the camera itself is, for a fleet's, whose own address is the fleet's.
-        publish_status: publish the status on a topic, none for an empty text; None: that cannot be.
+        address: where the camera itself is, for a fleet's, whose own address is the fleet's.
     """
 
     def __init__(
@@ -54,19 +54,17 @@ class CameraServices:
         results: CameraResults,
         life: ManagedCamera,
         *,
-        device_url: Callable[[], str | None] | None = None,
-        publish_status: Callable[[str], None] | None = None,
+        address: Address | None = None,
     ) -> None:
         self._camera, self._node, self._results = camera, node, results
-        self._thesis = ThesisServices(
-            camera, node, results, life, device_url=device_url, publish_status=publish_status
-        )
-        self._triggers: dict[str, Callable[[], Awaitable[str]]] = {
-            "trigger": self._trigger,
-            "start": self._start,
-            "stop": self._stop,
-            "reset_errors": self._reset_errors,
-            "reboot": self._reboot,
+        self._thesis = ThesisServices(camera, node, results, life, address=address)
+        self._std: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
+            "trigger": ("Trigger", self._trigger),
+            "start": ("Trigger", self._start),
+            "stop": ("Trigger", self._stop),
+            "reset_errors": ("Trigger", self._reset_errors),
+            "reboot": ("Trigger", self._reboot),
+            "run": ("SetBool", self._run),
         }
         self._served: list[Any] = []
 
@@ -81,9 +79,8 @@ class CameraServices:
         try:
             for name, do in self._thesis.table.items():
                 self._serve(name, f"smartcam_msgs/srv/{name}", self._in_fields(do, named=True))
-            for name, tell in self._triggers.items():
-                self._serve(name, "std_srvs/srv/Trigger", self._in_words(lambda _, do=tell: do()))
-            self._serve("run", "std_srvs/srv/SetBool", self._in_words(self._run))
+            for name, (kind, tell) in self._std.items():
+                self._serve(name, f"std_srvs/srv/{kind}", self._in_words(tell))
             typed = self._in_fields(self._trigger_results, named=False)
             self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed)
         except BaseException:
@@ -93,6 +90,7 @@ class CameraServices:
     async def close(self) -> None:
         """Serve no more; calls under way are given up. Idempotent, bounded."""
         served = self._withdraw()
+        await self._thesis.close()
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 for one in served:
@@ -159,24 +157,24 @@ class CameraServices:
 
     # ------------------------------------------------------------------ std_srvs
 
-    async def _trigger(self) -> str:
+    async def _trigger(self, _: object) -> str:
         return utf8(as_json(await self._camera.trigger()))
 
-    async def _start(self) -> str:
+    async def _start(self, _: object) -> str:
         await self._camera.start()
         return ""
 
-    async def _stop(self) -> str:
+    async def _stop(self, _: object) -> str:
         await self._camera.stop()
         return ""
 
     async def _run(self, request: Any) -> str:
-        return await (self._start() if request.data else self._stop())
+        return await (self._start if request.data else self._stop)(request)
 
-    async def _reset_errors(self) -> str:
+    async def _reset_errors(self, _: object) -> str:
         return str(await self._camera.reset_errors())
 
-    async def _reboot(self) -> str:
+    async def _reboot(self, _: object) -> str:
         await self._camera.reboot()
         return ""
 

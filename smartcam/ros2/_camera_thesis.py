@@ -18,6 +18,7 @@ from smartcam.interpreters._base import resolve
 from smartcam.models import Status
 from smartcam.ros2._camera_reading import localizations_in_metres, own_interpreter
 from smartcam.ros2._camera_results import DEFAULT_QUEUE
+from smartcam.ros2._camera_status_topic import CameraStatusTopic
 from smartcam.ros2._messages import utf8
 from smartcam.settings import FLEET_SCHEMES, parse_address
 
@@ -86,8 +87,7 @@ class ThesisServices:
         node: of the camera.
         results: which are published.
         life: the node's life cycle.
-        device_url: where the camera itself is, for a fleet's, whose own address is the fleet's.
-        publish_status: publish the status on a topic, none for an empty text.
+        address: where the camera itself is, for a fleet's, whose own address is the fleet's.
     """
 
     def __init__(
@@ -97,11 +97,11 @@ class ThesisServices:
         results: CameraResults,
         life: ManagedCamera,
         *,
-        device_url: Callable[[], str | None] | None = None,
-        publish_status: Callable[[str], None] | None = None,
+        address: Address | None = None,
     ) -> None:
         self._camera, self._node, self._results, self._life = camera, node, results, life
-        self._device_url, self._publish_status = device_url, publish_status
+        self._address = address or camera.settings.address
+        self._status = CameraStatusTopic(camera, node, results.messages)
         self._lock = asyncio.Lock()  # of the life cycle: one after the other
         self.table: dict[str, Callable[[Any], Awaitable[dict[str, Any]]]] = {
             "SmartcameraSetup": self._setup,
@@ -111,6 +111,10 @@ class ThesisServices:
             "Trigger50ByteString": self._trigger_strings,
             "TriggerLocalization": self._trigger_localizations,
         }
+
+    async def close(self) -> None:
+        """Publish no status any more. Idempotent."""
+        await self._status.close()
 
     def check_name(self, name: str) -> None:
         """See that a request is meant for this camera.
@@ -134,18 +138,13 @@ class ThesisServices:
     async def _setup(self, request: Any) -> dict[str, Any]:
         self._check_place(request)
         self._check_reading(request)
-        if request.topic_status and self._publish_status is None:
-            raise ConfigurationError(
-                f"{self._camera.name}: topic_status {request.topic_status!r:.80}: the status is on "
-                "a topic of this node already: expected an empty text"
-            )
+        self._status.resolve(request.topic_status)  # before anything is done
         async with self._lock:
             if self._state not in {"inactive", "active"}:
                 await self._life.configure()
             if request.application_id:
                 await self._ensure(request.application_id)
-            if self._publish_status is not None:
-                self._publish_status(request.topic_status)
+            self._status.publish_on(request.topic_status)
         return {}
 
     def _check_place(self, request: Any) -> None:
@@ -153,8 +152,7 @@ class ThesisServices:
         name, model = self._camera.name, request.camera_model_name
         if not (model or request.con_address):
             return
-        url = None if self._device_url is None else self._device_url()
-        has = self._camera.settings.address if url is None else parse_address(url)
+        has = self._address
         if has.scheme in FLEET_SCHEMES:
             raise ConfigurationError(
                 f"{name}: it is a fleet's, which knows where it is: expected con_address and "
@@ -213,8 +211,7 @@ class ThesisServices:
     async def _stop(self, request: Any) -> dict[str, Any]:
         async with self._lock:
             self._results.publish_on("")
-            if self._publish_status is not None:
-                self._publish_status("")
+            self._status.publish_on("")
             if self._state == "active":
                 await self._life.deactivate()
             if self._state == "inactive":

@@ -60,12 +60,16 @@ class ResultMessages:
         frame_id: what that frame is called in ROS.
         calibration: as the camera's settings have it; it names the frame of a result in which
             nothing was found.
+
+    Attributes:
+        frame_id: as given.
     """
 
     def __init__(
         self, types: RosTypes, camera: str, frame_id: str, calibration: Any = None
     ) -> None:
-        self._camera, self._frame_id, self._calibration = camera, frame_id, calibration
+        self.frame_id: str = frame_id
+        self._camera, self._calibration = camera, calibration
         cls = {
             name: types.message(name).cls
             for name in (
@@ -109,7 +113,7 @@ class ResultMessages:
         return self._frame(frames.pop() if frames else self._empty_frame(result.application))
 
     def _frame(self, frame_id: str) -> str:
-        return self._frame_id if frame_id == self._camera else frame_id
+        return self.frame_id if frame_id == self._camera else frame_id
 
     def _empty_frame(self, application: int) -> str:
         calibration = self._calibration
@@ -192,7 +196,7 @@ class ResultMessages:
         return self._cls.Result(
             self.header(result.received_at, frame_id),
             self._camera,
-            result.application,
+            max(result.application, 0),  # -1 where a camera does not say it
             result.number,
             error,
             self.localizations(parts or ()),
@@ -202,7 +206,7 @@ class ResultMessages:
 
     def failed(self, error: BaseException, at: datetime) -> Any:
         """Return what is said of a result that could not be read."""
-        header = self.header(at, self._frame_id)
+        header = self.header(at, self.frame_id)
         return self._cls.Result(header, self._camera, 0, 0, error_text(error), [], "", b"")
 
 

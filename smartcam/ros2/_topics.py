@@ -6,7 +6,9 @@ kept by an advanced publisher, and asked for by an advanced subscriber.
 
 from __future__ import annotations
 
+import asyncio
 import collections
+import concurrent.futures
 import logging
 import threading
 import time
@@ -123,6 +125,7 @@ class RosPublisher(RosEnd):
         qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
         self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
         self._patient: Any = None  # waits for room
+        self._hasty: Any = None  # leaves out to whom one is under way
         self._lane = "latched" if qos.latched else "long"
         self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
         self._appear()
@@ -181,10 +184,7 @@ class RosPublisher(RosEnd):
         Raises:
             RosError: the publisher is closed.
         """
-        if self._closed:
-            raise RosError(f"{self.name}: this publisher is closed")
-        self._number += 1
-        attachment = Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+        attachment = self._attachment()
         if self._direct and len(data) <= LONG and not self._context.waits(self):
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
@@ -198,6 +198,64 @@ class RosPublisher(RosEnd):
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
         self._context.say_later(self, self._say_next, self._lane)
+
+    async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message, except to whom one is under way already.
+
+        For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
+        that is old. It returns when the engine has copied the message; a thread encodes it. A
+        publisher has either these or those of :meth:`publish`.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+
+        Cancellation: the message is published or not.
+        """
+        what, attachment = said(message, fields), self._attachment()
+        self._lane = "newest"
+        done: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+        def say() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                self._say_newest(what, attachment)
+            except BaseException as exc:  # noqa: BLE001 - told to who waits
+                done.set_exception(exc)
+            else:
+                done.set_result(None)
+
+        self._context.say_later(self, say, self._lane)
+        await asyncio.wrap_future(done)
+
+    def _attachment(self) -> bytes:
+        if self._closed:
+            raise RosError(f"{self.name}: this publisher is closed")
+        self._number += 1
+        return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+
+    def _say_newest(self, what: object, attachment: bytes) -> None:
+        """Encode and say a message; in the thread for it."""
+        data = self.type.encode(what)
+        if self._closed:
+            return
+        quietly(self._hastily, data, attachment)
+        self.published += 1
+
+    def _hastily(self, data: bytes, attachment: bytes) -> None:
+        """Have the engine send a message to all to whom none is under way.
+
+        By a publisher of its own, since the session may take the other one back meanwhile.
+        """
+        if self._hasty is None:
+            zenoh = self._context.zenoh.engine
+            self._hasty = self._context.zenoh.session.declare_publisher(
+                self.entity.key,
+                congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+                priority=zenoh.Priority.DATA_LOW,
+            )
+        self._hasty.put(data, attachment=attachment)
 
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
@@ -237,14 +295,15 @@ class RosPublisher(RosEnd):
             self._take_back()
 
     def _take_back(self) -> None:
-        patient, self._patient = self._patient, None
-        if patient is not None:
-            quietly(patient.undeclare)
+        for one in (self._patient, self._hasty):
+            if one is not None:
+                quietly(one.undeclare)
+        self._patient = self._hasty = None
         self._publisher = None
         self._outlet.close()
 
 
-class _Heard(NamedTuple):
+class _FromTopic(NamedTuple):
     data: bytes
     attachment: Attachment
 
@@ -272,7 +331,7 @@ class RosSubscription(RosEnd):
         self.type: MessageType = kind
         self.attachment: Attachment | None = None
         self.rejected: int = 0
-        self._queue = Subscription[_Heard](
+        self._queue = Subscription[_FromTopic](
             entity.name,
             max_queue=entity.qos.kept,
             overflow="drop_oldest",
@@ -314,7 +373,7 @@ class RosSubscription(RosEnd):
         except RosMessageError as exc:
             self._reject(exc)
             return
-        self._queue.offer(_Heard(data, attachment), 0.0, len(data))
+        self._queue.offer(_FromTopic(data, attachment), 0.0, len(data))
 
     def _reject(self, why: RosMessageError) -> None:
         self.rejected += 1

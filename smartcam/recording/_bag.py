@@ -1,0 +1,310 @@
+"""A rosbag2: a folder with an MCAP file of ROS 2 messages and a ``metadata.yaml`` about it.
+
+What stands in both is what rosbag2 writes and reads: ``mcap_storage.cpp`` of rosbag2_storage_mcap
+(profile ``ros2``, schemas ``ros2msg``, ``offered_qos_profiles`` and ``topic_type_hash`` with each
+channel, a metadata record ``rosbag2``), ``yaml.hpp`` and ``qos.cpp`` of rosbag2_storage (the rest).
+The form is version 8 of the latter, with the policies as numbers in a text: version 9 writes their
+names in a list, which ROS 2 Humble does not read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import re
+import stat
+from dataclasses import dataclass, field
+from typing import IO, TYPE_CHECKING, Any, NamedTuple
+
+import smartcam
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.recording._form import load_extra
+from smartcam.recording._recorder import CHUNK, opened
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam.ros2._qos import QoS
+    from smartcam.ros2._types import RosTypes
+
+VERSION = 8
+"""Of the form of ``metadata.yaml``."""
+
+METADATA = "metadata.yaml"
+
+_HALF = f"{METADATA}.tmp"
+
+_FOREVER = {"sec": 9_223_372_036, "nsec": 854_775_807}
+_RELIABLE, _BEST_EFFORT, _KEEP_LAST, _TRANSIENT_LOCAL, _VOLATILE, _AUTOMATIC = 1, 2, 1, 1, 2, 1
+"""``rmw/types.h``"""
+
+
+class Topic(NamedTuple):
+    """A topic of a bag.
+
+    Attributes:
+        name: with a slash in front.
+        type: of its messages.
+        qos: that its node offers.
+    """
+
+    name: str
+    type: str
+    qos: QoS
+
+
+@dataclass(slots=True)
+class _BagChannel:
+    """A topic as it stands in the file, and how many messages it has."""
+
+    id: int
+    metadata: dict[str, str]  # of its topic, for ``metadata.yaml``
+    count: int = 0
+
+
+def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
+    """Make a bag's folder and return its MCAP file, open and ours.
+
+    Args:
+        folder: of the bag; the one that it is in must be there.
+        overwrite: take the place of a bag that is there.
+
+    Raises:
+        ConfigurationError: it is there already, holds something else than a bag, another recorder
+            writes it, or it cannot be made.
+    """
+    what = f"bag {folder}"
+    try:
+        made = _made(folder, what, overwrite=overwrite)
+        try:
+            stream = opened(mcap_of(folder), overwrite=overwrite)
+            for old in folder.iterdir():
+                if old.name != mcap_of(folder).name:
+                    old.unlink()
+        except BaseException:
+            if made:
+                folder.rmdir()
+            raise
+    except (OSError, ValueError) as exc:
+        if isinstance(exc, ConfigurationError):
+            raise
+        reason = exc.strerror if isinstance(exc, OSError) else exc
+        raise ConfigurationError(f"{what}: {reason}") from exc
+    return stream
+
+
+def _made(folder: Path, what: str, *, overwrite: bool) -> bool:
+    """Make the folder where it is not there; return whether it was made."""
+    try:
+        folder.mkdir()
+    except FileExistsError as exc:
+        if not overwrite:
+            raise ConfigurationError(
+                f"{what}: it is there already; overwrite (--force) takes the place of a bag"
+            ) from exc
+        if not folder.is_dir():
+            raise ConfigurationError(f"{what}: this is no folder") from exc
+        other = [one.name for one in folder.iterdir() if not _is_of_bag(folder, one)]
+        if other:
+            raise ConfigurationError(
+                f"{what}: the folder holds {other[0]!r:.80}, which is no part of a bag: it is left "
+                "as it is"
+            ) from exc
+        return False
+    return True
+
+
+def mcap_of(folder: Path) -> Path:
+    """Return the place of a bag's MCAP file: rosbag2 names it after the folder."""
+    return folder / f"{folder.resolve().name}_0.mcap"
+
+
+def _is_of_bag(folder: Path, path: Path) -> bool:
+    """Return whether a file may be a bag's own: other recordings are not taken for one."""
+    own = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
+    return (own is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a bag of ours, which nobody writes any more."""
+    for path in (folder / METADATA, folder / _HALF, mcap_of(folder)):
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # somebody has put something there
+        folder.rmdir()
+
+
+@dataclass(eq=False)
+class BagWriter:
+    """Writes a bag; not for several threads.
+
+    Args:
+        folder: its folder.
+        stream: its MCAP file, from :func:`make_folder`; closed at the end.
+        types: of the messages.
+
+    Raises:
+        MissingExtraError: the mcap library, or PyYAML, is not installed.
+    """
+
+    folder: Path
+    stream: IO[bytes]
+    types: RosTypes
+    _schemas: dict[str, int] = field(init=False, default_factory=dict[str, int])
+    _channels: dict[Topic, _BagChannel] = field(
+        init=False, default_factory=dict[Topic, _BagChannel]
+    )
+    _first: int = field(init=False, default=(1 << 63) - 1)
+    _last: int = field(init=False, default=0)
+
+    def __post_init__(self) -> None:
+        self._yaml = load_yaml()
+        self._writer: Any = load_extra("mcap.writer").Writer(self.stream, chunk_size=CHUNK)
+        self._on_disk = stat.S_ISREG(os.fstat(self.stream.fileno()).st_mode)
+
+    @property
+    def count(self) -> int:
+        """Messages so far."""
+        return sum(channel.count for channel in self._channels.values())
+
+    def start(self) -> None:
+        """Write what stands first; from here on it can be read, whatever happens."""
+        self._writer.start("ros2", library=f"smartcam {smartcam.__version__}")
+        # a file that is cut off has only this one, which says how to read the policies
+        self._write_metadata_record()
+        self.flush()
+
+    def add(self, topic: Topic, at: int, message: Any) -> None:
+        """Write a message; it is on the disk after the next :meth:`flush`.
+
+        Args:
+            topic: where to.
+            at: when it came, nanoseconds since 1970, UTC.
+            message: it, or a mapping of its fields.
+
+        Raises:
+            RosMessageError: the fields make no message of the topic's type.
+            OSError: the disk fails.
+        """
+        data = self.types.message(topic.type).encode(message)
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._new_channel(topic)
+        channel.count += 1
+        self._first, self._last = min(self._first, at), max(self._last, at)
+        self._writer.add_message(channel.id, at, data, at, channel.count & 0xFFFFFFFF)
+
+    def flush(self) -> None:
+        """End the chunk and have it put on the disk."""
+        self._writer.flush()
+        if self._on_disk:
+            os.fsync(self.stream.fileno())
+
+    def finish(self) -> None:
+        """Write the index, what stands last, and ``metadata.yaml``."""
+        self._write_metadata_record()
+        self._writer.finish()
+        self.stream.flush()
+        if self._on_disk:
+            os.fsync(self.stream.fileno())
+        text = self._text({"rosbag2_bagfile_information": self._metadata()})
+        half = self.folder / _HALF
+        with half.open("w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        half.replace(self.folder / METADATA)
+
+    def close(self) -> None:
+        """Close the file; what it does not take any more is dropped."""
+        with contextlib.suppress(OSError):
+            self.stream.close()
+
+    def _new_channel(self, topic: Topic) -> _BagChannel:
+        kind = self.types.message(topic.type)
+        if kind.name not in self._schemas:
+            self._schemas[kind.name] = self._writer.register_schema(
+                kind.name, "ros2msg", kind.text.encode()
+            )
+        qos = self._text([_policies(topic.qos)]).strip()
+        number: int = self._writer.register_channel(
+            topic.name,
+            "cdr",
+            self._schemas[kind.name],
+            {"offered_qos_profiles": qos, "topic_type_hash": kind.hash},
+        )
+        told = {
+            "name": topic.name,
+            "type": kind.name,
+            "serialization_format": "cdr",
+            "offered_qos_profiles": qos,
+            "type_description_hash": kind.hash,
+        }
+        return _BagChannel(number, told)
+
+    def _write_metadata_record(self) -> None:
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": self._text(self._metadata())})
+
+    def _text(self, value: object) -> str:
+        """Return a value as YAML; by libyaml where PyYAML has it."""
+        dumper = getattr(self._yaml, "CSafeDumper", self._yaml.SafeDumper)
+        text: str = self._yaml.dump(value, Dumper=dumper, sort_keys=False, allow_unicode=True)
+        return text
+
+    def _metadata(self) -> dict[str, Any]:
+        count, name = self.count, mcap_of(self.folder).name
+        starting_time = {"nanoseconds_since_epoch": self._first if count else 0}
+        duration = {"nanoseconds": self._last - self._first if count else 0}
+        return {
+            "version": VERSION,
+            "storage_identifier": "mcap",
+            "duration": dict(duration),
+            "starting_time": dict(starting_time),
+            "message_count": count,
+            "topics_with_message_count": [
+                {"topic_metadata": channel.metadata, "message_count": channel.count}
+                for channel in self._channels.values()
+            ],
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [name],
+            "files": [
+                {
+                    "path": name,
+                    "starting_time": dict(starting_time),
+                    "duration": dict(duration),
+                    "message_count": count,
+                }
+            ],
+            "custom_data": None,
+            "ros_distro": self.types.distribution,
+        }
+
+
+def load_yaml() -> Any:
+    """Import PyYAML.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        return importlib.import_module("yaml")
+    except ImportError as exc:
+        raise MissingExtraError(
+            'bags need PyYAML: pip install "smartcam[ros2,record]"', extra="ros2"
+        ) from exc
+
+
+def _policies(qos: QoS) -> dict[str, Any]:
+    """Return a topic's offered policies."""
+    return {
+        "history": _KEEP_LAST,
+        "depth": qos.kept,
+        "reliability": _RELIABLE if qos.reliable else _BEST_EFFORT,
+        "durability": _TRANSIENT_LOCAL if qos.latched else _VOLATILE,
+        "deadline": dict(_FOREVER),
+        "lifespan": dict(_FOREVER),
+        "liveliness": _AUTOMATIC,
+        "liveliness_lease_duration": dict(_FOREVER),
+        "avoid_ros_namespace_conventions": False,
+    }

@@ -1,0 +1,320 @@
+"""What goes into a bag of each thing that a client saw, or that a recording holds."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import deque
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.models import (
+    ApplicationChanged,
+    CameraEvent,
+    Connected,
+    Disconnected,
+    Header,
+    Localization,
+    Pose,
+    Position,
+    Quaternion,
+    Reconnected,
+    Result,
+    Status,
+    StatusChanged,
+)
+from smartcam.observers import TraceEntry
+from smartcam.recording._bag import Topic
+from smartcam.recording._bag_messages import (
+    DIAGNOSTICS,
+    STATUS,
+    diagnostics,
+    health,
+    status_fields,
+)
+from smartcam.recording._bag_specs import Specs
+from smartcam.recording._form import RecordedError, nanoseconds
+from smartcam.ros2._camera_status import OK, WARN
+from smartcam.ros2._messages import DETECTIONS, POSES, RESULT, ResultMessages, utf8
+from smartcam.ros2._names import as_name
+from smartcam.ros2._qos import DEFAULT, DRIVER, LATCHED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from smartcam.ros2._types import RosTypes
+
+_DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
+
+_CONTAINERS = 64
+"""Containers that are kept until what became of them is told: many came in one burst."""
+
+UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
+"""Errors that say why a container could not be read."""
+
+
+class BagCounts(NamedTuple):
+    """What a bag holds.
+
+    Attributes:
+        messages: all of them.
+        results: results, each on the topic ``results``; those that could not be read, too.
+        unread: of these, the ones that could not be read; their messages say why.
+        localizations: of these, the ones that are localizations, which two more topics have.
+        errors: other errors, on ``/diagnostics``.
+    """
+
+    messages: int = 0
+    results: int = 0
+    unread: int = 0
+    localizations: int = 0
+    errors: int = 0
+
+
+class BagMessage(NamedTuple):
+    """A message for a bag: where, when (nanoseconds since 1970, UTC), and the message or fields."""
+
+    topic: Topic
+    at: int
+    message: Any
+
+
+class ReadResult(NamedTuple):
+    """A result as it goes into the bag; ``error``: why it could not be read, else "".
+
+    ``again``: it was read anew, so that an earlier error says nothing any more.
+    """
+
+    result: Result
+    error: str = ""
+    again: bool = False
+
+
+@dataclass(eq=False)
+class BagItems:
+    """Makes messages of items, in order; knows the state of each camera.
+
+    Args:
+        types: of the messages.
+        read: what each result goes through; default as it is.
+    """
+
+    _types: RosTypes
+    _read: Callable[[Result], ReadResult] = ReadResult
+    _cameras: dict[str, _BagCamera] = field(init=False, default_factory=dict[str, "_BagCamera"])
+
+    def __post_init__(self) -> None:
+        self.counts: BagCounts = BagCounts()
+        self._titles: set[str] = set()
+
+    def describe(self, facts: Mapping[str, Any]) -> None:
+        """Take facts about a camera, as a recorder is told them."""
+        if {"interpret_as", "pixels"} & facts.keys():
+            camera = self._of(facts["camera"])
+            camera.facts.update(facts)
+            pixels = camera.facts.get("pixels") == "True"
+            camera.specs = Specs(camera.facts.get("interpret_as", ""), pixels=pixels)
+
+    def messages(self, item: object) -> Iterator[BagMessage]:
+        """Yield what an item comes to; nothing of frames, which ROS has no message for."""
+        for message in self._messages(item):
+            self._count(messages=1)
+            yield message
+
+    def _messages(self, item: object) -> Iterator[BagMessage]:
+        match item:
+            case Result():
+                camera = self._of(item.camera)
+                camera.settle(item.raw)
+                yield from self._result(camera, *self._read(item)[:2])
+            case TraceEntry():
+                self._of(item.camera).see_frame(item)
+            case RecordedError():
+                yield from self._error(self._of(item.camera), item)
+            case CameraEvent():
+                camera = self._of(item.camera)
+                camera.see_event(item)
+                yield from camera.state(item.at)
+            case _:
+                pass
+
+    def _of(self, name: str) -> _BagCamera:
+        known = self._cameras.get(name)
+        if known is None:
+            base = title = topic_of_camera(name)
+            number = 2
+            while title in self._titles:
+                title, number = f"{base}_{number}", number + 1
+            self._titles.add(title)
+            known = self._cameras[name] = _BagCamera(
+                name, title, ResultMessages(self._types, name, name)
+            )
+        return known
+
+    def _result(self, camera: _BagCamera, result: Result, error: str) -> Iterator[BagMessage]:
+        at, made = nanoseconds(result.received_at), camera.make
+        if result.application < 0:  # it does not say whose it is
+            result = result._replace(application=0)
+        parts = None if error else camera.specs.parts(result)
+        frames = {one.pose.header.frame_id for one in parts or ()}
+        self._count(results=1, unread=bool(error), localizations=parts is not None)
+        if error:
+            message = made.result(result._replace(value=result.raw), None)
+            message.error = utf8(error)
+        else:
+            message = made.result(result, parts)
+        yield BagMessage(camera.results, at, message)
+        if len(frames) > 1:  # each of its own; an array has one
+            text = f"result {result.number}: poses in several frames: {', '.join(sorted(frames))}"
+            yield camera.warning(result.received_at, text)
+        elif parts is not None:
+            yield BagMessage(camera.localizations, at, made.poses(result, parts))
+            yield BagMessage(camera.detections, at, made.detections(result, parts))
+
+    def _error(self, camera: _BagCamera, item: RecordedError) -> Iterator[BagMessage]:
+        text = f"{item.error}: {item.text}"
+        if item.error not in UNREADABLE:
+            self._count(errors=1)
+            yield camera.warning(item.at, text, triggered_at=item.triggered_at)
+            return
+        application, raw, at = camera.unread() or (0, b"", item.at)
+        result = Result(item.camera, application, None, 0, item.triggered_at, at, None, raw, None)
+        found = self._read(result) if raw else ReadResult(result)
+        yield from self._result(camera, found.result, found.error if found.again else text)
+
+    def _count(self, **more: int) -> None:
+        now = {name: getattr(self.counts, name) + more[name] for name in more}
+        self.counts = self.counts._replace(**now)
+
+
+@dataclass(eq=False)
+class _BagCamera:
+    """One camera: its topics, its state as far as it was told, and containers on their way."""
+
+    name: str
+    title: str  # for topics
+    make: ResultMessages
+    url: str = ""
+    connected: bool = False
+    status: Status | None = None
+    application: int | None = None
+    why: str = ""  # it is not connected
+    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # that were told
+    specs: Specs = field(default_factory=Specs)  # how its results are read
+
+    def __post_init__(self) -> None:
+        self.results = Topic(f"/{self.title}/results", RESULT, DRIVER)
+        self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
+        self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
+        self._status = Topic(f"/{self.title}/status", STATUS, LATCHED)
+        self._told: object = None  # of the last diagnostics
+        self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
+
+    def see_event(self, event: CameraEvent) -> None:
+        """Keep what an event tells."""
+        match event:
+            case Connected() | Reconnected():
+                self.connected, self.url, self.why = True, event.url, ""
+            case Disconnected():
+                self.connected, self.status = False, None
+                self.why = event.reason
+            case StatusChanged():
+                self.status = event.status
+            case ApplicationChanged():
+                self.application = event.application
+            case _:
+                pass
+
+    def state(self, at: datetime) -> Iterator[BagMessage]:
+        """Yield the state for its topic, and for the diagnostics what is new to them."""
+        when = nanoseconds(at)
+        level, text = health(self.status, connected=self.connected, why=self.why)
+        fields = status_fields(
+            self.name,
+            at,
+            connected=self.connected,
+            status=self.status,
+            application=self.application,
+        )
+        error = "" if level == OK else text
+        yield BagMessage(self._status, when, {**fields, "error": utf8(error)})
+        if (level, text, self.application) != self._told:
+            self._told = (level, text, self.application)
+            told = diagnostics(self.title, self.url, at, level, text, application=self.application)
+            yield BagMessage(_DIAGNOSTICS, when, told)
+
+    def warning(self, at: datetime, text: str, **values: object) -> BagMessage:
+        """Return a message of the diagnostics about something that went wrong once."""
+        told = diagnostics(self.title, self.url, at, WARN, text, **values)
+        return BagMessage(_DIAGNOSTICS, nanoseconds(at), told)
+
+    # ------------------------------------------------------------------ containers
+
+    def see_frame(self, entry: TraceEntry) -> None:
+        """Keep a container until it is told what became of it."""
+        if entry.direction == "<" and entry.message == "ResultContainer" and entry.fields:
+            data, application = entry.fields.get("data"), entry.fields.get("application", -1)
+            if isinstance(data, str) and isinstance(application, int):
+                with contextlib.suppress(ValueError):
+                    self._containers.append((application, bytes.fromhex(data), entry.at))
+
+    def settle(self, raw: bytes) -> None:
+        """A container was read: forget it and those before it."""
+        for place, (_, data, _) in enumerate(self._containers):
+            if data == raw:
+                for _ in range(place + 1):
+                    self._containers.popleft()
+                return
+
+    def unread(self) -> tuple[int, bytes, datetime] | None:
+        """Return application, bytes and time of the container that an error means.
+
+        Where several came of which nothing was told, it is not known which: None.
+        """
+        known = self._containers.pop() if len(self._containers) == 1 else None
+        self._containers.clear()
+        return known
+
+
+def topic_of_camera(name: str) -> str:
+    """Return a camera's name as its topics have it, which is its node's name, too."""
+    return "/".join(part for part in as_name(name).split("/") if part) or "camera"
+
+
+def parts_from_json(value: object) -> list[Localization] | None:
+    """Return what a recording has of localizations as localizations, None where it is none."""
+    if not isinstance(value, list):
+        return None
+    said: list[Any] = value
+    try:
+        return [_part(one) for one in said]
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def _part(said: Mapping[str, Any]) -> Localization:
+    """Return a localization of JSON; raises where it is none."""
+    if set(said) != set(Localization._fields):
+        raise ValueError("these are not its fields")
+    pose, feature, photo = said["pose"], said["feature_id"], said["photo_index"]
+    header = pose["header"]
+    if not (isinstance(feature, str) and isinstance(header["frame_id"], str)):
+        raise TypeError("no text")
+    if type(photo) is not int:
+        raise TypeError("no index")
+    return Localization(
+        feature,
+        _number(said["quality"]),
+        photo,
+        Pose(
+            Header(header["seq"], datetime.fromisoformat(header["stamp"]), header["frame_id"]),
+            Position(*(_number(pose["position"][name]) for name in "xyz")),
+            Quaternion(*(_number(pose["orientation"][name]) for name in "xyzw")),
+        ),
+    )
+
+
+def _number(said: object) -> float:
+    if isinstance(said, bool) or not isinstance(said, (int, float)):
+        raise TypeError("no number")
+    return float(said)

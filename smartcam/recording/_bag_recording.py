@@ -1,0 +1,201 @@
+"""A bag of a recording: its results as they were, or read again."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client.interpretation import Interpretation
+from smartcam.exceptions import (
+    ConfigurationError,
+    InterpretationError,
+    RecordingError,
+    RosMessageError,
+    UnsupportedError,
+)
+from smartcam.observers import TraceEntry
+from smartcam.protocols._bvs import BVS
+from smartcam.protocols.messages import ResultContainer
+from smartcam.recording._bag import remove_folder
+from smartcam.recording._bag_items import BagCounts, BagItems, ReadResult, parts_from_json
+from smartcam.recording._bag_recorder import DISTRIBUTION, open_bag
+from smartcam.ros2._types import RosTypes
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+    from smartcam.models import Result
+    from smartcam.recording._form import Item
+    from smartcam.recording._reader import RecordedCamera, Recording
+
+
+def write_bag(
+    recording: Recording,
+    path: str | Path,
+    *,
+    camera: str | None = None,
+    interpret_as: Any = None,
+    y_down: bool | None = None,
+    calibration: Any = None,
+    overwrite: bool = False,
+) -> BagCounts:
+    """Make a rosbag2 of a recording, in its order and with its times.
+
+    Without ``interpret_as`` and ``calibration`` the values are the recorded ones. With one of them
+    each result's bytes are read again; those that do not fit go in with why, and are counted.
+
+    Args:
+        recording: where from.
+        path: the bag's folder.
+        camera: whose; default all cameras'.
+        interpret_as: how to read results, as :func:`smartcam.connect` takes it; default what was
+            recorded of it, or localizations where there is a calibration.
+        y_down: the camera's y axis points down; default as recorded.
+        calibration: brings localizations into the robot's frame, as :func:`smartcam.connect` has
+            it.
+        overwrite: take the place of a bag that is there.
+
+    Returns:
+        What is in the bag.
+
+    Raises:
+        ConfigurationError: no such camera, an option that cannot work, or the folder is there
+            already or cannot be made.
+        UnsupportedError: a camera whose results cannot be read again from their bytes.
+        RecordingError: it cannot be written to its end; nothing is left of it.
+        MissingExtraError: a library is not installed.
+    """
+    conversion = BagConversion(
+        recording, Path(path), camera, interpret_as, y_down, calibration, overwrite
+    )
+    for _ in conversion.steps():
+        pass
+    return conversion.counts
+
+
+@dataclass(eq=False)
+class BagConversion:
+    """Makes a bag of a recording in steps of one item; the fields are :func:`write_bag`'s."""
+
+    recording: Recording
+    folder: Path
+    camera: str | None
+    interpret_as: Any
+    y_down: bool | None
+    calibration: Any
+    overwrite: bool
+    _items: BagItems = field(init=False)
+
+    def __post_init__(self) -> None:
+        cameras = self.recording.cameras
+        chosen = (
+            [*cameras.values()] if self.camera is None else [self.recording.camera(self.camera)]
+        )
+        again = self.interpret_as is not None or self.calibration is not None
+        self._readers = {one.name: self._reader(one) for one in chosen} if again else {}
+        self._items = BagItems(RosTypes(DISTRIBUTION), self._read)
+        for one in chosen:
+            said = {"interpret_as": self._spec(one)} if again else one.facts
+            self._items.describe({**said, "camera": one.name})
+
+    @property
+    def counts(self) -> BagCounts:
+        """What is in the bag."""
+        return self._items.counts
+
+    def steps(self) -> Generator[None, None, None]:
+        """Write the bag, an item a step; when this is closed early, nothing is left of it.
+
+        Raises as :func:`write_bag`.
+        """
+        if self.recording.path.resolve().parent == self.folder.resolve():
+            raise ConfigurationError(
+                f"bag {self.folder}: the recording {self.recording.path} is in this folder"
+            )
+        writer = open_bag(self.folder, overwrite=self.overwrite)
+        try:
+            with contextlib.closing(writer):
+                writer.start()
+                for item in self.recording.items(self.camera):
+                    self._see(item)
+                    for message in self._items.messages(item):
+                        writer.add(*message)
+                    yield
+                writer.finish()
+        except BaseException as exc:
+            with contextlib.suppress(OSError):
+                remove_folder(self.folder)
+            if isinstance(exc, (OSError, RosMessageError)):
+                reason = getattr(exc, "strerror", None) or exc
+                raise RecordingError(f"bag {self.folder}: {reason}") from exc
+            raise
+
+    def _spec(self, camera: RecordedCamera) -> Any:
+        """Return how a camera's results are read again."""
+        if self.interpret_as is not None:
+            return self.interpret_as
+        return camera.interpret_as or "localizations"
+
+    def _reader(self, camera: RecordedCamera) -> _ResultReader:
+        if camera.dialect not in BVS.dialects and camera.protocol != "bvs":
+            raise UnsupportedError(
+                f"bag: camera {camera.name!r} is one of {camera.protocol or 'no known protocol'} "
+                f"(dialect {camera.dialect}): only results of bvs can be read again; without "
+                "interpret_as and calibration the recorded values are taken"
+            )
+        y_down = camera.facts.get("y_down") == "True" if self.y_down is None else self.y_down
+        spec = self._spec(camera)
+        reading = Interpretation(
+            spec,
+            lenient=camera.facts.get("lenient") == "True",
+            y_down=y_down,
+            calibration=self.calibration,
+        )
+        endian = camera.facts.get("endian", "0")
+        if endian not in {"0", "1"}:
+            raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
+        return _ResultReader(reading, int(endian))
+
+    def _see(self, item: Item) -> None:
+        if isinstance(item, TraceEntry) and item.message == "StatusReport" and self._readers:
+            self._readers[item.camera].see_status(item)
+
+    def _read(self, result: Result) -> ReadResult:
+        """Return a result as it goes into the bag."""
+        if self._readers:
+            return self._readers[result.camera].read(result)
+        if result.value == result.raw.hex():  # as bytes stand in a recording
+            return ReadResult(result._replace(value=result.raw))
+        parts = parts_from_json(result.value)
+        return ReadResult(result if parts is None else result._replace(value=parts))
+
+
+@dataclass(eq=False)
+class _ResultReader:
+    """Reads one camera's results again."""
+
+    _interpretation: Interpretation
+    _endian: int
+
+    def see_status(self, entry: TraceEntry) -> None:
+        """Keep the byte order that a status tells."""
+        endian = (entry.fields or {}).get("endian")
+        if isinstance(endian, int):
+            self._endian = endian
+
+    def read(self, result: Result) -> ReadResult:
+        """Return the result with what its bytes hold, or why that cannot be told."""
+        container = ResultContainer(application=result.application, data=result.raw)
+        try:
+            value, sequence, _ = self._interpretation(
+                container,
+                self._endian,
+                camera=result.camera,
+                number=result.number,
+                at=result.received_at,
+            )
+        except InterpretationError as exc:
+            return ReadResult(result, f"{type(exc).__name__}: {exc}", again=True)
+        return ReadResult(result._replace(value=value, sequence=sequence), again=True)
