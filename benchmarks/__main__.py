@@ -30,6 +30,7 @@ BENCHMARKS = {
     "frames": "a frame to its readers and to a JPEG, and the delay of the loop",
     "pictures": "bytes of a picture at the same PSNR, and the CPU time of codecs",
     "transports": "pictures from stamp to stamp: bus, RTP, on request, GStreamer, rospy",
+    "ros2": "pictures, calls and detections without ROS, and what a camera's node adds to it",
     "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
 """Modules of this package with a ``run(plan)``, and what they measure."""

@@ -107,6 +107,7 @@ class RosContext:
         self._users = 0
         self._numbers = 0
         self._ends: dict[tuple[str, str], list[Entity]] = {}
+        self._watchers: dict[tuple[str, str], list[Callable[[Entity, bool], None]]] = {}
         self._lock = threading.Lock()
         self._threads: dict[str, ThreadPoolExecutor] = {}
         self._long: collections.Counter[object] = collections.Counter()
@@ -169,7 +170,32 @@ class RosContext:
         if not ends:
             self._ends.pop((entity.name, entity.kind), None)
 
+    def watch(
+        self, name: str, kind: str, watcher: Callable[[Entity, bool], None]
+    ) -> Callable[[], None]:
+        """Have ``watcher(entity, present)`` called for ends that come and go from now on.
+
+        Args:
+            name: of their topic or service.
+            kind: of them.
+            watcher: is called in the event loop.
+
+        Returns:
+            What ends it.
+        """
+        found = self._watchers.setdefault((name, kind), [])
+        found.append(watcher)
+
+        def end() -> None:
+            found.remove(watcher)
+            if not found and self._watchers.get((name, kind)) is found:
+                del self._watchers[name, kind]
+
+        return end
+
     def _compare(self, other: Entity, present: bool) -> None:
+        for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
+            watcher(other, present)
         if present and other.kind in OTHER_END:
             for one in self._ends.get((other.name, OTHER_END[other.kind]), ()):
                 self._differ(one, other)
