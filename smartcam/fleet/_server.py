@@ -20,6 +20,7 @@ from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
+from smartcam.settings import masked
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator._wire_camera import WireCamera
     from smartcam.fleet._bus import Bus
-    from smartcam.fleet._file import Planned
+    from smartcam.fleet._file import FramesEntry, Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
     from smartcam.settings import CameraSettings
@@ -113,6 +114,12 @@ class FleetServer(Server):
 
         return dict(SETTINGS)
 
+    def _ros_frames(self, entry: FramesEntry) -> dict[str, Any]:
+        found: dict[str, Any] = {"video_device": masked(entry.url)}
+        if entry.camera_info is not None:
+            found["camera_info_url"] = (self._folder / entry.camera_info).absolute().as_uri()
+        return found
+
     def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
 
@@ -126,6 +133,11 @@ class FleetServer(Server):
             file.ros2 or RosSection(),
             cameras=said,
             settings=cameras,
+            frames={
+                planned.name: self._ros_frames(planned.entry.frames)
+                for planned in self._plan
+                if planned.entry.frames is not None
+            },
             calibrations={name: one for name, one in found.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
         )

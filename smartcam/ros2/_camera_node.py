@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import inspect
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,13 +14,15 @@ from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._camera_lifecycle import CameraLifecycle
 from smartcam.ros2._camera_parameters import CameraParameters
+from smartcam.ros2._camera_pictures import CameraPictures
 from smartcam.ros2._camera_results import CameraResults
 from smartcam.ros2._camera_services import CameraServices
 from smartcam.ros2._camera_status import CameraStatus
 from smartcam.ros2._rosout import RosOut
+from smartcam.ros2._transforms import StaticTransforms, camera_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable
 
     from smartcam.camera import Camera
     from smartcam.settings import CameraSettings
@@ -86,6 +89,10 @@ PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
     lambda one: one.results,
     lambda one: one.services,
     lambda one: one.rosout(),
+    lambda one: CameraPictures(
+        one.camera, one.node, camera_info_url=str(one.options.frames.get("camera_info_url", ""))
+    ),
+    lambda one: StaticTransforms(one.node, one.transforms()),
     lambda one: one.lifecycle,
 )
 """What a node is made of, in the order in which it starts; the life cycle is the last, so that what
@@ -153,6 +160,13 @@ class CameraNode(Server):
             return record.getMessage().startswith(begins)
 
         return RosOut(self.node, logging.getLogger("smartcam"), wanted=wanted)
+
+    def transforms(self) -> list[Any]:
+        """Return where the calibration puts the camera; none where it does not say, or is none."""
+        calibration = self.camera.settings.calibration
+        if calibration is None or isinstance(calibration, Mapping):  # of each application one
+            return []
+        return camera_transforms(calibration, self.frame_id, parent=self.options.parent_frame)
 
     def _on_transition(self, _: object) -> None:
         self.results.active = self.lifecycle.active

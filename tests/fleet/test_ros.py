@@ -22,6 +22,8 @@ from tests.ros2.roskit import PATIENCE, TRIGGER, free_place, soon, until
 
 pytestmark = pytest.mark.real_time
 
+ROOT = Path(__file__).parents[2]
+
 EMULATED = {"emulated": {}, "application": 7, "interpret_as": "localizations"}
 STATUS = "smartcam_msgs/msg/CameraStatus"
 POSES = "geometry_msgs/msg/PoseArray"
@@ -136,3 +138,35 @@ def test_a_wrong_file_is_told(text: str, file: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as told:
         load_fleet(path)
     assert text in str(told.value).replace(" > ", ".")
+
+
+def rows(page: str) -> dict[str, str]:
+    """Return what the page's tables say: a type by each name."""
+    found: dict[str, str] = {}
+    for line in page.splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) == 5 and "`" in cells[1] and "`" in cells[2]:
+            names = cells[1].replace("`", "").split(", ")
+            types = cells[2].replace("`", "").split(", ")
+            for n, name in enumerate(names):
+                found[name] = types[min(n, len(types) - 1)]
+    return found
+
+
+async def test_the_page_has_what_a_node_has() -> None:
+    place = free_place()
+    frames = {**EMULATED, "frames": "synthetic://?size=64x48&fps=5"}
+    async with (
+        smartcam.fleet.serve(plant(place, {"line1/cam3": frames})),
+        Node("viewer", connect=place, parameters=False) as viewer,
+    ):
+        await until(lambda: "/line1/cam3/get_state" in viewer.graph.services())
+        await until(lambda: "/line1/cam3/image_raw" in viewer.graph.topics())
+        said = rows((ROOT / "docs" / "ros2.md").read_text(encoding="utf-8"))
+        for found in (viewer.graph.topics(), viewer.graph.services()):
+            for name, (type,) in found.items():
+                own = name.removeprefix("/line1/cam3/")
+                package = said[own].removesuffix("...")
+                assert type.startswith(package) or type.endswith(f"/{package}"), (name, type)
+                said.pop(own)
+        assert set(said) == {"/tf_static"}
