@@ -155,7 +155,7 @@ class RosFleet(Server):
         return Node(own, namespace=f"{above}/{namespace}", context=self.context)
 
     def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
-        said = self._said.get(name, RosCamera())
+        said = self._said.get(name, RosCamera.model_validate({}))
         return CameraNodeOptions(
             frame_id=said.frame_id or as_name(name).replace("/", "_"),
             parent_frame=said.parent_frame or "",

@@ -130,7 +130,7 @@ class FleetServer(Server):
             bus,
             file.fleet,
             self.address,
-            file.ros2 or RosSection(),
+            file.ros2 or RosSection.model_validate({}),
             cameras=said,
             settings=cameras,
             frames={

@@ -167,6 +167,7 @@ class RosClient(RosEnd):
         self.type: ServiceType = kind
         self._number = 0
         self._waiting: set[asyncio.Future[Any]] = set()
+        self._querier: Any = None
 
         def declare(session: Any) -> Any:
             zenoh = context.zenoh.engine

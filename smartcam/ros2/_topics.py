@@ -220,7 +220,8 @@ class RosPublisher(RosEnd):
 
         Cancellation: the message is published or not.
         """
-        what, _ = said(message, fields), self._check_open()
+        self._check_open()
+        what = said(message, fields)
         if self._slot is None:
             self._slot = self._context.slot()
             self._lane = self._slot.lane

@@ -62,7 +62,7 @@ async def test_a_plant_is_seen_and_used_from_ros() -> None:
         others = viewer.subscribe("/line_1/cam1/localizations", POSES, qos=QoS(depth=5))
         publishers = {one.node.full_name: one for one in server._ros.nodes.values()}  # type: ignore[union-attr]
         await until(lambda: publishers["/line_1/cam2"].results._publishers["localizations"].heard)
-        direct = smartcam.connect(server.urls["line-1/cam2"])
+        direct: Any = smartcam.connect(server.urls["line-1/cam2"])
         async with direct as camera:
             result = await camera.trigger()
             message = await soon(anext(poses))
@@ -99,7 +99,8 @@ async def test_a_fleet_that_is_served_already_is_seen_by_its_url() -> None:
     async with smartcam.fleet.serve(file) as server:
         assert server.ros_nodes == []
         address = FleetAddress.parse(f"fleet://{place.partition('/')[2]}")
-        section = RosSection(domain=3, namespace="plant", autostart=False)
+        given = {"domain": 3, "namespace": "plant", "autostart": False}
+        section = RosSection.model_validate(given)
         async with (
             ros_of(address, section) as ros,
             Node("viewer", connect=place, domain=3) as viewer,

@@ -199,7 +199,7 @@ async def test_nobody_serves_it() -> None:
 async def test_a_call_ends_with_its_timeout_and_the_handler_with_its_own() -> None:
     ended = asyncio.Event()
 
-    async def never(_: object) -> object:
+    async def never(_: object) -> None:
         try:
             await asyncio.Event().wait()
         finally:
@@ -267,7 +267,7 @@ asyncio.run(main())
 async def test_a_call_ends_with_its_caller_which_is_killed(tmp_path: Path) -> None:
     began, ended = asyncio.Event(), asyncio.Event()
 
-    async def waits(_: object) -> object:
+    async def waits(_: object) -> None:
         began.set()
         try:
             await asyncio.Event().wait()
