@@ -178,9 +178,9 @@ class Search:
 
         Cancellation: every connection is closed; what was found stays.
         """
-        spans = [await _resolved(*each) for each in self._networks]
-        leave = [(text, await _resolved(text, span)) for text, span in self._leave]
-        addresses, alone = AddressSet(spans), AddressSet(span for _, span in leave)
+        addresses = AddressSet([one for each in self._networks for one in await _spans(*each)])
+        leave = [(text, one) for text, span in self._leave for one in await _spans(text, span)]
+        alone = AddressSet(span for _, span in leave)
         _check_count(len(addresses), self._max_addresses)
         for text, span in leave:
             if span.size == 1 and span.first in addresses:
@@ -264,10 +264,10 @@ class Search:
 # ---------------------------------------------------------------------- addresses
 
 
-async def _resolved(text: str, span: Span | None) -> Span:
-    """Return a text's addresses: a name's is looked up, and it is the first that is told."""
+async def _spans(text: str, span: Span | None) -> list[Span]:
+    """Return a text's addresses; those of a name are looked up."""
     if span is not None:
-        return span
+        return [span]
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(NAME_TIMEOUT):
@@ -277,8 +277,8 @@ async def _resolved(text: str, span: Span | None) -> Span:
             f"no name server answers within {NAME_TIMEOUT:g} s"
         )
         raise ConfigurationError(f"find: the name {text!r} does not resolve: {why}") from exc
-    address = address_of(str(told[0][4][0]))
-    return Span(address, address)
+    found = {address_of(str(one[4][0])) for one in told}
+    return [Span(address, address) for address in sorted(found)]
 
 
 def _check_size(networks: Iterable[tuple[str, Span | None]], most: int) -> None:
