@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import os
 import re
 import sys
@@ -24,7 +25,7 @@ from smartcam.doctor._search import (
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable, Mapping
+    from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
     from smartcam.doctor import Found
 
@@ -128,7 +129,10 @@ async def find(
     """
     if as_yaml and options.as_json:
         raise click.UsageError("--json and --yaml do not go together")
-    known = {} if fleet_file is None else await asyncio.to_thread(_fleet_hosts, fleet_file)
+    known: dict[str, dict[str, str]] = {}
+    taken: set[str] = set()
+    if fleet_file is not None:
+        known, taken = await asyncio.to_thread(_fleet_cameras, fleet_file)
     search = Search(
         networks,
         ports=ports,
@@ -141,34 +145,34 @@ async def find(
         async with _telling(search):
             await search.run()
     finally:
-        if search.total:  # else nothing was begun
+        if search.begun:
             alone = {host: known[text] for host, text in search.left.items() if text in known}
-            _show(search, alone, options, as_yaml=as_yaml)
+            if as_yaml:
+                click.echo("\n".join(fleet_lines(search.results(), taken)))
+            else:
+                _show(search.results(), alone, options)
+            click.echo(summary(search), err=True)
 
 
-def _fleet_hosts(path: str) -> dict[str, dict[str, str]]:
-    """Return the hosts of a fleet file's cameras, with names and URLs of these."""
+def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
+    """Return the hosts of a fleet file's cameras, with names and URLs of these; and all names."""
     from smartcam.fleet import load_fleet
 
     found: dict[str, dict[str, str]] = {}
-    for planned in load_fleet(path).plan():
+    plan = load_fleet(path).plan()
+    for planned in plan:
         if planned.entry.url is not None:
             address = parse_address(planned.entry.url, model=planned.entry.model)
             found.setdefault(address.host, {})[planned.name] = address.url
-    return found
+    return found, {planned.name for planned in plan}
 
 
 # ---------------------------------------------------------------------- showing
 
 
-def _show(
-    search: Search, alone: Mapping[str, Mapping[str, str]], options: Options, *, as_yaml: bool
-) -> None:
-    found = search.results()
-    names = {name for cameras in alone.values() for name in cameras}
-    if as_yaml:
-        click.echo("\n".join(fleet_lines(found, names)))
-    elif options.as_json:
+def _show(found: Sequence[Found], alone: Mapping[str, Mapping[str, str]], options: Options) -> None:
+    """Print what was found, and what was left alone, as a table or as JSON."""
+    if options.as_json:
         for one in found:
             value = {name: getattr(one, name) for name in one.__dataclass_fields__}
             options.show({**value, "greeting": one.greeting, "urls": one.urls}, "")
@@ -185,7 +189,6 @@ def _show(
             for host, cameras in alone.items()
         ]
         click.echo(table_text(("host", "port", "protocol", "opened", "what is known"), rows))
-    click.echo(summary(search), err=True)
 
 
 def _ms(found: Found) -> str:
@@ -238,10 +241,9 @@ def fleet_lines(found: Iterable[Found], taken: Iterable[str] = ()) -> list[str]:
 def _fresh(found: Found, taken: set[str]) -> str:
     """Return a name for a camera, made from its address."""
     host = re.sub(r"[^a-z0-9]", "-", found.host.lower())
-    for name in (f"found/{host}", f"found/{host}-{found.port}"):
-        if name not in taken:
-            return name
-    return f"found/{host}-{found.port}-new"
+    base = f"found/{host}-{found.port}"
+    names = itertools.chain((f"found/{host}", base), (f"{base}-{n}" for n in itertools.count(2)))
+    return next(name for name in names if name not in taken)
 
 
 @contextlib.asynccontextmanager

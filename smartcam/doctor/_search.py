@@ -118,6 +118,7 @@ class Search:
         counts: how many of the tries came to what.
         why: the first failure that is this machine's.
         left: addresses that were left alone, to the texts that say so.
+        begun: whether it has come as far as the first port.
     """
 
     def __init__(
@@ -164,6 +165,7 @@ class Search:
         self.counts: collections.Counter[str] = collections.Counter()
         self.why = ""
         self.left: dict[str, str] = {}
+        self.begun = False
 
     def results(self) -> list[Found]:
         """Return what was found, sorted by address."""
@@ -186,6 +188,7 @@ class Search:
             if span.size == 1 and span.first in addresses:
                 self.left[str(span.first)] = text
         self.total = len(addresses) * len(self._ports)
+        self.begun = True
         loop = asyncio.get_running_loop()
         places, due = asyncio.Semaphore(self._at_once), loop.time()
         try:
