@@ -20,14 +20,14 @@ from smartcam.doctor._search import (
     MOST_AT_ONCE,
     MOST_RATE,
     MOST_SECONDS,
-    Search,
+    CameraSearch,
 )
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
-    from smartcam.doctor import Found
+    from smartcam.doctor import FoundPort
 
 PERIOD = 1.0
 """Seconds between two looks of the line that tells how far the search is."""
@@ -133,7 +133,7 @@ async def find(
     taken: set[str] = set()
     if fleet_file is not None:
         known, taken = await asyncio.to_thread(_fleet_cameras, fleet_file)
-    search = Search(
+    search = CameraSearch(
         networks,
         ports=ports,
         protocols=protocols or None,
@@ -170,7 +170,9 @@ def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
 # ---------------------------------------------------------------------- showing
 
 
-def _show(found: Sequence[Found], alone: Mapping[str, Mapping[str, str]], options: Options) -> None:
+def _show(
+    found: Sequence[FoundPort], alone: Mapping[str, Mapping[str, str]], options: Options
+) -> None:
     """Print what was found, and what was left alone, as a table or as JSON."""
     if options.as_json:
         for one in found:
@@ -191,11 +193,11 @@ def _show(found: Sequence[Found], alone: Mapping[str, Mapping[str, str]], option
         click.echo(table_text(("host", "port", "protocol", "opened", "what is known"), rows))
 
 
-def _ms(found: Found) -> str:
+def _ms(found: FoundPort) -> str:
     return f"{found.seconds * 1e3:.1f} ms"
 
 
-def evidence(found: Found) -> str:
+def evidence(found: FoundPort) -> str:
     """Return what is known of a port that is open, as a line."""
     if found.answer is not None:
         return f"a camera answers: {found.answer.url}"
@@ -207,7 +209,7 @@ def evidence(found: Found) -> str:
     return f"{text}; asked: {found.refusal}" if found.refusal else text
 
 
-def summary(search: Search) -> str:
+def summary(search: CameraSearch) -> str:
     """Return how the search went, for people."""
     outcomes = ("open", "refused", "no answer", "unreachable", "failed")
     told = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
@@ -217,7 +219,7 @@ def summary(search: Search) -> str:
     return f"{text}. Cameras that are set to UDP do not show."
 
 
-def fleet_lines(found: Iterable[Found], taken: Iterable[str] = ()) -> list[str]:
+def fleet_lines(found: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
     """Return lines for a fleet file; what is no camera, or did not answer, is a comment.
 
     ``taken``: names that the fleet has already.
@@ -238,7 +240,7 @@ def fleet_lines(found: Iterable[Found], taken: Iterable[str] = ()) -> list[str]:
     return lines
 
 
-def _fresh(found: Found, taken: set[str]) -> str:
+def _fresh(found: FoundPort, taken: set[str]) -> str:
     """Return a name for a camera, made from its address."""
     host = re.sub(r"[^a-z0-9]", "-", found.host.lower())
     base = f"found/{host}-{found.port}"
@@ -247,7 +249,7 @@ def _fresh(found: Found, taken: set[str]) -> str:
 
 
 @contextlib.asynccontextmanager
-async def _telling(search: Search) -> AsyncIterator[None]:
+async def _telling(search: CameraSearch) -> AsyncIterator[None]:
     """Have a line on a terminal's stderr that tells how far the search is."""
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield
@@ -261,7 +263,7 @@ async def _telling(search: Search) -> AsyncIterator[None]:
         click.echo("\r\x1b[K", err=True, nl=False)
 
 
-async def _tell(search: Search) -> None:
+async def _tell(search: CameraSearch) -> None:
     while True:
         await asyncio.sleep(PERIOD)
         text = f"{search.opened} of {search.total} ports, {search.counts['open']} open"

@@ -17,7 +17,7 @@ from smartcam.doctor import _state_checks as state_checks
 from smartcam.doctor import _trigger_checks as trigger_checks
 from smartcam.doctor._context import DoctorOptions, Examination, Witness
 from smartcam.doctor._findings import Exit, Finding
-from smartcam.doctor._found import Found
+from smartcam.doctor._found import FoundPort
 from smartcam.doctor._search import find
 from smartcam.exceptions import (
     CameraFaultError,
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Finding",
-    "Found",
+    "FoundPort",
     "examine",
     "find",
 ]

@@ -23,7 +23,7 @@ MOST_PORTS = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
+class FoundPort:
     """A port that took a connection.
 
     Attributes:
@@ -144,7 +144,7 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
 # ---------------------------------------------------------------------- what was heard
 
 
-def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> Found:
+def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
     """Return what an open port is, by what was heard."""
     said = opened.said.lstrip()
     greeted = [one for one in protocols if one.greeting and said.startswith(one.greeting)]
@@ -158,7 +158,7 @@ def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]
         evidence = "said"
     elif opened.ended:
         evidence = "ended"
-    return Found(
+    return FoundPort(
         host=host,
         port=port,
         protocols=tuple(one.name for one in possible),

@@ -23,7 +23,7 @@ from smartcam.settings import parse_address
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from smartcam.doctor._found import Found
+    from smartcam.doctor._found import FoundPort
     from smartcam.doctor._networks import HostAddress
 
 MAX_ADDRESSES = 65_536
@@ -65,7 +65,7 @@ async def find(
     at_once: int = 64,
     timeout: float = 1.0,
     max_addresses: int = MAX_ADDRESSES,
-) -> list[Found]:
+) -> list[FoundPort]:
     """Return what listens in networks where cameras do, sorted by address.
 
     The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent. A
@@ -93,7 +93,7 @@ async def find(
 
     Cancellation: every connection is closed.
     """
-    search = Search(
+    search = CameraSearch(
         networks,
         ports=ports,
         protocols=protocols,
@@ -109,7 +109,7 @@ async def find(
     return search.results()
 
 
-class Search:
+class CameraSearch:
     """One search; what was found stays, however it ends. Arguments as in :func:`find`.
 
     Attributes:
@@ -158,7 +158,7 @@ class Search:
         self._timeout = timeout
         self._max_addresses = max_addresses
         _check_size(self._networks, max_addresses)
-        self._found: dict[tuple[HostAddress, int], Found] = {}
+        self._found: dict[tuple[HostAddress, int], FoundPort] = {}
         self._busy = 0
         self.opened = 0
         self.total = 0
@@ -167,7 +167,7 @@ class Search:
         self.left: dict[str, str] = {}
         self.begun = False
 
-    def results(self) -> list[Found]:
+    def results(self) -> list[FoundPort]:
         """Return what was found, sorted by address."""
         return [self._found[key] for key in sorted(self._found)]
 
@@ -299,7 +299,7 @@ def _check_count(count: int, most: int) -> None:
 # ---------------------------------------------------------------------- asking
 
 
-async def asked(found: Found) -> Found:
+async def asked(found: FoundPort) -> FoundPort:
     """Speak to what was found, in each protocol that it may speak, and return what came of it."""
     failed: list[str] = []
     for url in found.urls:

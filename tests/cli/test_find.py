@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from smartcam._cli.find import fleet_lines
-from smartcam.doctor import Found
+from smartcam.doctor import FoundPort
 from smartcam.fleet import load_fleet
 from tests.cli.commandline import emulators, run
 from tests.doctor.findkit import NETWORK, filtered, free_port
@@ -41,7 +41,7 @@ def silent(port: int, *hosts: int) -> Iterator[list[socket.socket]]:
 
 
 def search(*args: str) -> Outcome:
-    """Search, and see that it went well and said nothing on stderr but how it went."""
+    """CameraSearch, and see that it went well and said nothing on stderr but how it went."""
     outcome = run("find", *args)
     assert outcome.code == 0, outcome
     assert re.fullmatch(r"\d+ of \d+ ports tried: .* do not show\.\n", outcome.err), outcome
@@ -99,8 +99,8 @@ def test_find_leaves_a_fleets_cameras_alone(port: int, tmp_path: Path) -> None:
         f'  line1/cam4: {{model: IN-SIGHT, url: "{NETWORK}3"}}\n  line2/**: {{emulated: {{}}}}\n'
         f'  found/{NETWORK.replace(".", "-")}4: {{url: "bvs://10.0.0.9"}}\n'
     )
-    args = (f"{NETWORK}1-4", "--port", str(port), "--may-disturb", *QUICK)
-    args = (*args, "--fleet", str(fleet), "--leave", f"{NETWORK}1")
+    alone = ("--fleet", str(fleet), "--leave", f"{NETWORK}1")
+    args = (f"{NETWORK}1-4", "--port", str(port), "--may-disturb", *QUICK, *alone)
     with silent(port, 1, 2, 3, 4) as servers:
         out = search(*args).out
         assert f"{NETWORK}2" in out
@@ -112,9 +112,9 @@ def test_find_leaves_a_fleets_cameras_alone(port: int, tmp_path: Path) -> None:
     assert [line.get("fleet_camera") for line in lines] == [None, "line1/cam3", "line1/cam4"]
     assert lines[0]["urls"] == [f"bvs://{NETWORK}4:{port}"]
     assert lines[0]["evidence"] == "silent"
-    alone = search(f"{NETWORK}2", "--may-disturb", "--fleet", str(fleet))
-    assert "it is line1/cam3 of the fleet" in alone.out
-    assert alone.err.startswith("0 of 0 ports tried")
+    only = search(f"{NETWORK}2", "--may-disturb", "--fleet", str(fleet))
+    assert "it is line1/cam3 of the fleet" in only.out
+    assert only.err.startswith("0 of 0 ports tried")
     # the lines go into that very file, below its last camera
     with fleet.open("a") as file:
         file.write(text.partition("\n")[2])
@@ -124,7 +124,7 @@ def test_find_leaves_a_fleets_cameras_alone(port: int, tmp_path: Path) -> None:
     run("find", *args, "--fleet", str(tmp_path / "none.yaml")).failed(2, "none.yaml")
 
 
-def found(host: str = "10.0.0.7", **said: object) -> Found:
+def found(host: str = "10.0.0.7", **said: object) -> FoundPort:
     given = {
         "port": 36701,
         "protocols": ("bvs",),
@@ -132,7 +132,7 @@ def found(host: str = "10.0.0.7", **said: object) -> Found:
         "said": b"",
         "seconds": 0.1,
     }
-    return Found(host=host, **{**given, **said})  # type: ignore[arg-type]
+    return FoundPort(host=host, **{**given, **said})  # type: ignore[arg-type]
 
 
 def test_lines_load_whatever_was_said(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ import pytest
 
 import smartcam
 from smartcam import Backoff, ConfigurationError
-from smartcam.doctor import Found, _search
+from smartcam.doctor import FoundPort, _search
 from smartcam.doctor._opening import MAX_SAID, Opened, is_own
-from smartcam.doctor._search import Search
+from smartcam.doctor._search import CameraSearch
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.protocols import BVS, Transport
 from smartcam.protocols._base import Protocol
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 WELCOME = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "
 
 
-async def found_on(port: int, *networks: str, **options: Any) -> list[Found]:
+async def found_on(port: int, *networks: str, **options: Any) -> list[FoundPort]:
     """Return what listens at a port of this process' network."""
     options = {"ports": [port], "may_disturb": True, **options}
     return await smartcam.find(*(networks or (f"{NETWORK}0/28",)), **options)
 
 
-def told(found: list[Found]) -> dict[str, tuple[tuple[str, ...], str]]:
+def told(found: list[FoundPort]) -> dict[str, tuple[tuple[str, ...], str]]:
     """Return by the address' last number: protocols, and what they are known by."""
     return {one.host.rpartition(".")[2]: (one.protocols, one.evidence) for one in found}
 
@@ -113,9 +113,9 @@ async def test_clients_at_work_notice_nothing() -> None:
             assert client.connected
             assert one.sessions == session
             assert heard_from(one) == set(session)
-        for one in (silent, rubbish, endless):
-            assert (one.opened, one.received) == (1, b"")
-            await until(lambda one=one: one.ended == 1)
+        others = (silent, rubbish, endless)
+        assert [(other.opened, other.received) for other in others] == [(1, b"")] * 3
+        await until(lambda: all(other.ended == 1 for other in others))
         visitors = {visit.peer for one in bvs for visit in one.visits}
         assert len(visitors) == 2, "each was opened once, and closed by us"
 
@@ -269,7 +269,7 @@ def opened_at(monkeypatch: pytest.MonkeyPatch, lasts: float) -> tuple[list[float
 
 async def test_openings_have_a_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     times, _ = opened_at(monkeypatch, lasts=0.3)
-    search = Search(["10.0.0.0/24"], protocols=["insight"], ports=[24], rate=20, at_once=500)
+    search = CameraSearch(["10.0.0.0/24"], protocols=["insight"], ports=[24], rate=20, at_once=500)
     await search.run()
     assert len(times) == search.opened == search.total == 2 * 254
     # neither more than 20 in any second, nor a burst in a tenth of one
@@ -288,7 +288,7 @@ async def test_connections_at_a_time_are_bounded(monkeypatch: pytest.MonkeyPatch
 async def test_address_that_answers_nothing_ends_by_its_deadline() -> None:
     port, loop = free_port(), asyncio.get_running_loop()
     with filtered(f"{NETWORK}1", port), filtered(f"{NETWORK}2", port):
-        search = Search(
+        search = CameraSearch(
             [f"{NETWORK}1-2"], ports=[port], protocols=["insight"], timeout=2.0, rate=1000
         )
         begun = loop.time()
@@ -330,16 +330,15 @@ async def test_talker_that_never_says_a_line_ends_by_its_deadline() -> None:
 def test_search_that_cannot_work_is_refused(options: dict[str, Any], said: str) -> None:
     options = {"networks": ["10.0.0.1"], "protocols": ["insight"], **options}
     with pytest.raises(ConfigurationError, match=said):
-        Search(options.pop("networks"), **options)
+        CameraSearch(options.pop("networks"), **options)
 
 
 async def test_more_addresses_may_be_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_search, "MAX_ADDRESSES", 3)
     times, _ = opened_at(monkeypatch, lasts=0.0)
-    networks, only = ("10.0.0.1-5", "10.0.0.4-6"), {"protocols": ["insight"]}
+    networks, only = ("10.0.0.1-5", "10.0.0.4-6"), ["insight"]
     with pytest.raises(ConfigurationError, match="6 addresses are more than 3"):
-        Search(networks, **only, max_addresses=3)
-    await Search(networks, **only, max_addresses=6).run()
+        CameraSearch(networks, protocols=only, max_addresses=3)
+    await CameraSearch(networks, protocols=only, max_addresses=6).run()
     assert len(times) == 6
 
 
@@ -403,7 +402,7 @@ async def test_cancelled_search_closes_and_keeps_what_it_found() -> None:
         listening(f"{NETWORK}4", port) as later,
     ):
         with filtered(f"{NETWORK}3", port):
-            search = Search(
+            search = CameraSearch(
                 [f"{NETWORK}1-4"],
                 ports=[port],
                 may_disturb=True,

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import smartcam
-from smartcam.doctor._search import Search
+from smartcam.doctor._search import CameraSearch
 from smartcam.emulator import EmulatedCamera
 
 pytestmark = pytest.mark.long
@@ -38,7 +38,7 @@ async def _search() -> dict[str, object]:
         smartcam.connect(emulator.url, reconnect=None) as client,
     ):
         networks = ["10.77.0.0/28", "fd77::2", "10.77.1.1-2", "10.77.2.1-3", "10.99.0.1"]
-        search = Search(networks, ports=[5000], may_disturb=True, rate=1000, timeout=0.5)
+        search = CameraSearch(networks, ports=[5000], may_disturb=True, rate=1000, timeout=0.5)
         task = asyncio.create_task(search.run())
         while not task.done():
             await client.trigger()
