@@ -142,7 +142,7 @@ async def find(
         **given,
     )
     try:
-        async with _telling(search):
+        async with telling(search):
             await search.run()
     finally:
         if search.begun:
@@ -249,7 +249,7 @@ def _fresh(found: FoundPort, taken: set[str]) -> str:
 
 
 @contextlib.asynccontextmanager
-async def _telling(search: CameraSearch) -> AsyncIterator[None]:
+async def telling(search: CameraSearch) -> AsyncIterator[None]:
     """Have a line on a terminal's stderr that tells how far the search is."""
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield

@@ -145,8 +145,11 @@ class CameraSearch:
                 raise ConfigurationError(
                     f"find: {name}={value!r}: expected more than 0, at most {most:,}"
                 )
-        if not networks:
-            raise ConfigurationError("find: no network is named")
+        if not networks or not all(isinstance(text, str) for text in networks):
+            raise ConfigurationError(
+                "find: expected one network or several, each a text of its own; got "
+                f"{networks!r:.80}"
+            )
         self._networks = [(text, read_span(text)) for text in networks]
         self._leave = [(text, read_span(text)) for text in leave]
         self._ports = ports_of(ports, protocols)

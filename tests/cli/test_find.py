@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import re
 import signal
@@ -11,8 +12,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from smartcam._cli.find import fleet_lines
+from smartcam._cli.find import fleet_lines, telling
 from smartcam.doctor import FoundPort
+from smartcam.doctor._search import CameraSearch
 from smartcam.fleet import load_fleet
 from tests.cli.commandline import emulators, run
 from tests.doctor.findkit import NETWORK, filtered, free_port
@@ -41,7 +43,7 @@ def silent(port: int, *hosts: int) -> Iterator[list[socket.socket]]:
 
 
 def search(*args: str) -> Outcome:
-    """CameraSearch, and see that it went well and said nothing on stderr but how it went."""
+    """Search, and see that it went well and said nothing on stderr but how it went."""
     outcome = run("find", *args)
     assert outcome.code == 0, outcome
     assert re.fullmatch(r"\d+ of \d+ ports tried: .* do not show\.\n", outcome.err), outcome
@@ -166,6 +168,7 @@ def test_lines_load_whatever_was_said(tmp_path: Path) -> None:
     assert all(line.isascii() and line.isprintable() for line in lines)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no Ctrl-C for one process")
 def test_find_after_ctrl_c_shows_what_it_has(port: int) -> None:
     with (
@@ -185,6 +188,22 @@ def test_find_after_ctrl_c_shows_what_it_has(port: int) -> None:
     assert [line["protocols"] for line in outcome.lines] == [["insight"]]
     assert outcome.lines[0]["greeting"] == "Welcome to In-Sight(tm)"
     assert "3 of 6 ports tried: 1 open, 2 refused" in outcome.err
+
+
+async def test_terminal_is_told_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search = CameraSearch(["10.0.0.1"], protocols=["insight"])
+    async with telling(search):
+        await asyncio.sleep(2.5)
+    assert capsys.readouterr().err == ""  # which is no terminal
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    monkeypatch.setenv("TERM", "xterm")
+    async with telling(search):
+        search.opened, search.total, search.counts["open"] = 7, 9, 1
+        await asyncio.sleep(1.5)
+    clear = "\r\x1b[K"
+    assert capsys.readouterr().err == f"{clear}7 of 9 ports, 1 open{clear}"
 
 
 @pytest.mark.long

@@ -311,7 +311,8 @@ async def test_talker_that_never_says_a_line_ends_by_its_deadline() -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"networks": []}, "no network"),
+        ({"networks": []}, "expected one network"),
+        ({"networks": [["10.0.0.1"]]}, "each a text of its own"),
         ({"networks": ["10.0.0.0/8"]}, r"16,777,214 addresses .* max_addresses=16777214"),
         ({"networks": ["10.0.0.0/24"], "max_addresses": 253}, "254 addresses"),
         ({"networks": ["10.0.0.0/24", "10.0.0.1-255"], "max_addresses": 254}, "255 addresses"),
@@ -340,6 +341,17 @@ async def test_more_addresses_may_be_allowed(monkeypatch: pytest.MonkeyPatch) ->
         CameraSearch(networks, protocols=only, max_addresses=3)
     await CameraSearch(networks, protocols=only, max_addresses=6).run()
     assert len(times) == 6
+
+
+async def test_address_of_ipv6() -> None:
+    try:
+        server = socket.create_server(("::1", 0), family=socket.AF_INET6)
+    except OSError:
+        pytest.skip("this system has no IPv6")
+    with server:
+        port = server.getsockname()[1]
+        found = [one for one in await found_on(port, "::1") if one.port == port]
+    assert [one.urls for one in found] == [(f"bvs://[::1]:{port}",)]
 
 
 async def test_name_means_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
