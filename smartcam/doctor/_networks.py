@@ -94,6 +94,24 @@ class AddressSet:
         same = _place(first)[:2] == _place(address)[:2]
         return same and first.number <= address.number <= last.number
 
+    def without(self, others: AddressSet) -> AddressSet:
+        """Return those that are not in another set."""
+        left: list[Span] = []
+        for first, last in self._spans:
+            for away in others._spans:
+                if _place(away.first)[:2] != _place(first)[:2] or away.last.number < first.number:
+                    continue
+                if away.first.number > last.number:
+                    break
+                if away.first.number > first.number:
+                    left.append(Span(first, first._replace(number=away.first.number - 1)))
+                first = first._replace(number=away.last.number + 1)
+                if first.number > last.number:
+                    break
+            if first.number <= last.number:
+                left.append(Span(first, last))
+        return AddressSet(left)
+
     def __iter__(self) -> Iterator[HostAddress]:
         """Yield each."""
         for first, last in self._spans:
@@ -101,14 +119,17 @@ class AddressSet:
                 yield first._replace(number=number)
 
 
-def read_span(text: str) -> Span | None:
+def read_span(text: str, *, whole: bool = False) -> Span | None:
     """Return the addresses that a text means; None for a name, which has to be looked up.
+
+    ``whole``: of an IPv4 network its first and last address too, which are no hosts in it, and may
+    be in a larger one.
 
     Raises:
         ConfigurationError: it means none, or no host's, or an IPv6 network that is too large.
     """
     text = text.strip()
-    span = _read(text)
+    span = _read(text, whole=whole)
     if span is None:
         if _NAME.fullmatch(text):
             return None
@@ -128,7 +149,7 @@ def read_span(text: str) -> Span | None:
     return span
 
 
-def _read(text: str) -> Span | None:
+def _read(text: str, *, whole: bool) -> Span | None:
     """Return what a text says, None where it is neither address nor network nor range."""
     address = _address(text)
     if address is not None:
@@ -138,7 +159,7 @@ def _read(text: str) -> Span | None:
             network = ipaddress.ip_network(text, strict=False)
         except ValueError as exc:
             raise ConfigurationError(f"{text!r:.80} is no network: {exc}") from exc
-        return _hosts(network)
+        return _hosts(network, whole=whole)
     left, dash, right = text.partition("-")
     first = _address(left.strip()) if dash else None
     if first is None:
@@ -167,10 +188,10 @@ def _address(text: str) -> HostAddress | None:
     return HostAddress(found.version, int(found), scope)
 
 
-def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network) -> Span:
+def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: bool) -> Span:
     """Return a network's hosts: of IPv4 neither its own address nor the one of all."""
     first, last = int(network.network_address), int(network.broadcast_address)
-    if network.version == 4 and last - first > 1:
+    if network.version == 4 and last - first > 1 and not whole:
         first, last = first + 1, last - 1
     return Span(HostAddress(network.version, first), HostAddress(network.version, last))
 

@@ -151,7 +151,7 @@ class CameraSearch:
                 f"{networks!r:.80}"
             )
         self._networks = [(text, read_span(text)) for text in networks]
-        self._leave = [(text, read_span(text)) for text in leave]
+        self._leave = [(text, read_span(text, whole=True)) for text in leave]
         self._ports = ports_of(ports, protocols)
         if not (may_disturb or ask):
             check_consent(self._ports)
@@ -185,11 +185,11 @@ class CameraSearch:
         """
         addresses = AddressSet([one for each in self._networks for one in await _spans(*each)])
         leave = [(text, one) for text, span in self._leave for one in await _spans(text, span)]
-        alone = AddressSet(span for _, span in leave)
         _check_count(len(addresses), self._max_addresses)
         for text, span in leave:
             if span.size == 1 and span.first in addresses:
                 self.left[str(span.first)] = text
+        addresses = addresses.without(AddressSet(span for _, span in leave))
         self.total = len(addresses) * len(self._ports)
         self.begun = True
         loop = asyncio.get_running_loop()
@@ -197,9 +197,6 @@ class CameraSearch:
         try:
             async with asyncio.TaskGroup() as group:
                 for address in addresses:
-                    if address in alone:
-                        self.total -= len(self._ports)
-                        continue
                     for port in self._ports:
                         await places.acquire()
                         await asyncio.sleep(max(0.0, due - loop.time()))

@@ -343,6 +343,16 @@ async def test_more_addresses_may_be_allowed(monkeypatch: pytest.MonkeyPatch) ->
     assert len(times) == 6
 
 
+async def test_network_that_is_left_is_left_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    times, _ = opened_at(monkeypatch, lasts=0.0)
+    search = CameraSearch(
+        ["10.0.0.0-20"], protocols=["insight"], leave=["10.0.0.0/28", "10.0.0.17"]
+    )
+    await search.run()
+    assert len(times) == search.total == 4
+    assert search.left == {"10.0.0.17": "10.0.0.17"}
+
+
 async def test_address_of_ipv6() -> None:
     try:
         server = socket.create_server(("::1", 0), family=socket.AF_INET6)

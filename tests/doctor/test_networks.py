@@ -89,22 +89,34 @@ def test_socket_gets_the_address(address: str, place: tuple[object, ...]) -> Non
 PLACES = st.tuples(st.sampled_from([4, 6]), st.integers(1, 30), st.integers(0, 9))
 
 
-@given(st.lists(PLACES, max_size=8))
-def test_set_has_each_address_once_and_in_order(places: list[tuple[int, int, int]]) -> None:
-    base = {4: int(ipaddress.ip_address("10.0.0.0")), 6: 0xFD << 120}
+BASE = {4: int(ipaddress.ip_address("10.0.0.0")), 6: 0xFD << 120}
+
+
+def spans_of(places: list[tuple[int, int, int]]) -> tuple[list[Span], set[HostAddress]]:
+    """Return spans, and their addresses one by one."""
     spans = [
-        Span(*(HostAddress(kind, base[kind] + one) for one in (first, first + more)))
+        Span(*(HostAddress(kind, BASE[kind] + one) for one in (first, first + more)))
         for kind, first, more in places
     ]
-    expected = {
-        HostAddress(kind, base[kind] + first + nth)
+    return spans, {
+        HostAddress(kind, BASE[kind] + first + nth)
         for kind, first, more in places
         for nth in range(more + 1)
     }
+
+
+@given(st.lists(PLACES, max_size=8), st.lists(PLACES, max_size=8))
+def test_set_has_each_address_once_and_in_order(
+    places: list[tuple[int, int, int]], others: list[tuple[int, int, int]]
+) -> None:
+    (spans, expected), (more_spans, away) = spans_of(places), spans_of(others)
     found = AddressSet(spans)
     assert list(found) == sorted(expected)
     assert len(found) == len(expected)
     for kind in (4, 6):
         for number in range(45):
-            address = HostAddress(kind, base[kind] + number)
+            address = HostAddress(kind, BASE[kind] + number)
             assert (address in found) == (address in expected)
+    left = found.without(AddressSet(more_spans))
+    assert list(left) == sorted(expected - away)
+    assert len(left) == len(expected - away)
