@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from smartcam.camera import Camera
     from smartcam.client import SmartCamera
     from smartcam.connecting import connect
+    from smartcam.doctor import find
     from smartcam.exceptions import (
         CalibrationError,
         CameraBusyError,
@@ -142,6 +143,7 @@ __all__ = [
     "connect",
     "emulator",
     "exceptions",
+    "find",
     "frames",
     "interpreters",
     "layout",
@@ -158,6 +160,7 @@ if not TYPE_CHECKING:
             "camera": "Camera",
             "client": "SmartCamera",
             "connecting": "connect",
+            "doctor": "find",
             "exceptions": " ".join(name for name in __all__ if name.endswith("Error")),
             "layout": "Layout",
             "models": "ApplicationChanged CameraEvent Capabilities Connected Disconnected Header "

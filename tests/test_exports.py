@@ -37,7 +37,7 @@ PUBLIC = [
     "ServiceTimeoutError", "SmartCamError", "SmartCamera", "Statistics", "Status",
     "StatusChanged", "SubscriberOverflowError", "TriggerError", "TriggerTimeoutError",
     "UnsupportedError", "WrongApplicationError", "__version__", "connect", "emulator",
-    "exceptions", "frames", "interpreters", "layout", "models", "protocols",
+    "exceptions", "find", "frames", "interpreters", "layout", "models", "protocols",
 ]  # fmt: skip
 
 MODULES = sorted(

@@ -17,6 +17,7 @@ from smartcam._cli.decode import decode, from_hex
 from smartcam._cli.depth import depth
 from smartcam._cli.dissector import dissector
 from smartcam._cli.doctor import doctor
+from smartcam._cli.find import find
 from smartcam._cli.fleet import fleet
 from smartcam._cli.frames import frames
 from smartcam._cli.image import image
@@ -64,7 +65,7 @@ TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
     "A fleet": ("serve", "fleet", "ros2", "ros1"),
     "Pictures": ("frames", "depth"),
-    "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
+    "Finding out": ("find", "doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
     "Recordings": ("record", "replay", "pcap", "bag", "dissector"),
     "Without a camera": ("demo",),
@@ -322,7 +323,7 @@ async def demo_command(
 
 
 for _one in (
-    *(live, probe, doctor, image, decode, calibrate, sheet),
+    *(live, find, probe, doctor, image, decode, calibrate, sheet),
     *(record, replay, pcap, bag, dissector, serve, fleet, ros2, ros1, frames, depth),
 ):
     command.add_command(_one)

@@ -2,7 +2,7 @@
 
 :func:`examine` runs one check after the other, from the ground up: the name, the session, status,
 application, round trip, run state, triggers, layout, clock. It changes nothing on the camera and
-triggers nothing unless that is allowed.
+triggers nothing unless that is allowed. :func:`find` says where in a network cameras may be.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from smartcam.doctor import _state_checks as state_checks
 from smartcam.doctor import _trigger_checks as trigger_checks
 from smartcam.doctor._context import DoctorOptions, Examination, Witness
 from smartcam.doctor._findings import Exit, Finding
+from smartcam.doctor._found import FoundPort
+from smartcam.doctor._search import find
 from smartcam.exceptions import (
     CameraFaultError,
     CommandRejectedError,
@@ -37,7 +39,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Finding",
+    "FoundPort",
     "examine",
+    "find",
 ]
 
 NOTICE = Finding(

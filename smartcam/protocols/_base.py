@@ -277,6 +277,8 @@ class Protocol:
             fresh link: dialects that begin a session alike. Default: each dialect by itself.
         emulator: ``module:attribute`` of the class of its emulated cameras, a
             :class:`~smartcam.emulator.LineCamera` for one; "" where it brings none.
+        greeting: what a camera says first to a client that has just come and has said nothing;
+            ``b""`` if it keeps silent until it is spoken to, None if that is not known.
     """
 
     name: str
@@ -290,6 +292,7 @@ class Protocol:
         default_factory=dict[Transport, "tuple[tuple[Dialect, ...], ...]"]
     )
     emulator: str = ""
+    greeting: bytes | None = None
 
     def tries(
         self,

@@ -370,5 +370,6 @@ BVS = _Bvs(
         Transport.UDP: ((HANDBOOK,), _16_BIT_KIN, (THESIS,)),
     },
     emulator="smartcam.emulator._camera:EmulatedCamera",
+    greeting=b"",  # before Connect neither results nor status (SC manual p. 28: published)
 )
 """What the entry point ``bvs`` gives."""

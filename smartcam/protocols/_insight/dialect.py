@@ -36,6 +36,7 @@ from smartcam.protocols._insight.words import (
     LAST_JOB_ID,
     LINE_END,
     MAX_CELLS,
+    WELCOME,
     StatusCode,
     code_text,
     parse_cells,
@@ -246,5 +247,6 @@ INSIGHT = Protocol(
         "counter": "a cell that counts runs: values of several runs are told by it",
     },
     emulator="smartcam.emulator._insight.camera:EmulatedInSight",
+    greeting=WELCOME.encode(ENCODING),
 )
 """What the entry point ``insight`` gives."""

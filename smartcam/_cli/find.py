@@ -1,0 +1,270 @@
+"""``smartcam find``: which addresses of a network listen where cameras do."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import os
+import re
+import sys
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.texts import table_text
+from smartcam.doctor._search import (
+    MAX_ADDRESSES,
+    MOST_ADDRESSES,
+    MOST_AT_ONCE,
+    MOST_RATE,
+    MOST_SECONDS,
+    CameraSearch,
+)
+from smartcam.settings import parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+
+    from smartcam.doctor import FoundPort
+
+PERIOD = 1.0
+"""Seconds between two looks of the line that tells how far the search is."""
+
+_EVIDENCE = {
+    "greeted": "greets as {protocols}: {greeting}",
+    "silent": "silent, as {protocols} is before a client speaks",
+    "said": "may be {protocols}: {greeting}",
+    "ended": "hangs up at once: {protocols} with a client, or something else",
+}
+"""What was heard, in words."""
+
+
+@click.command(
+    help="Find what listens in networks where cameras do: opens the protocols' ports, sends "
+    "nothing, and tells what comes by itself. NETWORK: 192.168.0.0/24, 192.168.0.10-20, an "
+    "address, a host's name; several may be given. A camera that speaks UDP cannot be found so."
+)
+@click.argument("networks", metavar="NETWORK...", nargs=-1, required=True)
+@click.option(
+    "--port",
+    "ports",
+    type=click.IntRange(1, 0xFFFF),
+    multiple=True,
+    help="Open this one, too, for each protocol; repeatable.",
+)
+@click.option(
+    "--protocol",
+    "protocols",
+    multiple=True,
+    metavar="NAME",
+    help='Look for this one only, see "smartcam protocols"; repeatable.',
+)
+@click.option(
+    "--fleet",
+    "fleet_file",
+    type=click.Path(dir_okay=False),
+    metavar="FILE",
+    help="A fleet file: its cameras are named, and not touched.",
+)
+@click.option("--leave", multiple=True, metavar="NETWORK", help="Do not touch these; repeatable.")
+@click.option(
+    "--may-disturb",
+    is_flag=True,
+    help="Allow ports of cameras that serve one client: it is not known of all that a second "
+    "connection leaves the first alone.",
+)
+@click.option(
+    "--ask",
+    is_flag=True,
+    help='Also speak to what was found, as "smartcam probe" does. That takes a camera from its '
+    "client.",
+)
+@click.option(
+    "--rate",
+    type=click.FloatRange(0, MOST_RATE, min_open=True),
+    default=100.0,
+    show_default=True,
+    help="Openings a second at most.",
+)
+@click.option(
+    "--at-once",
+    type=click.IntRange(1, MOST_AT_ONCE),
+    default=64,
+    show_default=True,
+    help="Connections at a time at most.",
+)
+@click.option(
+    "--timeout",
+    "patience",
+    type=click.FloatRange(0, MOST_SECONDS, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Seconds until a port is open, and as many again to hear what comes by itself.",
+)
+@click.option(
+    "--max-addresses",
+    type=click.IntRange(1, MOST_ADDRESSES),
+    default=MAX_ADDRESSES,
+    show_default=True,
+    help="Refuse more.",
+)
+@click.option("--yaml", "as_yaml", is_flag=True, help="Print cameras as a fleet file has them.")
+@runs(*OUTPUT)
+async def find(
+    networks: tuple[str, ...],
+    ports: tuple[int, ...],
+    protocols: tuple[str, ...],
+    fleet_file: str | None,
+    leave: tuple[str, ...],
+    patience: float,
+    options: Options,
+    as_yaml: bool,
+    **given: Any,
+) -> None:
+    """Search and show what was found, after Ctrl-C what there is so far.
+
+    Raises ConfigurationError: something given cannot work, or consent is missing.
+    """
+    if as_yaml and options.as_json:
+        raise click.UsageError("--json and --yaml do not go together")
+    known: dict[str, dict[str, str]] = {}
+    taken: set[str] = set()
+    if fleet_file is not None:
+        known, taken = await asyncio.to_thread(_fleet_cameras, fleet_file)
+    search = CameraSearch(
+        networks,
+        ports=ports,
+        protocols=protocols or None,
+        leave=[*leave, *known],
+        timeout=patience,
+        **given,
+    )
+    try:
+        async with telling(search):
+            await search.run()
+    finally:
+        if search.begun:
+            alone = {host: known[text] for host, text in search.left.items() if text in known}
+            if as_yaml:
+                click.echo("\n".join(fleet_lines(search.results(), taken)))
+            else:
+                _show(search.results(), alone, options)
+            click.echo(summary(search), err=True)
+
+
+def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
+    """Return the hosts of a fleet file's cameras, with names and URLs of these; and all names."""
+    from smartcam.fleet import load_fleet
+
+    found: dict[str, dict[str, str]] = {}
+    plan = load_fleet(path).plan()
+    for planned in plan:
+        if planned.entry.url is not None:
+            address = parse_address(planned.entry.url, model=planned.entry.model)
+            found.setdefault(address.host, {})[planned.name] = address.url
+    return found, {planned.name for planned in plan}
+
+
+# ---------------------------------------------------------------------- showing
+
+
+def _show(
+    found: Sequence[FoundPort], alone: Mapping[str, Mapping[str, str]], options: Options
+) -> None:
+    """Print what was found, and what was left alone, as a table or as JSON."""
+    if options.as_json:
+        for one in found:
+            value = {name: getattr(one, name) for name in one.__dataclass_fields__}
+            options.show({**value, "greeting": one.greeting, "urls": one.urls}, "")
+        for host, cameras in alone.items():
+            for name, url in cameras.items():
+                options.show({"host": host, "url": url, "fleet_camera": name}, "")
+    elif found or alone:
+        rows = [
+            (one.host, str(one.port), ", ".join(one.protocols) or "-", _ms(one), evidence(one))
+            for one in found
+        ]
+        rows += [
+            (host, "", "", "", f"not touched: it is {' and '.join(cameras)} of the fleet")
+            for host, cameras in alone.items()
+        ]
+        click.echo(table_text(("host", "port", "protocol", "opened", "what is known"), rows))
+
+
+def _ms(found: FoundPort) -> str:
+    return f"{found.seconds * 1e3:.1f} ms"
+
+
+def evidence(found: FoundPort) -> str:
+    """Return what is known of a port that is open, as a line."""
+    if found.answer is not None:
+        return f"a camera answers: {found.answer.url}"
+    if found.evidence == "other":
+        heard = f"it says {found.greeting!r:.60}" if found.said else "it does not greet"
+        return f"another service: {heard}"
+    protocols = " or ".join(found.protocols)
+    text = _EVIDENCE[found.evidence].format(protocols=protocols, greeting=found.greeting[:60])
+    return f"{text}; asked: {found.refusal}" if found.refusal else text
+
+
+def summary(search: CameraSearch) -> str:
+    """Return how the search went, for people."""
+    outcomes = ("open", "refused", "no answer", "unreachable", "failed")
+    told = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
+    text = f"{search.opened} of {search.total} ports tried: {', '.join(told) or 'none'}"
+    if search.why:
+        text += f" (failed: {search.why})"
+    return f"{text}. Cameras that are set to UDP do not show."
+
+
+def fleet_lines(found: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:
+    """Return lines for a fleet file; what is no camera, or did not answer, is a comment.
+
+    ``taken``: names that the fleet has already.
+    """
+    names, lines = set(taken), ["cameras:"]
+    live = False
+    for one in found:
+        for nth, url in enumerate(one.urls):
+            name = _fresh(one, names)
+            sure = nth == 0 and not one.refusal
+            live = live or sure
+            line = f'{name}: {{url: "{url}"}}'
+            if sure:
+                names.add(name)
+            lines.append(f"  {'' if sure else '# '}{line}  # {evidence(one)}")
+    if not live:
+        lines[0] = "# cameras: none was found"
+    return lines
+
+
+def _fresh(found: FoundPort, taken: set[str]) -> str:
+    """Return a name for a camera, made from its address."""
+    host = re.sub(r"[^a-z0-9]", "-", found.host.lower())
+    base = f"found/{host}-{found.port}"
+    names = itertools.chain((f"found/{host}", base), (f"{base}-{n}" for n in itertools.count(2)))
+    return next(name for name in names if name not in taken)
+
+
+@contextlib.asynccontextmanager
+async def telling(search: CameraSearch) -> AsyncIterator[None]:
+    """Have a line on a terminal's stderr that tells how far the search is."""
+    if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
+        yield
+        return
+    task = asyncio.create_task(_tell(search), name="smartcam.find.telling")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        click.echo("\r\x1b[K", err=True, nl=False)
+
+
+async def _tell(search: CameraSearch) -> None:
+    while True:
+        await asyncio.sleep(PERIOD)
+        text = f"{search.opened} of {search.total} ports, {search.counts['open']} open"
+        click.echo(f"\r\x1b[K{text}", err=True, nl=False)

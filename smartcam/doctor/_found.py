@@ -1,0 +1,189 @@
+"""What a search finds: which protocols are spoken where, and what an open port may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.protocols._base import Protocol, Transport
+from smartcam.registry import PROTOCOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from smartcam.doctor._opening import Opened
+    from smartcam.doctor._probing import CameraAnswer
+
+Evidence = Literal["greeted", "silent", "said", "ended", "other"]
+
+MOST_PORTS = 32
+"""Ports of one address at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundPort:
+    """A port that took a connection.
+
+    Attributes:
+        host: its address.
+        port: the port.
+        protocols: names of the protocols that it may speak, the most probable first; empty where
+            what was heard is none of them.
+        evidence: ``greeted``: it said by itself what cameras of the protocol say; ``silent``: it
+            says nothing before it is spoken to, and so do they; ``said``: it said something, and
+            what they say is not known; ``ended``: it hung up at once, as a camera may that has a
+            client; ``other``: it is none of them.
+        said: what came by itself, up to 512 bytes.
+        seconds: until the connection was there.
+        answer: what the camera said of itself, where it was asked and has answered.
+        refusal: why it has not, where it was asked.
+    """
+
+    host: str
+    port: int
+    protocols: tuple[str, ...]
+    evidence: Evidence
+    said: bytes
+    seconds: float
+    answer: CameraAnswer | None = None
+    refusal: str = ""
+
+    @property
+    def urls(self) -> tuple[str, ...]:
+        """Its address in each protocol; what it answered to, if it was asked."""
+        if self.answer is not None:
+            return (self.answer.url,)
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        known = tcp_protocols()
+        return tuple(f"{_scheme(known[name])}://{host}:{self.port}" for name in self.protocols)
+
+    @property
+    def greeting(self) -> str:
+        """The first line of what came by itself, what cannot be printed as dots."""
+        lines = self.said.decode("latin-1").strip().splitlines()
+        return (
+            "".join(c if c.isascii() and c.isprintable() else "." for c in lines[0])
+            if lines
+            else ""
+        )
+
+
+# ---------------------------------------------------------------------- protocols
+
+
+def tcp_protocols() -> dict[str, Protocol]:
+    """Return the protocols that go over TCP, by name; one that cannot be loaded is none."""
+    found: dict[str, Protocol] = {}
+    for info in PROTOCOLS.available():
+        try:
+            protocol = PROTOCOLS.load(info.name)
+        except PluginError:
+            if info.origin == "built-in":
+                raise
+            continue  # a broken plug-in costs only its own name
+        if isinstance(protocol, Protocol) and Transport.TCP in protocol.schemes.values():
+            found[info.name] = protocol
+    return found
+
+
+def ports_of(
+    further: Iterable[int], names: Iterable[str] | None
+) -> dict[int, tuple[Protocol, ...]]:
+    """Return the ports to open, and which protocols may be spoken there.
+
+    Raises:
+        ConfigurationError: a name is no protocol's of TCP, a number is no port.
+    """
+    known = tcp_protocols()
+    chosen = [*known] if names is None else [*dict.fromkeys(names)]
+    for name in chosen:
+        if name not in known:
+            raise ConfigurationError(
+                f"find: no protocol {name!r} over TCP is known; there are {', '.join(known)}"
+                f"{did_you_mean(name, known)}"
+            )
+    if not chosen:
+        raise ConfigurationError("find: no protocol is named")
+    found: dict[int, tuple[Protocol, ...]] = {}
+    for name in chosen:
+        port = known[name].default_port
+        found[port] = (*found.get(port, ()), known[name])
+    for port in further:
+        if not 0 < port <= 0xFFFF:
+            raise ConfigurationError(f"find: port {port!r}: expected 1 to 65535")
+        own = found.get(port, ())
+        found[port] = (*own, *(known[name] for name in chosen if known[name] not in own))
+    if len(found) > MOST_PORTS:
+        raise ConfigurationError(f"find: {len(found)} ports: expected {MOST_PORTS} at most")
+    return found
+
+
+def serves_one(protocol: Protocol) -> bool:
+    """Return whether its cameras serve one client."""
+    return any(dialect.exclusive for dialect in protocol.dialects.values())
+
+
+def _scheme(protocol: Protocol) -> str:
+    return next(name for name, kind in protocol.schemes.items() if kind is Transport.TCP)
+
+
+def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
+    names = sorted({one.name for several in ports.values() for one in several if serves_one(one)})
+    if names:
+        raise ConfigurationError(
+            f"find: cameras of {', '.join(names)} serve one client, and no document says that a "
+            "second TCP connection which sends nothing leaves that client alone; so none is opened "
+            "without consent. Say may_disturb=True (--may-disturb) when a lost session does no "
+            f"harm, or look for other protocols only (protocols, --protocol); what is in leave "
+            "(--leave, --fleet) is not touched"
+        )
+
+
+# ---------------------------------------------------------------------- what was heard
+
+
+def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
+    """Return what an open port is, by what was heard."""
+    said = opened.said.lstrip()
+    greeted = [one for one in protocols if one.greeting and said.startswith(one.greeting)]
+    possible = greeted or [one for one in protocols if _may_be(one, opened)]
+    evidence: Evidence = "silent"
+    if greeted:
+        evidence = "greeted"
+    elif not possible:
+        evidence = "other"
+    elif opened.said:
+        evidence = "said"
+    elif opened.ended:
+        evidence = "ended"
+    return FoundPort(
+        host=host,
+        port=port,
+        protocols=tuple(one.name for one in possible),
+        evidence=evidence,
+        said=opened.said,
+        seconds=opened.seconds,
+    )
+
+
+def _may_be(protocol: Protocol, opened: Opened) -> bool:
+    """Return whether a camera may have been heard so, though it has not greeted."""
+    if opened.said:
+        return protocol.greeting is None
+    # who hangs up without a word may have as many clients as it takes
+    return opened.ended or not protocol.greeting
+
+
+def decided(said: bytes, protocols: tuple[Protocol, ...]) -> bool:
+    """Return whether more cannot change what an open port is."""
+    heard = said.lstrip()
+    if not heard:
+        return False
+    for one in protocols:
+        if one.greeting is None or (one.greeting and one.greeting.startswith(heard)):
+            return False
+        if one.greeting and heard.startswith(one.greeting):
+            return b"\n" in heard
+    return True

@@ -1,0 +1,109 @@
+"""Opening a port and hearing what comes by itself; nothing is ever sent."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable
+
+    from smartcam.doctor._networks import HostAddress
+
+MAX_SAID = 512
+"""Bytes that are read at most of what comes by itself."""
+
+Outcome = Literal["open", "refused", "no answer", "unreachable", "failed"]
+
+_OUTCOMES: dict[int, Outcome] = {
+    errno.ECONNREFUSED: "refused",
+    errno.ECONNRESET: "refused",
+    errno.ETIMEDOUT: "no answer",
+    errno.EHOSTUNREACH: "unreachable",
+    errno.ENETUNREACH: "unreachable",
+    errno.EHOSTDOWN: "unreachable",
+    errno.ENETDOWN: "unreachable",
+}
+"""What errors of an opening mean; others are this machine's, and failures."""
+
+SCARCE = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+"""Errors of a machine that has no socket left."""
+
+
+class Opened(NamedTuple):
+    """What came of opening a port.
+
+    Attributes:
+        outcome: what it came to.
+        seconds: until the connection was there.
+        said: what came by itself.
+        ended: whether the other end closed it by itself.
+        why: of a failure.
+    """
+
+    outcome: Outcome
+    seconds: float = 0.0
+    said: bytes = b""
+    ended: bool = False
+    why: str = ""
+
+
+async def open_port(
+    sock: socket.socket,
+    address: HostAddress,
+    port: int,
+    *,
+    timeout: float,
+    enough: Callable[[bytes], bool],
+) -> Opened:
+    """Open a port, hear what comes by itself until that is ``enough``, and close it.
+
+    Args:
+        sock: of the address' family; it is closed in the end.
+        address: the host's.
+        port: its port.
+        timeout: seconds until it is open, and as many again to hear.
+        enough: called with all that came.
+
+    Cancellation: the connection is closed.
+    """
+    loop = asyncio.get_running_loop()
+    begun = loop.time()
+    with sock:
+        sock.setblocking(False)
+        try:
+            async with asyncio.timeout(timeout):
+                await loop.sock_connect(sock, address.sockaddr(port)[1])
+            if is_own(sock):
+                return Opened("refused")
+        except TimeoutError:
+            return Opened("no answer")
+        except OSError as exc:
+            outcome = _OUTCOMES.get(exc.errno or 0, "failed")
+            return Opened(outcome, why=(exc.strerror or str(exc)) if outcome == "failed" else "")
+        seconds = loop.time() - begun
+        said, ended = b"", False
+        try:
+            async with asyncio.timeout(timeout):
+                while len(said) < MAX_SAID and not enough(said):
+                    data = await loop.sock_recv(sock, MAX_SAID - len(said))
+                    if not data:
+                        ended = True
+                        break
+                    said += data
+        except TimeoutError:
+            pass
+        except OSError:
+            ended = True  # it has reset the connection
+        return Opened("open", seconds, said, ended)
+
+
+def is_own(sock: socket.socket) -> bool:
+    """Return whether a socket is connected with itself.
+
+    The system may take the very port that is opened for our end, where that is a free one of this
+    machine: then they meet.
+    """
+    return bool(sock.getsockname() == sock.getpeername())

@@ -1,0 +1,311 @@
+"""Finding cameras: which addresses of a network listen where cameras do.
+
+Ports are opened and never used: nothing is sent, what comes by itself is read. Whoever wants to
+know more allows asking, which speaks as ``smartcam probe`` does.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import dataclasses
+import socket
+from contextlib import aclosing
+from typing import TYPE_CHECKING
+
+from smartcam.doctor._found import check_consent, decided, judged, ports_of
+from smartcam.doctor._networks import AddressSet, Span, address_of, read_span
+from smartcam.doctor._opening import SCARCE, open_port
+from smartcam.doctor._probing import trials
+from smartcam.exceptions import ConfigurationError
+from smartcam.settings import parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from smartcam.doctor._found import FoundPort
+    from smartcam.doctor._networks import HostAddress
+
+MAX_ADDRESSES = 65_536
+"""Addresses of one search, unless more are asked for."""
+
+MOST_ADDRESSES = 1 << 24
+"""Addresses of one search at most."""
+
+MOST_AT_ONCE = 1_000
+"""Connections at a time at most."""
+
+MOST_RATE = 10_000.0
+"""Openings a second at most."""
+
+MOST_SECONDS = 60.0
+"""Seconds that one opening may take at most."""
+
+ASK_TIMEOUT = 10.0
+"""Seconds for asking one camera, all ways together."""
+
+ASK_AT_ONCE = 16
+"""Cameras that are asked at a time."""
+
+NAME_TIMEOUT = 5.0
+"""Seconds for looking up a host's name."""
+
+SCARCE_PAUSE = 0.05
+"""Seconds until the next try where the system has no socket left."""
+
+
+async def find(
+    *networks: str,
+    ports: Iterable[int] = (),
+    protocols: Iterable[str] | None = None,
+    leave: Iterable[str] = (),
+    may_disturb: bool = False,
+    ask: bool = False,
+    rate: float = 100.0,
+    at_once: int = 64,
+    timeout: float = 1.0,
+    max_addresses: int = MAX_ADDRESSES,
+) -> list[FoundPort]:
+    """Return what listens in networks where cameras do, sorted by address.
+
+    The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent. A
+    camera that speaks UDP cannot be found so.
+
+    Args:
+        networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
+            network has at most 256 addresses.
+        ports: further ports to open; each of the protocols may be spoken there.
+        protocols: names of those to look for; default all that are known.
+        leave: addresses that are not touched, in the same words: cameras that are at work.
+        may_disturb: allows opening ports of protocols whose cameras serve one client, such as
+            ``bvs``: it is not known of all of them that a connection that says nothing leaves the
+            client alone.
+        ask: also speak to what was found, which takes a camera from its client; allows the same.
+        rate: openings a second at most.
+        at_once: connections at a time at most.
+        timeout: seconds until a port is open, and as many again to hear what comes by itself.
+        max_addresses: refuse more than that.
+
+    Raises:
+        ConfigurationError: a network, a number or a protocol cannot work, there are too many
+            addresses, a name does not resolve, the system has no socket left, or consent is
+            missing. Nothing was opened, unless it is a socket that is missing.
+
+    Cancellation: every connection is closed.
+    """
+    search = CameraSearch(
+        networks,
+        ports=ports,
+        protocols=protocols,
+        leave=leave,
+        may_disturb=may_disturb,
+        ask=ask,
+        rate=rate,
+        at_once=at_once,
+        timeout=timeout,
+        max_addresses=max_addresses,
+    )
+    await search.run()
+    return search.results()
+
+
+class CameraSearch:
+    """One search; what was found stays, however it ends. Arguments as in :func:`find`.
+
+    Attributes:
+        opened: how many ports were tried.
+        total: how many there are to try, once names are looked up.
+        counts: how many of the tries came to what.
+        why: the first failure that is this machine's.
+        left: addresses that were left alone, to the texts that say so.
+        begun: whether it has come as far as the first port.
+    """
+
+    def __init__(
+        self,
+        networks: Sequence[str],
+        *,
+        ports: Iterable[int] = (),
+        protocols: Iterable[str] | None = None,
+        leave: Iterable[str] = (),
+        may_disturb: bool = False,
+        ask: bool = False,
+        rate: float = 100.0,
+        at_once: int = 64,
+        timeout: float = 1.0,
+        max_addresses: int = MAX_ADDRESSES,
+    ) -> None:
+        for name, value, most in (
+            ("rate", rate, MOST_RATE),
+            ("at_once", at_once, MOST_AT_ONCE),
+            ("timeout", timeout, MOST_SECONDS),
+            ("max_addresses", max_addresses, MOST_ADDRESSES),
+        ):
+            if not 0 < value <= most:
+                raise ConfigurationError(
+                    f"find: {name}={value!r}: expected more than 0, at most {most:,}"
+                )
+        if not networks or not all(isinstance(text, str) for text in networks):
+            raise ConfigurationError(
+                "find: expected one network or several, each a text of its own; got "
+                f"{networks!r:.80}"
+            )
+        self._networks = [(text, read_span(text)) for text in networks]
+        self._leave = [(text, read_span(text, whole=True)) for text in leave]
+        self._ports = ports_of(ports, protocols)
+        if not (may_disturb or ask):
+            check_consent(self._ports)
+        self._ask = ask
+        self._interval = 1.0 / rate
+        self._at_once = at_once
+        self._timeout = timeout
+        self._max_addresses = max_addresses
+        _check_size(self._networks, max_addresses)
+        self._found: dict[tuple[HostAddress, int], FoundPort] = {}
+        self._busy = 0
+        self.opened = 0
+        self.total = 0
+        self.counts: collections.Counter[str] = collections.Counter()
+        self.why = ""
+        self.left: dict[str, str] = {}
+        self.begun = False
+
+    def results(self) -> list[FoundPort]:
+        """Return what was found, sorted by address."""
+        return [self._found[key] for key in sorted(self._found)]
+
+    async def run(self) -> None:
+        """Search.
+
+        Raises:
+            ConfigurationError: a name does not resolve, there are too many addresses, or the system
+                has no socket left.
+
+        Cancellation: every connection is closed; what was found stays.
+        """
+        addresses = AddressSet([one for each in self._networks for one in await _spans(*each)])
+        leave = [(text, one) for text, span in self._leave for one in await _spans(text, span)]
+        _check_count(len(addresses), self._max_addresses)
+        for text, span in leave:
+            if span.size == 1 and span.first in addresses:
+                self.left[str(span.first)] = text
+        addresses = addresses.without(AddressSet(span for _, span in leave))
+        self.total = len(addresses) * len(self._ports)
+        self.begun = True
+        loop = asyncio.get_running_loop()
+        places, due = asyncio.Semaphore(self._at_once), loop.time()
+        try:
+            async with asyncio.TaskGroup() as group:
+                for address in addresses:
+                    for port in self._ports:
+                        await places.acquire()
+                        await asyncio.sleep(max(0.0, due - loop.time()))
+                        due = max(due, loop.time()) + self._interval
+                        task = group.create_task(
+                            self._try(address, port), name=f"smartcam.find[{address}:{port}]"
+                        )
+                        task.add_done_callback(lambda _: places.release())
+        except ExceptionGroup as several:
+            ours, others = several.split(ConfigurationError)
+            if ours is None or others is not None:
+                raise
+            raise ours.exceptions[0] from None
+        if self._ask:
+            await self._ask_all()
+
+    async def _try(self, address: HostAddress, port: int) -> None:
+        protocols = self._ports[port]
+        sock = await self._socket(address)
+        self._busy += 1
+        try:
+            opened = await open_port(
+                sock,
+                address,
+                port,
+                timeout=self._timeout,
+                enough=lambda said: decided(said, protocols),
+            )
+        finally:
+            self._busy -= 1
+        self.opened += 1
+        self.counts[opened.outcome] += 1
+        self.why = self.why or opened.why
+        if opened.outcome == "open":
+            self._found[address, port] = judged(str(address), port, opened, protocols)
+
+    async def _socket(self, address: HostAddress) -> socket.socket:
+        """Return a socket, as soon as the system has one."""
+        loop = asyncio.get_running_loop()
+        until = loop.time() + 4 * self._timeout
+        while True:
+            try:
+                return socket.socket(address.sockaddr(0)[0], socket.SOCK_STREAM)
+            except OSError as exc:
+                if exc.errno not in SCARCE:
+                    raise ConfigurationError(f"find: {address}: {exc.strerror}") from exc
+                if not self._busy or loop.time() > until:
+                    raise ConfigurationError(
+                        f"find: this process has no socket left ({exc.strerror}), with "
+                        f"{self._busy} of the search's own open: close others, or allow more "
+                        "(ulimit -n)"
+                    ) from exc
+            await asyncio.sleep(SCARCE_PAUSE)
+
+    async def _ask_all(self) -> None:
+        places = asyncio.Semaphore(ASK_AT_ONCE)
+
+        async def ask(key: tuple[HostAddress, int]) -> None:
+            async with places:
+                self._found[key] = await asked(self._found[key])
+
+        async with asyncio.TaskGroup() as group:
+            for key, one in sorted(self._found.items()):
+                if one.protocols:
+                    group.create_task(ask(key), name=f"smartcam.find[{one.host}:{one.port}].ask")
+
+
+# ---------------------------------------------------------------------- addresses
+
+
+async def _spans(text: str, span: Span | None) -> list[Span]:
+    """Return a text's addresses; those of a name are looked up."""
+    if span is not None:
+        return [span]
+    loop = asyncio.get_running_loop()
+    try:
+        async with asyncio.timeout(NAME_TIMEOUT):
+            told = await loop.getaddrinfo(text.strip(), None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as exc:
+        why = (exc.strerror if isinstance(exc, OSError) else str(exc)) or (
+            f"no name server answers within {NAME_TIMEOUT:g} s"
+        )
+        raise ConfigurationError(f"find: the name {text!r} does not resolve: {why}") from exc
+    found = {address_of(str(one[4][0])) for one in told}
+    return [Span(address, address) for address in sorted(found)]
+
+
+def _check_size(networks: Iterable[tuple[str, Span | None]], most: int) -> None:
+    _check_count(len(AddressSet(span for _, span in networks if span is not None)), most)
+
+
+def _check_count(count: int, most: int) -> None:
+    if count > most:
+        raise ConfigurationError(
+            f"find: {count:,} addresses are more than {most:,}: name smaller networks, or allow "
+            f"them by max_addresses={count} (--max-addresses {count}), {MOST_ADDRESSES:,} at most"
+        )
+
+
+# ---------------------------------------------------------------------- asking
+
+
+async def asked(found: FoundPort) -> FoundPort:
+    """Speak to what was found, in each protocol that it may speak, and return what came of it."""
+    failed: list[str] = []
+    for url in found.urls:
+        async with aclosing(trials(parse_address(url), timeout=ASK_TIMEOUT)) as tries:
+            async for trial in tries:
+                if trial.answer is not None:
+                    return dataclasses.replace(found, answer=trial.answer)
+                failed.append(str(trial))
+    return dataclasses.replace(found, refusal="; ".join(failed))

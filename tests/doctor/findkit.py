@@ -1,0 +1,107 @@
+"""A network of this machine's own addresses for searches: cameras, and what else may listen."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import socket
+from typing import TYPE_CHECKING
+
+import pytest
+
+from smartcam.emulator import EmulatedCamera
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+    from smartcam.emulator._client_link import ClientLink
+
+NETWORK = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250 + 1}."
+"""Of this process alone, so that tests side by side do not meet."""
+
+
+def free_port() -> int:
+    """Return a port that nobody has; on the network's addresses nobody else looks for one."""
+    with socket.socket() as sock:
+        try:
+            sock.bind((f"{NETWORK}1", 0))
+        except OSError:
+            pytest.skip("this system has no loopback address but 127.0.0.1")
+        return int(sock.getsockname()[1])
+
+
+class Listening:
+    """A server that says ``greeting`` and is silent from then on, or hangs up.
+
+    ``slowly``: seconds between two letters of it.
+
+    Attributes:
+        received: all that clients have sent.
+        opened: connections so far.
+        ended: those that clients have ended.
+    """
+
+    def __init__(self, greeting: bytes, *, hangs_up: bool, slowly: float) -> None:
+        self.received = b""
+        self.opened = 0
+        self.ended = 0
+        self._greeting = greeting
+        self._hangs_up = hangs_up
+        self._slowly = slowly
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.opened += 1
+        with contextlib.suppress(ConnectionError):
+            for nth in range(len(self._greeting) if self._slowly else 0):
+                writer.write(self._greeting[nth : nth + 1])
+                await asyncio.sleep(self._slowly)
+            if not self._slowly:
+                writer.write(self._greeting)
+            while not self._hangs_up and (data := await reader.read(4096)):
+                self.received += data
+        self.ended += not self._hangs_up
+        writer.close()
+        with contextlib.suppress(ConnectionError):
+            await writer.wait_closed()
+
+
+@contextlib.asynccontextmanager
+async def listening(
+    host: str, port: int, greeting: bytes = b"", *, hangs_up: bool = False, slowly: float = 0.0
+) -> AsyncIterator[Listening]:
+    """Have a server of its kind at an address."""
+    made = Listening(greeting, hangs_up=hangs_up, slowly=slowly)
+    async with await asyncio.start_server(made.serve, host, port):
+        yield made
+
+
+@contextlib.contextmanager
+def filtered(host: str, port: int) -> Iterator[None]:
+    """Have an address that answers nothing: its queue of connections is full, nobody takes one."""
+    with contextlib.ExitStack() as stack:
+        sock = stack.enter_context(socket.create_server((host, port), backlog=0))
+        for _ in range(4):
+            client = stack.enter_context(socket.socket())
+            client.setblocking(False)
+            client.connect_ex(sock.getsockname())
+        yield
+
+
+class TakenAtOnce(EmulatedCamera):
+    """The other reading of what no document says: a connection alone takes the session."""
+
+    def arrived(self, link: ClientLink) -> None:
+        super().arrived(link)
+        old = self._active
+        if isinstance(old, type(link)) and old is not link:
+            old.close("a newcomer")
+
+
+class RefusesAtOnce(EmulatedCamera):
+    """A third one: while there is a session, newcomers are sent away as they come."""
+
+    def arrived(self, link: ClientLink) -> None:
+        super().arrived(link)
+        if self.has_session and not self.serves(link):
+            link.close("another client has the session")
