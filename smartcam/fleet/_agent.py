@@ -160,7 +160,7 @@ class Agent:
             self._plain.open()
             declared.append(bus.be_present(keys.agent(self.name)))
             for name, settings in self._cameras.items():
-                self.share(name, settings)
+                self.share(name, settings, self._frames.get(name))
         except BaseException:
             await self.close()
             raise
@@ -188,14 +188,21 @@ class Agent:
             self._sender.close()
             await self._bus.close()
 
-    def share(self, name: str, settings: CameraSettings) -> Host:
+    def share(
+        self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None
+    ) -> Host:
         """Begin to have a session with a camera, and to share it.
+
+        Args:
+            name: of the camera.
+            settings: of the client.
+            frames_of: where its frames come from.
 
         Raises:
             ConfigurationError: an option of it cannot work.
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
-        found = self._frames.get(name, NO_FRAMES)
+        found = frames_of or NO_FRAMES
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
         events = self._on_event
         host = Host(name, settings, bus, keys, self.epoch, self._history, events, topics, frames)
@@ -212,8 +219,10 @@ class Agent:
         token.close()
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
-        await host.close()
-        self._numbers_at[name] = host.numbers
+        try:
+            await host.close()
+        finally:
+            self._numbers_at[name] = host.numbers
         if len(self._numbers_at) > KNOWN_CAMERAS:
             del self._numbers_at[next(iter(self._numbers_at))]
 
