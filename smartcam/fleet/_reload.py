@@ -213,10 +213,12 @@ class Reloader:
 
     async def _read(self, file: str | Path | FleetFile) -> LoadedFleet:
         """Read and check a file, in a thread."""
-        if self._reading is not None and not self._reading.done():
-            raise ConfigurationError(
-                f"fleet file {file}: the reading that began before has no end yet; nothing was done"
-            )
+        if self._reading is not None:  # whoever waited for it was cancelled, or gave up
+            _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
+            if late:
+                raise ConfigurationError(
+                    f"fleet file {file}: the reading that began before has no end yet"
+                )
 
         def read() -> LoadedFleet:
             found = file if isinstance(file, FleetFile) else load_fleet(file)
