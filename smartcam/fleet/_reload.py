@@ -139,6 +139,7 @@ class Reloader:
         now: the file that holds.
         sources: what the cameras are made of, by name.
         last: what the last one came to; None before the first.
+        outcomes: how many were done, and how many were not.
         tell: is told when one begins (None) and when it is over.
     """
 
@@ -146,6 +147,7 @@ class Reloader:
         self.now = now
         self.sources: dict[str, CameraSource] = {}
         self.last: FleetChanges | SmartCamError | None = None
+        self.outcomes: dict[str, int] = {"done": 0, "refused": 0}
         self.tell: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
         self._folder, self._make = folder, make
         self._one = asyncio.Lock()
@@ -179,6 +181,8 @@ class Reloader:
                 self.last = changes
                 return changes
             finally:
+                done = isinstance(self.last, FleetChanges)
+                self.outcomes["done" if done else "refused"] += 1
                 self.tell(self.last)
 
     async def _reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:

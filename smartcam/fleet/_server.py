@@ -231,6 +231,11 @@ class FleetServer(Server):
         return self._agent
 
     @property
+    def bus_bytes(self) -> int:
+        """Bytes that wait to be said on the bus."""
+        return self._bus.waiting_bytes
+
+    @property
     def name(self) -> str:
         """The agent's name."""
         return "" if self._agent is None else self._agent.name
