@@ -156,7 +156,9 @@ def _client() -> Any:
     try:
         import prometheus_client
         import prometheus_client.core
-    except ImportError as exc:
+    except ModuleNotFoundError as exc:
+        if exc.name != "prometheus_client":
+            raise
         raise MissingExtraError(
             'metrics need prometheus-client: pip install "smartcam[operations]"',
             extra="operations",
