@@ -69,7 +69,9 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
 def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
     """Have all that is logged in here written as lines of JSON; an error that ends it, too."""
     section = None if server is None else server.file.operations
-    level = logging.getLevelName("DEBUG" if options.debug else section.level.upper() if section else "INFO")
+    level = logging.getLevelName(
+        "DEBUG" if options.debug else section.level.upper() if section else "INFO"
+    )
     with json_log(
         level,
         lambda: "" if server is None else server.name or server.file.agent or "",
@@ -169,7 +171,11 @@ class _Serving:
             self._notifier.ready(self._status())
         if not self._as_lines:  # else it was logged
             failed = isinstance(outcome, Exception)
-            text = f"not reloaded, all stays as it was: {outcome}" if failed else f"reloaded: {outcome}"
+            text = (
+                f"not reloaded, all stays as it was: {outcome}"
+                if failed
+                else f"reloaded: {outcome}"
+            )
             click.echo(text, err=True)
 
     def _status(self) -> str:

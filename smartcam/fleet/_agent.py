@@ -191,9 +191,7 @@ class Agent:
             self._sender.close()
             await self._bus.close()
 
-    def share(
-        self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None
-    ) -> Host:
+    def share(self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None) -> Host:
         """Begin to have a session with a camera, and to share it.
 
         Args:

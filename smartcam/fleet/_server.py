@@ -96,9 +96,7 @@ class FleetServer(Server):
                 {name: source.settings for name, source in sources.items()},
                 history=history,
                 on_event=self._tell,
-                frames={
-                    name: source.frames for name, source in sources.items() if source.frames
-                },
+                frames={name: source.frames for name, source in sources.items() if source.frames},
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)

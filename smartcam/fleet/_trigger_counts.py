@@ -70,7 +70,9 @@ class Totals:
     """
 
     def __init__(self, before: Totals | None = None) -> None:
-        self.counts: dict[str, int] = dict.fromkeys(SUMS, 0) if before is None else {**before.counts}
+        self.counts: dict[str, int] = (
+            dict.fromkeys(SUMS, 0) if before is None else {**before.counts}
+        )
         empty = Histogram(HISTOGRAM_BOUNDS, (0,) * (len(HISTOGRAM_BOUNDS) + 1))
         self.processing: Histogram = empty if before is None else before.processing
         self.round_trip: Histogram = empty if before is None else before.round_trip

@@ -34,8 +34,9 @@ def written(path: Path) -> list[dict[str, Any]]:
 
 
 def logged(path: Path, *records: Any) -> list[dict[str, Any]]:
-    with path.open("wb") as file, json_log(
-        logging.INFO, lambda: "a1", lambda: CAMERAS, descriptor=file.fileno()
+    with (
+        path.open("wb") as file,
+        json_log(logging.INFO, lambda: "a1", lambda: CAMERAS, descriptor=file.fileno()),
     ):
         for one in records:
             one()
