@@ -176,7 +176,8 @@ class _Serving:
                 if failed
                 else f"reloaded: {outcome}"
             )
-            click.echo(text, err=True)
+            with contextlib.suppress(OSError):  # nobody reads it
+                click.echo(text, err=True)
 
     def _status(self) -> str:
         server = self._server

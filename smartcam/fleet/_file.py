@@ -29,7 +29,7 @@ from smartcam.fleet._address import (
     check_word,
     missing_certificates,
 )
-from smartcam.fleet._operations_file import OperationsSection
+from smartcam.fleet._operations_file import OperationsSection  # noqa: TC001 - pydantic does
 from smartcam.fleet._ros_file import Fields, RosCamera, RosSection, node_names
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address

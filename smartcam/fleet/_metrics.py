@@ -86,7 +86,7 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
                 waiting += host.gate.waiting
                 reserved += host.gate.holder is not None
         await asyncio.sleep(0)
-    gauges = {
+    gauges: dict[str, float] = {
         "programs": agent.programs,
         "calls": agent.calls,
         "kept_results": kept,

@@ -13,16 +13,17 @@ import dataclasses
 import hashlib
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
 from smartcam.fleet._file import FleetFile, load_fleet
+from smartcam.fleet._ros_file import RosCamera
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
     from smartcam.fleet._agent import Agent
-    from smartcam.fleet._file import CameraEntry, Planned
+    from smartcam.fleet._file import Planned
     from smartcam.fleet._frames import FramesOf
     from smartcam.settings import CameraSettings
 
@@ -131,8 +132,8 @@ class Reloader:
     """Reads the file of a running agent again; one time after the other.
 
     Args:
-        folder: that paths in the file are in.
-        make: starts what the session with a camera stands on.
+        folder: that paths are in, where what stands in a file is given and not the file.
+        make: starts what the session with a camera stands on, given the folder.
         now: what the agent has.
 
     Attributes:
@@ -143,7 +144,12 @@ class Reloader:
         tell: is told when one begins (None) and when it is over.
     """
 
-    def __init__(self, folder: Path, now: LoadedFleet, make: Any) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        now: LoadedFleet,
+        make: Callable[[Planned, Path], Awaitable[CameraSource]],
+    ) -> None:
         self.now = now
         self.sources: dict[str, CameraSource] = {}
         self.last: FleetChanges | SmartCamError | None = None
@@ -151,7 +157,7 @@ class Reloader:
         self.tell: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
         self._folder, self._make = folder, make
         self._one = asyncio.Lock()
-        self._reading: asyncio.Future[LoadedFleet] | None = None
+        self._reading: asyncio.Future[tuple[LoadedFleet, FleetChanges]] | None = None
         self._applying: asyncio.Task[None] | None = None
         self._closed = False
 
@@ -166,7 +172,7 @@ class Reloader:
         async with self._one:
             self.tell(None)
             try:
-                changes = await self._reload(agent, file)
+                changes = await self._typed(agent, file)
             except SmartCamError as exc:
                 logger.warning("the fleet file was not taken, all stays as it was: %s", exc)
                 self.last = exc
@@ -185,38 +191,43 @@ class Reloader:
                 self.outcomes["done" if done else "refused"] += 1
                 self.tell(self.last)
 
+    async def _typed(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
+        try:
+            return await self._reload(agent, file)
+        except SmartCamError:
+            raise
+        except OSError as exc:
+            raise ConfigurationError(f"fleet file: it cannot work: {exc}") from exc
+        except Exception as exc:
+            logger.exception("! the reload failed")
+            raise SmartCamError(f"fleet file: a fault of ours: {exc!r:.200}") from exc
+
     async def _reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
         if self._applying is not None:  # whoever waited for it was cancelled
             await asyncio.wait({self._applying})
-        new, old = await self._read(file), self.now
-        self._check(agent, new)
-        gone = [name for name in old.plan if name not in new.plan]
-        changed = [
-            name for name in new.plan if name in old.plan and new.marks[name] != old.marks[name]
-        ]
-        added = [name for name in new.plan if name not in old.plan]
-        changes = FleetChanges(
-            agent.name,
-            *map(tuple, (added, gone, changed)),
-            kept=len(new.plan) - len(added) - len(changed),
-        )
+        folder = self._folder if isinstance(file, FleetFile) else Path(file).parent
+        new, changes = await self._read(file, folder, agent.name)
+        _refuse_added(agent, changes)
         async with contextlib.AsyncExitStack() as stack:
             made: dict[str, CameraSource] = {}
-            for name in (*added, *changed):
-                made[name] = source = await self._make(new.plan[name], self._folder)
+            for name in (*changes.added, *changes.changed):
+                made[name] = source = await self._make(new.plan[name], folder)
                 stack.push_async_callback(source.emulator.aclose)
                 await asyncio.sleep(0)
             if self._closed:
                 raise ConnectionClosedError(f"the agent {agent.name} ends; nothing was changed")
+            _refuse_added(agent, changes)  # it may have come meanwhile
             stack.pop_all()
             self.now = new
-            work = self._apply(agent, (*gone, *changed), made)
+            work = self._apply(agent, (*changes.removed, *changes.changed), made)
             self._applying = asyncio.get_running_loop().create_task(work, name="smartcam.reload")
         await asyncio.shield(self._applying)
         return changes
 
-    async def _read(self, file: str | Path | FleetFile) -> LoadedFleet:
-        """Read and check a file, in a thread."""
+    async def _read(
+        self, file: str | Path | FleetFile, folder: Path, agent: str
+    ) -> tuple[LoadedFleet, FleetChanges]:
+        """Read and check a file, and see what it changes, in a thread."""
         if self._reading is not None:  # whoever waited for it was cancelled, or gave up
             _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
             if late:
@@ -224,12 +235,15 @@ class Reloader:
                     f"fleet file {file}: the reading that began before has no end yet"
                 )
 
-        def read() -> LoadedFleet:
+        old = self.now
+
+        def read() -> tuple[LoadedFleet, FleetChanges]:
             found = file if isinstance(file, FleetFile) else load_fleet(file)
             try:
-                return loaded(found, self._folder)
+                new = loaded(found, folder)
             except ValueError as exc:
                 raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
+            return new, changes_of(old, new, agent)
 
         self._reading = asyncio.get_running_loop().run_in_executor(None, read)
         self._reading.add_done_callback(_looked_at)
@@ -240,32 +254,6 @@ class Reloader:
             raise ConfigurationError(
                 f"fleet file {file}: it could not be read within {READ_TIMEOUT:g} s"
             ) from exc
-
-    def _check(self, agent: Agent, new: LoadedFleet) -> None:
-        """Refuse what cannot be changed while the agent runs.
-
-        Raises:
-            ConfigurationError: names the field.
-        """
-        old = self.now
-        for field in FleetFile.model_fields:
-            if field not in LIVE and getattr(old.file, field) != getattr(new.file, field):
-                raise ConfigurationError(
-                    f"{field}: it was changed, which wants a restart of the agent {agent.name}; "
-                    f"only {', '.join(sorted(LIVE))} can be changed while it runs"
-                )
-        for name, planned in new.plan.items():
-            before = old.plan.get(name)
-            if before is None and name in agent.hosts:
-                raise ConfigurationError(
-                    f"cameras.{name}: a program has added a camera of this name by Setup; it is to "
-                    "stop it first"
-                )
-            if old.file.ros2 is not None and _seen(before) != _seen(planned):
-                raise ConfigurationError(
-                    f"cameras.{name}.ros2: it was changed, which wants a restart of the agent "
-                    f"{agent.name}"
-                )
 
     async def _apply(
         self, agent: Agent, ending: tuple[str, ...], made: dict[str, CameraSource]
@@ -281,6 +269,9 @@ class Reloader:
             self.sources[name] = source
             if self._closed:
                 continue  # the agent ends, and with it what was made
+            if name in agent.hosts:
+                logger.error("%s ! it is not shared: a program has added one meanwhile", name)
+                continue
             try:
                 agent.share(name, source.settings, source.frames)
             except SmartCamError:
@@ -297,16 +288,53 @@ class Reloader:
                 await source.emulator.aclose()
 
 
-def _seen(planned: Planned | None) -> Any:
+def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
+    """Return what a file changes.
+
+    Raises:
+        ConfigurationError: something that cannot be changed while the agent runs; names the field.
+    """
+    for field in FleetFile.model_fields:
+        if field not in LIVE and getattr(old.file, field) != getattr(new.file, field):
+            raise ConfigurationError(
+                f"{field}: it was changed, which wants a restart of the agent {agent}; only "
+                f"{', '.join(sorted(LIVE))} can be changed while it runs"
+            )
+    for name, planned in new.plan.items():
+        if old.file.ros2 is not None and _seen(old.plan.get(name)) != _seen(planned):
+            raise ConfigurationError(
+                f"cameras.{name}.ros2: it was changed, which wants a restart of the agent {agent}"
+            )
+    both = [name for name in new.plan if name in old.plan]
+    changed = tuple(name for name in both if new.marks[name] != old.marks[name])
+    return FleetChanges(
+        agent,
+        tuple(name for name in new.plan if name not in old.plan),
+        tuple(name for name in old.plan if name not in new.plan),
+        changed,
+        len(both) - len(changed),
+    )
+
+
+def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
+    """Refuse cameras whose names others have that programs have added.
+
+    Raises:
+        ConfigurationError: there is one.
+    """
+    for name in changes.added:
+        if name in agent.hosts:
+            raise ConfigurationError(
+                f"cameras.{name}: a program has added a camera of this name by Setup; it is to "
+                "stop it first"
+            )
+
+
+def _seen(planned: Planned | None) -> RosCamera:
     """Return how a camera is seen in ROS; a new one as if nothing was said."""
-    entry: CameraEntry | None = None if planned is None else planned.entry
-    if entry is None:
-        from smartcam.fleet._ros_file import RosCamera
-
-        return RosCamera()
-    return entry.ros2
+    return RosCamera.model_validate({}) if planned is None else planned.entry.ros2
 
 
-def _looked_at(future: asyncio.Future[LoadedFleet]) -> None:
+def _looked_at(future: asyncio.Future[tuple[LoadedFleet, FleetChanges]]) -> None:
     if not future.cancelled():
         future.exception()  # it was told to who waited, if anybody did

@@ -14,6 +14,7 @@ from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet._metrics import exposition, read_numbers, require_client
 from smartcam.fleet._operations_file import OperationsSection
+from smartcam.settings import validated
 from smartcam.web._connections import KEEP_ALIVE, visitor_of
 from smartcam.web._guard import HEADERS
 from smartcam.web._site import FAREWELL, OpenPort, calm, listening
@@ -40,22 +41,26 @@ class OperationsSite(Server):
 
     Args:
         server: the agent; may be started later.
-        section: where to listen, and what of latency is told; None: what its file says, or where
-            that says nothing ``127.0.0.1:9464``.
+        listen: ``HOST:PORT``; None: as its file says, or where that says nothing
+            ``127.0.0.1:9464``. Port 0 takes a free one.
 
     Raises:
         MissingExtraError: the extra ``operations`` is not installed.
-        ConfigurationError: the section says to listen nowhere.
+        ConfigurationError: that is no place, or the file says to listen nowhere.
     """
 
-    def __init__(self, server: FleetServer, section: OperationsSection | None = None) -> None:
+    def __init__(self, server: FleetServer, *, listen: str | None = None) -> None:
         require_client()
         self._server = server
-        self._section = section or server.file.operations or OperationsSection()
-        place = self._section.place
-        if place is None:
+        section = server.file.operations or OperationsSection.model_validate({})
+        if listen is not None:
+            section = validated(
+                OperationsSection, {**section.model_dump(), "listen": listen}, "operations"
+            )
+        if section.place is None:
             raise ConfigurationError("operations.listen: null: there is nowhere to listen")
-        self._host, self._port = place
+        self._host, self._port = section.place
+        self._each = section.latency == "camera"
         self._tried = False
         self._open: OpenPort | None = None
         self._making: asyncio.Task[tuple[bytes, str]] | None = None
@@ -171,8 +176,7 @@ class OperationsSite(Server):
 
     async def _made(self) -> tuple[bytes, str]:
         numbers = await read_numbers(self._server)
-        each = self._section.latency == "camera"
-        return await asyncio.to_thread(exposition, numbers, each=each)
+        return await asyncio.to_thread(exposition, numbers, each=self._each)
 
 
 @web.middleware
@@ -192,7 +196,7 @@ async def _placed(
                 status=exc.status,
                 text=f"{exc.status} {exc.reason}: there are /healthz, /readyz, /metrics\n",
             )
-        except Exception:
+        except Exception:  # noqa: BLE001 - the last place
             _log.exception("! %s %s: a fault of ours", request.method, request.path)
             response = web.Response(status=500, text="500 a fault of ours: see the log\n")
     if not request.content.is_eof():

@@ -62,9 +62,8 @@ def put(path: Path, count: int, place: str, **operations: Any) -> None:
 
 def ask(port: int, path: str) -> tuple[int, str]:
     try:
-        with urllib.request.urlopen(  # noqa: S310 - http
-            f"http://127.0.0.1:{port}{path}", timeout=PATIENCE
-        ) as answer:
+        url = f"http://127.0.0.1:{port}{path}"
+        with urllib.request.urlopen(url, timeout=PATIENCE) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as exc:
         with exc:

@@ -14,8 +14,8 @@ import yaml
 from click.testing import CliRunner
 
 from smartcam._cli.smartcam import command
-from smartcam.fleet import load_fleet
 from smartcam.fleet import _metrics as metrics
+from smartcam.fleet import load_fleet
 from smartcam.fleet._trigger_counts import OUTCOMES
 from tests import ROOT
 

@@ -1,4 +1,4 @@
-"""A fleet file read again: what changed is done, what did not goes on, what is wrong does nothing."""
+"""A fleet file read again: what changed is done, all else goes on; a wrong one does nothing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from smartcam.exceptions import ConfigurationError, ConnectionClosedError, Smart
 from smartcam.fleet import Fleet, FleetChanges, FleetServer
 from smartcam.fleet._bus import MemoryBus
 from smartcam.protocols import messages as m
-from smartcam.settings import parse_address
+from smartcam.settings import CameraSettings, parse_address
 from tests.fleet.fleetkit import PATIENCE, NumberedCamera
 
 
@@ -54,10 +54,6 @@ async def line(folder: Path, *names: str, time: float = 0.001) -> AsyncIterator[
         fleet = Fleet(bus.end(), None, "plant", None, PATIENCE, {})
         await stack.enter_async_context(fleet)
         yield Line(boxes, path, server, fleet)
-
-
-def sessions(one: Line) -> dict[str, int]:
-    return {name: host.camera.statistics().sessions for name, host in one.server.hosts.items()}
 
 
 def sessions(one: Line) -> dict[str, int]:
@@ -235,6 +231,46 @@ async def test_an_emulated_camera_that_cannot_start_leaves_all_as_it_was(tmp_pat
             await one.server.reload()
         assert [*one.server.hosts] == ["one", "two"]
         assert [*one.server.reloads.sources] == ["one", "two"]
+
+
+async def test_what_nobody_foresaw_is_a_typed_error_and_the_next_one_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with line(tmp_path) as one:
+        one.write("one")
+        for fault, expected in (
+            (OSError(24, "no file is left"), "no file is left"),
+            (KeyError("x"), "a fault of ours"),
+        ):
+            with monkeypatch.context() as patched:
+                patched.setattr("smartcam.fleet._reload.load_fleet", failing(fault))
+                with pytest.raises(SmartCamError, match=expected):
+                    await one.server.reload()
+                outcome = (await one.fleet.reload())["a1"]
+                assert expected in str(outcome)
+        assert [*one.server.hosts] == ["one", "two"]
+        assert (await one.server.reload()).removed == ("two",)
+
+
+def failing(error: Exception) -> Any:
+    def fail(_: object) -> None:
+        raise error
+
+    return fail
+
+
+async def test_a_camera_that_a_program_added_stays_its(tmp_path: Path) -> None:
+    async with line(tmp_path) as one:
+        agent = one.server.agent
+        assert agent is not None
+        agent.share("three", CameraSettings.make(one.boxes["three"].url, None, {"name": "three"}))
+        await one.server.wait_tried()
+        one.write("one", "three")
+        with pytest.raises(ConfigurationError, match="cameras.three: a program has added"):
+            await one.server.reload()
+        one.write("one")
+        assert (await one.server.reload()).removed == ("two",)
+        assert life(one.boxes["three"]) == (1, 0)
 
 
 async def test_two_at_once_are_done_one_after_the_other(tmp_path: Path) -> None:
