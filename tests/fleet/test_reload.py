@@ -13,8 +13,9 @@ import pytest
 import yaml
 
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
-from smartcam.fleet import Fleet, FleetChanges, FleetServer
+from smartcam.fleet import Fleet, FleetChanges, FleetFile, FleetServer
 from smartcam.fleet._bus import MemoryBus
+from smartcam.fleet._reload import LoadedFleet, changes_of, loaded
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings, parse_address
 from tests.fleet.fleetkit import PATIENCE, NumberedCamera
@@ -266,7 +267,7 @@ async def test_a_camera_that_a_program_added_stays_its(tmp_path: Path) -> None:
         agent.share("three", CameraSettings.make(one.boxes["three"].url, None, {"name": "three"}))
         await one.server.wait_tried()
         one.write("one", "three")
-        with pytest.raises(ConfigurationError, match="cameras.three: a program has added"):
+        with pytest.raises(ConfigurationError, match=r"cameras\.three: a program has added"):
             await one.server.reload()
         one.write("one")
         assert (await one.server.reload()).removed == ("two",)
@@ -354,3 +355,20 @@ async def test_a_program_has_it_reloaded_over_the_bus(tmp_path: Path) -> None:
         assert "fleet.yaml" in str(outcome)
         with pytest.raises(ConfigurationError, match="no agent 'a7'; there are a1"):
             await one.fleet.reload("a7")
+
+
+def test_how_a_camera_is_seen_in_ros_wants_a_restart() -> None:
+    def file(frame: str | None, ros: bool, *more: str) -> LoadedFleet:
+        said = {} if frame is None else {"ros2": {"frame_id": frame}}
+        cameras = {name: {"url": f"bvs://{name}", **said} for name in ("one", *more)}
+        top = {"agent": "a1", "cameras": cameras, **({"ros2": {}} if ros else {})}
+        return loaded(FleetFile.model_validate(top), Path())
+
+    with pytest.raises(ConfigurationError, match=r"cameras\.one\.ros2: it was changed"):
+        changes_of(file("base", True), file("table", True), "a1")
+    with pytest.raises(ConfigurationError, match=r"cameras\.two\.ros2: it was changed"):
+        changes_of(file("base", True), file("base", True, "two"), "a1")
+    assert changes_of(file(None, True), file(None, True, "two"), "a1").added == ("two",)
+    assert changes_of(file("base", False), file("table", False), "a1").changed == ("one",)
+    with pytest.raises(ConfigurationError, match="ros2: it was changed"):
+        changes_of(file(None, False), file(None, True), "a1")
