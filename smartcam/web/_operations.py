@@ -12,7 +12,8 @@ from aiohttp import web
 
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._metrics import exposition, read_numbers, require_client
+from smartcam.fleet._metric_families import exposition, require_client
+from smartcam.fleet._metrics import read_numbers
 from smartcam.fleet._operations_file import OperationsSection
 from smartcam.settings import validated
 from smartcam.web._connections import KEEP_ALIVE, visitor_of
@@ -176,7 +177,7 @@ class OperationsSite(Server):
 
     async def _made(self) -> tuple[bytes, str]:
         numbers = await read_numbers(self._server)
-        return await asyncio.to_thread(exposition, numbers, each=self._each)
+        return await exposition(numbers, each=self._each)
 
 
 @web.middleware

@@ -14,7 +14,7 @@ import yaml
 from click.testing import CliRunner
 
 from smartcam._cli.smartcam import command
-from smartcam.fleet import _metrics as metrics
+from smartcam.fleet import _metric_families as families
 from smartcam.fleet import load_fleet
 from smartcam.fleet._trigger_counts import OUTCOMES
 from tests import ROOT
@@ -63,14 +63,14 @@ def test_commands_in_unit_and_containers_are_ours() -> None:
 
 def test_what_the_alarms_look_at_is_there() -> None:
     (group,) = read("alerts.yml")["groups"]
-    source = Path(metrics.__file__).read_text("utf-8")
+    source = Path(families.__file__).read_text("utf-8")
     for rule in group["rules"]:
         for name in re.findall(r"smartcam_\w+", rule["expr"]):
             assert f'"{re.sub("_(total|bucket)$", "", name)}"' in source, rule["alert"]
         for words in re.findall(r'outcome!?~"(.*?)"', rule["expr"]):
             assert set(words.split("|")) <= set(OUTCOMES)
         for words in re.findall(r'fate!?~"(.*?)"', rule["expr"]):
-            assert set(words.split("|")) <= set(metrics.FATES)
+            assert set(words.split("|")) <= set(families.FATES)
 
 
 @pytest.mark.long

@@ -19,7 +19,8 @@ from smartcam.exceptions import ConfigurationError, MissingExtraError, SmartCamE
 from smartcam.fleet import Fleet, FleetFile, FleetServer
 from smartcam.fleet import _metrics as metrics
 from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._metrics import exposition, read_numbers
+from smartcam.fleet._metric_families import exposition
+from smartcam.fleet._metrics import read_numbers
 from smartcam.fleet._trigger_counts import OUTCOMES, outcome_of
 from smartcam.web import OperationsSite
 from smartcam.web._connections import MAX_CONNECTIONS
@@ -170,12 +171,16 @@ async def test_the_text_grows_by_a_few_lines_for_a_camera_and_by_no_labels_of_ot
         numbers = await read_numbers(server)
         assert numbers is not None
 
-    def lines(count: int) -> int:
+    async def lines(count: int) -> int:
         cameras = [numbers.cameras[0]._replace(name=f"line/cam{n}") for n in range(count)]
-        text, _ = exposition(numbers._replace(cameras=cameras), each=False)
+        text, _ = await exposition(numbers._replace(cameras=cameras), each=False)
+        assert text.count(b"# TYPE smartcam_connected ") == 1
+        assert (
+            len([one for one in samples(text.decode()) if one[0] == "smartcam_connected"]) == count
+        )
         return text.count(b"\n")
 
-    assert lines(101) - lines(1) == 100 * 11
+    assert await lines(101) - await lines(1) == 100 * 11
     kinds = [getattr(smartcam.exceptions, name) for name in smartcam.exceptions.__all__]
     words = {outcome_of(kind.__new__(kind)) for kind in (*kinds, Exception, TimeoutError)}
     assert words < {*OUTCOMES}
