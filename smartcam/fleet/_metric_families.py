@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._metrics import AgentNumbers, CameraNumbers
 
-MOST_LINES = 64
+MOST_LINES = 80
 """Lines that are made at a time."""
 
 _SUMS = {

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from smartcam.frames._source import SourceStatistics
     from smartcam.models import Statistics
 
-SLICE = 8
-"""Cameras that are read at a time: a fraction of a millisecond."""
+SLICE = 24
+"""Cameras that are read at a time: half a millisecond, as a hundred of them added up."""
 
 FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
 
@@ -77,8 +77,8 @@ async def read_numbers(server: FleetServer) -> AgentNumbers | None:
     cameras = [one for host, one in read if agent.hosts.get(host.name) is host]
     totals = Totals(agent.past)
     totals.add(host.camera.statistics() for host in agent.leaving)
-    for begin in range(0, len(cameras), SLICE):
-        totals.add(one.account for one in cameras[begin : begin + SLICE])
+    for begin in range(0, len(cameras), 4 * SLICE):
+        totals.add(one.account for one in cameras[begin : begin + 4 * SLICE])
         await asyncio.sleep(0)
     return AgentNumbers(
         agent.name,

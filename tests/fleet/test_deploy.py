@@ -15,6 +15,7 @@ from click.testing import CliRunner
 
 from smartcam._cli.smartcam import command
 from smartcam.fleet import _metric_families as families
+from smartcam.fleet import _metrics as metrics
 from smartcam.fleet import load_fleet
 from smartcam.fleet._trigger_counts import OUTCOMES
 from tests import ROOT
@@ -70,7 +71,7 @@ def test_what_the_alarms_look_at_is_there() -> None:
         for words in re.findall(r'outcome!?~"(.*?)"', rule["expr"]):
             assert set(words.split("|")) <= set(OUTCOMES)
         for words in re.findall(r'fate!?~"(.*?)"', rule["expr"]):
-            assert set(words.split("|")) <= set(families.FATES)
+            assert set(words.split("|")) <= set(metrics.FATES)
 
 
 @pytest.mark.long
