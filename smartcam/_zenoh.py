@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import ctypes
 import functools
 import io
 import json
@@ -31,14 +32,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
-    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(worker_threads:2),"
+    "(rx:(handover:app),acc:(handover:app),net:(worker_threads:2),tx:(worker_threads:1),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: one for what comes and goes, which halves the CPU time of a call; its callbacks
-here only put what comes into a queue. Its inner tasks have two of their own: where a session of a
-router is freed, or a latched publisher is closed, the binding waits for such a task and lets no
-thread of Python run meanwhile, also not the one that is to call back. The variable ZENOH_RUNTIME
-goes before it."""
+"""Zenoh's threads: as few as can be, which halves the CPU time of a call; its callbacks here only
+put what comes into a queue. What sends has one of its own: the one for what comes waits for it
+where an answer is longer than a queue (128 KiB, which the tokens of 20 nodes of ROS are), and would
+wait for itself until the link is given up. Its inner tasks have two of their own: where a latched
+publisher is closed, the binding waits for such a task and lets no thread of Python run meanwhile,
+also not the one that is to call back. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
@@ -240,6 +242,8 @@ class ZenohSession:
             opening.add_done_callback(_close_late)
             raise
         self._end_lingering()
+        self._waiting.clear()
+        self._bytes, self._woken = 0, False
         self._bell = _LoopBell.on(loop, self._drain)
         return self
 
@@ -269,7 +273,9 @@ class ZenohSession:
             return
         for one in tuple(self._declared):
             one.close()
-        closing = self._loop.run_in_executor(None, _end, session, self._threads())
+        closing = self._loop.run_in_executor(
+            None, _end, session, self._threads(), bool(self._link.listen)
+        )
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.shield(closing)
@@ -485,10 +491,17 @@ def _refuse(query: Any, why: str) -> None:
     quietly(query.drop)
 
 
-def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:
-    """Say what is to be said yet, then end the session."""
+def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
+    """Say what is to be said yet, then end the session.
+
+    A router that is closed is never freed: its last reference would wait for an engine's thread,
+    and hold the interpreter, which that thread may wait for to tell another session of this process
+    something. It is 16 KiB.
+    """
     for one in threads:
         one.shutdown()
+    if router:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()
 
 

@@ -22,6 +22,7 @@ from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
+from smartcam.settings import masked
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator._wire_camera import WireCamera
     from smartcam.fleet._bus import Bus
-    from smartcam.fleet._file import Planned
+    from smartcam.fleet._file import FramesEntry, Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
 
@@ -104,7 +105,7 @@ class FleetServer(Server):
             stack.push_async_callback(self.reloads.close)
             stack.callback(service.close)
             if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
+                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus, cameras))
             self._agent, self._stack = agent, stack.pop_all()
 
     def _more(self) -> dict[str, Any]:
@@ -115,7 +116,13 @@ class FleetServer(Server):
 
         return dict(SETTINGS)
 
-    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
+    def _ros_frames(self, entry: FramesEntry) -> dict[str, Any]:
+        found: dict[str, Any] = {"video_device": masked(entry.url)}
+        if entry.camera_info is not None:
+            found["camera_info_url"] = (self._folder / entry.camera_info).absolute().as_uri()
+        return found
+
+    def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
 
         file, own = self.file, self.file.agent_name
@@ -125,8 +132,14 @@ class FleetServer(Server):
             bus,
             file.fleet,
             self.address,
-            file.ros2 or RosSection(),
+            file.ros2 or RosSection.model_validate({}),
             cameras=said,
+            settings=cameras,
+            frames={
+                planned.name: self._ros_frames(planned.entry.frames)
+                for planned in self._plan
+                if planned.entry.frames is not None
+            },
             calibrations={name: one for name, one in found.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
         )
