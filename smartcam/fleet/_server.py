@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._file import FramesEntry, Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
+    from smartcam.settings import CameraSettings
 
 OPEN_TIMEOUT = 10.0
 """Seconds for coming to the bus."""
@@ -66,6 +67,9 @@ class FleetServer(Server):
         self._listen, self._connect = listen, connect = with_ports(listen), connect
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
         self._ros: RosFleet | None = None
+        # what is told of cameras in ROS, of those that a reload brings, too
+        self._settings: dict[str, CameraSettings] = {}
+        self._ros_frames: dict[str, dict[str, Any]] = {}
         self._agent: Agent | None = None
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
@@ -105,7 +109,7 @@ class FleetServer(Server):
             stack.push_async_callback(self.reloads.close)
             stack.callback(service.close)
             if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus, cameras))
+                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
             self._agent, self._stack = agent, stack.pop_all()
 
     def _more(self) -> dict[str, Any]:
@@ -116,13 +120,7 @@ class FleetServer(Server):
 
         return dict(SETTINGS)
 
-    def _ros_frames(self, entry: FramesEntry) -> dict[str, Any]:
-        found: dict[str, Any] = {"video_device": masked(entry.url)}
-        if entry.camera_info is not None:
-            found["camera_info_url"] = (self._folder / entry.camera_info).absolute().as_uri()
-        return found
-
-    def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
+    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
 
         file, own = self.file, self.file.agent_name
@@ -134,12 +132,8 @@ class FleetServer(Server):
             self.address,
             file.ros2 or RosSection.model_validate({}),
             cameras=said,
-            settings=cameras,
-            frames={
-                planned.name: self._ros_frames(planned.entry.frames)
-                for planned in self._plan
-                if planned.entry.frames is not None
-            },
+            settings=self._settings,
+            frames=self._ros_frames,
             calibrations={name: one for name, one in found.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
         )
@@ -190,6 +184,8 @@ class FleetServer(Server):
                 make = functools.partial(entry.frames.source, folder)
                 make()  # what cannot work is told now
                 frames = FramesOf(make, FrameAddress.parse(entry.frames.url).shown)
+            self._settings[planned.name] = settings
+            self._ros_frames[planned.name] = _ros_frames(entry.frames, folder)
             return CameraSource(settings, frames, stack.pop_all())
 
     async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
@@ -271,6 +267,16 @@ class FleetServer(Server):
         """The fleet URLs of its cameras, by name."""
         address = self.address
         return {name: address.of(name).url for name in self.reloads.now.plan}
+
+
+def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
+    """Return where frames come from as parameters of v4l2_camera."""
+    if entry is None:
+        return {}
+    found: dict[str, Any] = {"video_device": masked(entry.url)}
+    if entry.camera_info is not None:
+        found["camera_info_url"] = (folder / entry.camera_info).absolute().as_uri()
+    return found
 
 
 async def _end_emulators(sources: dict[str, CameraSource]) -> None:
