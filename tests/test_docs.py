@@ -200,7 +200,7 @@ def test_python_block_runs(block: Block, shell: Shell, monkeypatch: pytest.Monke
     if any(name in text for name in shown):
         for name, content in shown.items():  # an agent listens where its file says
             path, port = shell.folder / name, "listen: tcp/127.0.0.1:0"
-            path.write_text(re.sub(r"listen: \S+:\d+", port, content), encoding="utf-8")
+            path.write_text(re.sub(r"listen: \w+/\S+:\d+", port, content), encoding="utf-8")
         monkeypatch.chdir(shell.folder)
     # empty lines in front, so that a traceback names the page's own lines
     code = compile("\n" * (block.line - 1) + text, str(block.page), "exec", dont_inherit=True)

@@ -142,6 +142,33 @@ def _named_text(result: Result) -> str:
     return f"{result.camera}: {result_text(result)}"
 
 
+# ---------------------------------------------------------------------- reload
+
+
+@fleet.command(
+    help="Have the agents of a fleet read their fleet files again. Cameras that did not change go "
+    "on; a file that is wrong leaves all as it was. Prints what has changed, one line per agent. "
+    "Exit code: 0 if all did it, else that of the first error."
+)
+@click.argument("url")
+@click.option("--agent", metavar="NAME", help="This one only.")
+@runs("--timeout", *OUTPUT)
+async def reload(url: str, agent: str | None, options: Options) -> None:
+    async with _opened(url, options) as opened:
+        outcomes = await opened.reload(agent, timeout=options.step(30.0))
+    if not outcomes:
+        raise ConnectFailedError(f"no agent of {opened.url} is there")
+    codes: list[int] = []
+    for name, outcome in outcomes.items():
+        if isinstance(outcome, SmartCamError):
+            codes.append(exit_code(outcome))
+            _show_error(name, outcome, codes[-1], options, kind="agent")
+        else:
+            options.show(outcome, f"{name}: {outcome}")
+    if codes:
+        raise SystemExit(codes[0])
+
+
 # ---------------------------------------------------------------------- trigger
 
 
@@ -170,9 +197,11 @@ async def trigger(url: str, pattern: str, input_hex: str | None, options: Option
         raise SystemExit(codes[0])
 
 
-def _show_error(name: str, error: SmartCamError, code: int, options: Options) -> None:
+def _show_error(
+    name: str, error: SmartCamError, code: int, options: Options, kind: str = "camera"
+) -> None:
     text = str(error)
     if options.as_json:
-        click.echo(error_json(error, text, code, camera=name))
+        click.echo(error_json(error, text, code, **{kind: name}))
     else:
         click.echo(f"{name}: {tinted('error', 'error:')} {text.removeprefix(f'{name}: ')}")

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
+import logging
+import signal
+import sys
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from smartcam._cli.log_lines import json_log
 from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.running import exit_code
+from smartcam._cli.systemd import Notifier
+from smartcam.exceptions import SmartCamError
 from smartcam.models import Connected, Disconnected, Reconnected
 
 if TYPE_CHECKING:
-    from smartcam.fleet import FleetServer
+    from collections.abc import AsyncIterator, Iterator
+
+    from smartcam.fleet import FleetChanges, FleetServer
     from smartcam.models import CameraEvent
+
+logger: logging.Logger = logging.getLogger("smartcam.serve")
 
 
 @click.command(
@@ -20,12 +33,19 @@ if TYPE_CHECKING:
     "programs, until Ctrl-C or SIGTERM. Prints one line per camera, its fleet URL, which every "
     "command takes that takes a camera's. A camera that is not there says so on its line, and is "
     "tried on; what comes and goes later is told on stderr, with --json on stdout, by the same "
-    'object again. Needs the extra "fleet".'
+    "object again. SIGHUP has the file read again, but where stdin is a terminal. Needs the extra "
+    '"fleet"; with operations: in the file "operations", too.'
 )
 @click.argument("file", required=False, metavar="FLEET.yaml")
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of fleet files, and end.")
+@click.option(
+    "--log",
+    type=click.Choice(["text", "json"]),
+    help="How what happens is told on stderr; default: as the file says, or text. json: one object "
+    "a line, from all that logs, and nothing else.",
+)
 @runs(*OUTPUT, interrupted=0, terminated=0)
-async def serve(file: str | None, schema: bool, options: Options) -> None:
+async def serve(file: str | None, schema: bool, log: str | None, options: Options) -> None:
     """Share cameras."""
     import smartcam.fleet
 
@@ -34,15 +54,166 @@ async def serve(file: str | None, schema: bool, options: Options) -> None:
         return
     if file is None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
-    async with smartcam.fleet.serve(file) as server:
-        await server.wait_tried()
-        events = server.events()
-        for name in server.hosts:
-            value = _camera(server, name)
-            why = "" if value["connected"] else f"  not connected: {value['reason']}"
-            options.show(value, f"{value['url']}{why}")
-        async for event in events:
-            tell(server, event, options)
+    if log == "json":  # a file that is wrong is told so, too
+        with _logged(None, options):
+            server = smartcam.fleet.serve(file)
+    else:
+        server = smartcam.fleet.serve(file)
+    section = server.file.operations
+    as_lines = (log or (section and section.log)) == "json"
+    with _logged(server, options) if as_lines else contextlib.nullcontext():
+        await _Serving(server, options, as_lines).run()
+
+
+@contextlib.contextmanager
+def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
+    """Have all that is logged in here written as lines of JSON; an error that ends it, too."""
+    section = None if server is None else server.file.operations
+    level = logging.getLevelName(
+        "DEBUG" if options.debug else section.level.upper() if section else "INFO"
+    )
+    with json_log(
+        level,
+        lambda: "" if server is None else server.name or server.file.agent or "",
+        lambda: () if server is None else server.hosts,
+    ):
+        try:
+            yield
+        except (SmartCamError, OSError) as exc:
+            logger.critical("%s", exc, exc_info=options.debug)
+            raise SystemExit(exit_code(exc)) from exc
+
+
+class _Serving:
+    """A server in its process: what it says of itself, and the signals that it hears.
+
+    Args:
+        server: the agent.
+        options: of the command.
+        as_lines: what happens is logged, and not printed for people.
+    """
+
+    def __init__(self, server: FleetServer, options: Options, as_lines: bool) -> None:
+        self._server, self._options, self._as_lines = server, options, as_lines
+        self._notifier = Notifier()
+        self._ready = False
+
+    async def run(self) -> None:
+        server, notifier = self._server, self._notifier
+        async with contextlib.AsyncExitStack() as stack:
+            stack.callback(notifier.close)
+            wanted = stack.enter_context(_hangup())
+            await stack.enter_async_context(self._watched())
+            await stack.enter_async_context(server)
+            stack.callback(notifier.stopping)
+            server.reloads.tell = self._on_reload
+            stack.enter_context(notifier.telling(self._status))
+            await stack.enter_async_context(_while_here(self._reload_when(wanted)))
+            await server.wait_tried()
+            self._ready = True
+            notifier.ready(self._status())
+            events = server.events()
+            for name in [*server.hosts]:
+                value = _camera(server, name)
+                why = "" if value["connected"] else f"  not connected: {value['reason']}"
+                self._say(name, value, f"{value['url']}{why}", connected=value["connected"])
+            async for event in events:
+                if self._as_lines:
+                    self._log(event)
+                if self._options.as_json or not self._as_lines:
+                    tell(server, event, self._options)
+
+    @contextlib.asynccontextmanager
+    async def _watched(self) -> AsyncIterator[None]:
+        """Serve health and numbers in here, where the file says so."""
+        section = self._server.file.operations
+        if section is None or section.place is None:
+            yield
+            return
+        from smartcam.web import OperationsSite
+
+        async with OperationsSite(self._server) as site:
+            logger.info("health and numbers are at port %d of %s", site.port, section.place[0])
+            yield
+
+    def _say(self, camera: str, value: dict[str, Any], text: str, *, connected: bool) -> None:
+        if self._as_lines:
+            level = logging.INFO if connected else logging.WARNING
+            logger.log(level, "shared: %s", text, extra={"camera": camera})
+        if self._options.as_json or not self._as_lines:
+            self._options.show(value, text)
+
+    def _log(self, event: CameraEvent) -> None:
+        extra = {"camera": event.camera}
+        if event.camera not in self._server.hosts:
+            return  # given up on purpose
+        if isinstance(event, Disconnected):
+            logger.warning("not connected: %s", event.reason, extra=extra)
+        elif isinstance(event, (Connected, Reconnected)):
+            logger.info("connected", extra=extra)
+
+    # ------------------------------------------------------------------ reloads
+
+    async def _reload_when(self, wanted: asyncio.Event) -> None:
+        """Read the file again whenever it is wanted; several wishes at a time are one."""
+        while True:
+            await wanted.wait()
+            wanted.clear()
+            with contextlib.suppress(SmartCamError):  # which was told
+                await self._server.reload()
+
+    def _on_reload(self, outcome: FleetChanges | SmartCamError | None) -> None:
+        if outcome is None:
+            if self._ready:
+                self._notifier.reloading("reading the fleet file again")
+            return
+        if self._ready:
+            self._notifier.ready(self._status())
+        if not self._as_lines:  # else it was logged
+            failed = isinstance(outcome, Exception)
+            text = (
+                f"not reloaded, all stays as it was: {outcome}"
+                if failed
+                else f"reloaded: {outcome}"
+            )
+            with contextlib.suppress(OSError):  # nobody reads it
+                click.echo(text, err=True)
+
+    def _status(self) -> str:
+        server = self._server
+        hosts = server.hosts.values()
+        text = f"{sum(host.connected for host in hosts)} of {len(hosts)} cameras connected"
+        last = server.reloads.last
+        return f"{text}; not reloaded: {last}" if isinstance(last, Exception) else text
+
+
+@contextlib.contextmanager
+def _hangup() -> Iterator[asyncio.Event]:
+    """Give what SIGHUP sets. In a terminal it means that the terminal is gone, and ends us."""
+    wanted, loop = asyncio.Event(), asyncio.get_running_loop()
+    number = getattr(signal, "SIGHUP", None)
+    if number is None or (sys.stdin is not None and sys.stdin.isatty()):
+        yield wanted
+        return
+    with contextlib.suppress(NotImplementedError):
+        loop.add_signal_handler(number, wanted.set)
+    try:
+        yield wanted
+    finally:
+        with contextlib.suppress(NotImplementedError):
+            loop.remove_signal_handler(number)
+            signal.signal(number, signal.SIG_IGN)  # while it ends, there is nothing to read again
+
+
+@contextlib.asynccontextmanager
+async def _while_here(work: Any) -> AsyncIterator[None]:
+    """Have something done in a task in here."""
+    task = asyncio.get_running_loop().create_task(work)
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait({task})
 
 
 def _camera(server: FleetServer, name: str) -> dict[str, Any]:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from smartcam.models import SubscriberStatistics
 
 
+_WIRE = tuple(field.name for field in dataclasses.fields(Counters))
+
+
 class Times:
     """Collects times for a :class:`~smartcam.Histogram`."""
 
@@ -115,7 +118,8 @@ class ClientCounters:
 
     def statistics(self, subscribers: Iterable[SubscriberStatistics]) -> Statistics:
         """Return everything counted so far."""
-        wire = dataclasses.asdict(self._wire_total())
+        total = self._wire_total()
+        wire = {name: getattr(total, name) for name in _WIRE}
         wire["ignored_datagrams"] = wire.pop("ignored_frames")
         return Statistics(
             received=self.received,
@@ -136,5 +140,5 @@ class ClientCounters:
     def _wire_total(self) -> Counters:
         if self._open is None:
             return self._wire
-        both = zip(dataclasses.astuple(self._wire), dataclasses.astuple(self._open), strict=True)
-        return Counters(*(one + other for one, other in both))
+        one, other = self._wire, self._open
+        return Counters(*(getattr(one, name) + getattr(other, name) for name in _WIRE))

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     )
     from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._opening import open, serve
+    from smartcam.fleet._reload import FleetChanges
     from smartcam.fleet._server import FleetServer
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "CameraLeft",
     "Fleet",
     "FleetCamera",
+    "FleetChanges",
     "FleetEvent",
     "FleetFile",
     "FleetFrame",
@@ -58,6 +60,7 @@ if not TYPE_CHECKING:
             "_fleet": "AgentJoined AgentLeft CameraJoined CameraLeft Fleet FleetEvent FleetResults",
             "_frame_wire": "FleetFrame",
             "_opening": "open serve",
+            "_reload": "FleetChanges",
             "_server": "FleetServer",
         },
     )

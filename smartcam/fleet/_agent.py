@@ -29,6 +29,7 @@ from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._plain import Plain
 from smartcam.fleet._shared import Owner
+from smartcam.fleet._trigger_counts import RESULT, Totals, outcome_of
 from smartcam.fleet._wire import (
     BusMessage,
     TriggerOrder,
@@ -140,6 +141,8 @@ class Agent:
         self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
         self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
         self._plain = Plain(self, keys, bus)
+        self.leaving: set[Host] = set()  # are being closed
+        self.past: Totals = Totals()  # of cameras shared no more
 
     # ------------------------------------------------------------------ life
 
@@ -160,7 +163,7 @@ class Agent:
             self._plain.open()
             declared.append(bus.be_present(keys.agent(self.name)))
             for name, settings in self._cameras.items():
-                self.share(name, settings)
+                self.share(name, settings, self._frames.get(name))
         except BaseException:
             await self.close()
             raise
@@ -188,14 +191,19 @@ class Agent:
             self._sender.close()
             await self._bus.close()
 
-    def share(self, name: str, settings: CameraSettings) -> Host:
+    def share(self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None) -> Host:
         """Begin to have a session with a camera, and to share it.
+
+        Args:
+            name: of the camera.
+            settings: of the client.
+            frames_of: where its frames come from.
 
         Raises:
             ConfigurationError: an option of it cannot work.
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
-        found = self._frames.get(name, NO_FRAMES)
+        found = frames_of or NO_FRAMES
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
         events = self._on_event
         host = Host(name, settings, bus, keys, self.epoch, self._history, events, topics, frames)
@@ -208,14 +216,29 @@ class Agent:
     async def unshare(self, name: str) -> None:
         """End the session with a camera, and share it no more; bounded."""
         host = self.hosts.pop(name)
+        self.leaving.add(host)
         token, running = self._shared.pop(name)
         token.close()
         running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
-        await host.close()
-        self._numbers_at[name] = host.numbers
+        try:
+            await asyncio.gather(running, return_exceptions=True)
+            await host.close()
+        finally:
+            self._numbers_at[name] = host.numbers
+            self.leaving.discard(host)
+            self.past.add([host.camera.statistics()])
         if len(self._numbers_at) > KNOWN_CAMERAS:
             del self._numbers_at[next(iter(self._numbers_at))]
+
+    @property
+    def programs(self) -> int:
+        """How many programs are here."""
+        return len(self._programs)
+
+    @property
+    def calls(self) -> int:
+        """How many calls of theirs are under way."""
+        return sum(len(guest.tasks) for guest in self._programs.values())
 
     async def wait_tried(self) -> None:
         """Wait until each camera was tried once, well or not; bounded."""
@@ -356,6 +379,8 @@ class Agent:
                 f"{host.name}: {len(guest.tasks)} calls of this program are under way"
             )
         if error is not None:
+            if said == "trigger":
+                host.triggers[outcome_of(error)] += 1
             self._reply(program, number, {"error": to_fields(error)})
             return None
         return min(timeout, left)
@@ -383,7 +408,7 @@ class Agent:
     async def _do(self, said: str, call: ProgramCall, guest: Guest) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
-        inside = False
+        inside, outcome = False, "cancelled"
         try:
             if said in PASSES_GATE:
                 if not host.gate.goes_in(call.program):
@@ -396,10 +421,12 @@ class Agent:
             if not isinstance(exc, SmartCamError):
                 logger.exception("%s ! %s failed", host.name, said)
             reply: dict[str, Any] = {"error": to_fields(exc)}
-            blobs = []
+            blobs, outcome = [], outcome_of(exc)
         else:
-            reply = {"answer": fields}
+            reply, outcome = {"answer": fields}, RESULT
         finally:
+            if said == "trigger":
+                host.triggers[outcome] += 1
             if inside:
                 host.gate.leave(call.program)
             guest.tasks.pop(call.owner.call, None)

@@ -55,6 +55,11 @@ class Bus(abc.ABC):
 
     local: bool = False
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait to be said; 0 where nothing ever waits."""
+        return 0
+
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:
         """Come to the bus.

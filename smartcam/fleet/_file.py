@@ -29,6 +29,7 @@ from smartcam.fleet._address import (
     check_word,
     missing_certificates,
 )
+from smartcam.fleet._operations_file import OperationsSection  # noqa: TC001 - pydantic does
 from smartcam.fleet._ros_file import Fields, RosCamera, RosSection, node_names
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address
@@ -321,6 +322,9 @@ class FleetFile(Fields):
     )
     ros2: RosSection | None = Field(
         None, description="have the cameras seen in ROS 2; {} is enough"
+    )
+    operations: OperationsSection | None = Field(
+        None, description="how smartcam serve is watched: health, numbers, log; {} is enough"
     )
     cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
         description="by name, such as line1/cam3; emulated ones at a name that ends in /**",

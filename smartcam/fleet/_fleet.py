@@ -24,6 +24,7 @@ from smartcam.fleet._address import FleetAddress, check_pattern
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import meets
 from smartcam.fleet._program import Program
+from smartcam.fleet._reload_service import reload_agents
 from smartcam.models import ValueT
 from smartcam.settings import CameraSettings
 from smartcam.streams import Subscribers, Subscription
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from typing import Literal, Self
 
     from smartcam.fleet._bus import Bus, Handle
+    from smartcam.fleet._reload import FleetChanges
     from smartcam.models import Result, SubscriberStatistics
 
 
@@ -480,6 +482,37 @@ class Fleet:
         Cancellation: cancels each; which ones were triggered then is unknown.
         """
         return await self._each(pattern, lambda one: one.trigger(timeout=timeout, **options))
+
+    async def reload(
+        self, agent: str | None = None, *, timeout: float = 30.0
+    ) -> dict[str, FleetChanges | SmartCamError]:
+        """Have agents read their fleet files again: :meth:`smartcam.fleet.FleetServer.reload`.
+
+        Args:
+            agent: which one; None for all that are there.
+            timeout: seconds for the answers.
+
+        Returns:
+            What has changed, or the error, by the agent's name. A ``ConfigurationError`` says that
+            all stayed as it was at this agent.
+
+        Raises:
+            ConfigurationError: there is no such agent.
+            ConnectionClosedError: the fleet is not open.
+
+        Cancellation: what the agents have begun goes on.
+        """
+        if self._state != "open":
+            raise ConnectionClosedError(f"{self.url}: not open: the fleet is new, or was closed")
+        there = sorted(self._present)
+        if agent is not None and agent not in there:
+            raise ConfigurationError(
+                f"the fleet has no agent {agent!r}; there are {', '.join(there[:20]) or 'none'}"
+                f"{did_you_mean(agent, there)}"
+            )
+        program = self._program
+        wanted = there if agent is None else [agent]
+        return await reload_agents(program.bus, program.keys, wanted, timeout)
 
     async def _each(
         self, pattern: str, do: Callable[[FleetCamera[Any]], Awaitable[Any]]

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._frame_stream import FrameOrder, TakenFrame
     from smartcam.fleet._frame_video import SharedVideo
     from smartcam.frames import Frame, FrameSource
+    from smartcam.frames._source import SourceStatistics
 
 T = TypeVar("T")
 
@@ -126,6 +127,16 @@ class SharedFrames:
         source, self._source = self._source, None
         if source is not None:
             await source.close()
+
+    @property
+    def viewers(self) -> int:
+        """How many streams there are."""
+        return len(self._viewers)
+
+    @property
+    def statistics(self) -> SourceStatistics | None:
+        """What the source did; None where it is not open."""
+        return None if self._source is None else self._source.statistics()
 
     def forget(self, program: str) -> None:
         """A program is gone, and so are its streams."""

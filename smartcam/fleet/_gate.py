@@ -57,6 +57,11 @@ class Gate:
         if self._line:
             self._grant()
 
+    @property
+    def waiting(self) -> int:
+        """How many wait for being let in."""
+        return len(self._line)
+
     async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
         """Keep the commands of others out; those under way are waited for.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import collections
 import contextlib
 import math
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from smartcam.fleet._gate import Gate
 from smartcam.fleet._log import AgentLog
 from smartcam.fleet._shared import SharedCamera, Tap
 from smartcam.fleet._topics import CameraTopics
+from smartcam.fleet._trigger_counts import RESULT, outcome_of
 from smartcam.fleet._wire import (
     CURRENT,
     LATE,
@@ -28,7 +30,7 @@ from smartcam.fleet._wire import (
 from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Sequence
+    from collections.abc import Callable, Hashable, Iterator, Sequence
 
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._frames import SharedFrames
@@ -81,6 +83,7 @@ class Host:
         topics: says in JSON what comes, for other programs.
         frames: its frames.
         failure: why there is no session yet, None where there is or was one.
+        triggers: how those of programs ended, by a word of ``OUTCOMES``.
     """
 
     def __init__(
@@ -103,6 +106,7 @@ class Host:
         self.states = AgentLog(MOST_STATES, MOST_STATE_BYTES)
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
+        self.triggers: collections.Counter[str] = collections.Counter()
         self._epoch, self._tell = epoch, on_event
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self.topics: CameraTopics = CameraTopics(self, topics)
@@ -124,6 +128,11 @@ class Host:
     def camera(self) -> SharedCamera:
         """The client that has the session."""
         return self._camera
+
+    @property
+    def was_tried(self) -> bool:
+        """Whether the first try has come to an end, well or not."""
+        return self._opened.is_set()
 
     @property
     def connected(self) -> bool:
@@ -211,6 +220,19 @@ class Host:
                 f"{self.name}: the agent has no session with the camera: {why}"
             ) from self.failure
         return self._camera
+
+    @contextlib.contextmanager
+    def counted(self, said: str) -> Iterator[None]:
+        """Count how a trigger in here ends, if ``said`` is one."""
+        outcome = RESULT
+        try:
+            yield
+        except BaseException as exc:
+            outcome = outcome_of(exc)
+            raise
+        finally:
+            if "trigger" in said.lower():
+                self.triggers[outcome] += 1
 
     async def enter(self, program: str, said: str, timeout: float) -> None:
         """Let a command of ``program`` begin, as :meth:`Gate.enter` does.

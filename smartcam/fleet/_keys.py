@@ -83,6 +83,10 @@ class Keys:
         """Calls to a camera's agent: commands, and questions that change nothing."""
         return f"{self.root}/{'command' if command else 'ask'}/{agent}/{camera}"
 
+    def reload(self, agent: str) -> str:
+        """Have an agent read its file again."""
+        return f"{self.root}/administer/{agent}/reload"
+
     def reply(self, program: str) -> str:
         """Replies to a program."""
         return f"{self.root}/reply/{program}"

@@ -82,6 +82,16 @@ class AgentLog:
         """The first number that is kept; the next one where nothing is."""
         return self._entries[0].number if self._entries else self.following
 
+    @property
+    def kept(self) -> int:
+        """How many things are kept."""
+        return self.following - self.first
+
+    @property
+    def kept_bytes(self) -> int:
+        """Their bytes."""
+        return self._bytes
+
     def add(self, count: int, clock: float, data: bytes) -> None:
         """Keep ``count`` things with the next numbers, which ``data`` has in it."""
         entries, number = self._entries, self.following

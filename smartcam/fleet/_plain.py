@@ -395,7 +395,8 @@ class Plain:
         try:
             left = max(0.0, deadline - loop.time())
             owner = Owner(self._program, self._numbers)
-            answer = await service.do(Work(host, host.topics, request, left, owner))
+            with host.counted(order.name):
+                answer = await service.do(Work(host, host.topics, request, left, owner))
             if service is STOP and host.name in self._added:
                 self._added.discard(host.name)
                 await self._agent.unshare(host.name)

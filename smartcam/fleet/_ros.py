@@ -85,7 +85,7 @@ class RosFleet(Server):
         wanted: Callable[[str, str], bool] = lambda _agent, _camera: True,
     ) -> None:
         self._section, self._said, self._wanted = section, dict(cameras or {}), wanted
-        self._settings, self._frames = dict(settings or {}), dict(frames or {})
+        self._settings, self._frames = settings or {}, frames or {}  # others come into them
         self.context: RosContext = RosContext(
             bus, domain=section.domain, distribution=section.distribution
         )

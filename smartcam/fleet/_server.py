@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 from smartcam._server import Server
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.camera import DEFAULT_MAX_QUEUE
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, ConnectionClosedError
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
+from smartcam.fleet._reload import CameraSource, FleetChanges, Reloader, loaded
+from smartcam.fleet._reload_service import ReloadService
 from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
@@ -53,16 +55,21 @@ class FleetServer(Server):
     def __init__(
         self, file: str | Path | FleetFile, *, bus: Bus | None = None, folder: Path | None = None
     ) -> None:
-        self.file: FleetFile = file if isinstance(file, FleetFile) else load_fleet(file)
+        self._given = file
+        found = file if isinstance(file, FleetFile) else load_fleet(file)
         self._folder = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
-            self._plan = self.file.plan()
+            now = loaded(found, self._folder)
         except ValueError as exc:
-            raise ConfigurationError(f"fleet {self.file.fleet}: {exc}") from exc
+            raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
+        self.reloads: Reloader = Reloader(self._folder, now, self._source)
         listen, connect = self.file.endpoints
         self._listen, self._connect = listen, connect = with_ports(listen), connect
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
         self._ros: RosFleet | None = None
+        # what is told of cameras in ROS, of those that a reload brings, too
+        self._settings: dict[str, CameraSettings] = {}
+        self._ros_frames: dict[str, dict[str, Any]] = {}
         self._agent: Agent | None = None
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
@@ -80,30 +87,29 @@ class FleetServer(Server):
             return
         file = self.file
         async with contextlib.AsyncExitStack() as stack:
-            cameras: dict[str, CameraSettings] = {}
-            frames: dict[str, FramesOf] = {}
-            for planned in self._plan:
-                url = planned.entry.url or await self._emulate(planned, stack)
-                cameras[planned.name] = planned.entry.settings(planned.name, url)
-                entry = planned.entry.frames
-                if entry is not None:
-                    make = functools.partial(entry.source, self._folder)
-                    make()  # what cannot work is told now
-                    frames[planned.name] = FramesOf(make, FrameAddress.parse(entry.url).shown)
+            sources: dict[str, CameraSource] = {}
+            self.reloads = Reloader(self._folder, self.reloads.now, self._source)
+            self.reloads.sources = sources
+            stack.push_async_callback(_end_emulators, sources)
+            for name, planned in self.reloads.now.plan.items():
+                sources[name] = await self._source(planned, self._folder)
             history = (file.history.results, file.history.bytes)
             agent = Agent(
                 file.agent_name,
                 Keys(file.fleet),
                 self._bus,
-                cameras,
+                {name: source.settings for name, source in sources.items()},
                 history=history,
                 on_event=self._tell,
-                frames=frames,
+                frames={name: source.frames for name, source in sources.items() if source.frames},
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
+            service = ReloadService(agent, self._bus, Keys(file.fleet), self.reload)
+            stack.push_async_callback(self.reloads.close)
+            stack.callback(service.close)
             if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus, cameras))
+                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
             self._agent, self._stack = agent, stack.pop_all()
 
     def _more(self) -> dict[str, Any]:
@@ -114,17 +120,11 @@ class FleetServer(Server):
 
         return dict(SETTINGS)
 
-    def _ros_frames(self, entry: FramesEntry) -> dict[str, Any]:
-        found: dict[str, Any] = {"video_device": masked(entry.url)}
-        if entry.camera_info is not None:
-            found["camera_info_url"] = (self._folder / entry.camera_info).absolute().as_uri()
-        return found
-
-    def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
+    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
 
         file, own = self.file, self.file.agent_name
-        said = {planned.name: planned.entry.ros2 for planned in self._plan}
+        said = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
         found = {name: one.load_calibration(self._folder) for name, one in said.items()}
         return RosFleet(
             bus,
@@ -132,12 +132,8 @@ class FleetServer(Server):
             self.address,
             file.ros2 or RosSection.model_validate({}),
             cameras=said,
-            settings=cameras,
-            frames={
-                planned.name: self._ros_frames(planned.entry.frames)
-                for planned in self._plan
-                if planned.entry.frames is not None
-            },
+            settings=self._settings,
+            frames=self._ros_frames,
             calibrations={name: one for name, one in found.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
         )
@@ -148,6 +144,49 @@ class FleetServer(Server):
         await self._stack.aclose()
         for stream in self._events:
             stream.end(None)
+
+    async def reload(self, file: str | Path | FleetFile | None = None) -> FleetChanges:
+        """Read the fleet file again, and do as it says now; cameras that did not change go on.
+
+        Those keep their sessions, and what is under way ends as if nothing was. A camera that
+        changed is closed and opened again, one that is new is shared at once, whether it is
+        connected or not. Only ``cameras`` can be changed; another field wants a restart. Several
+        at a time are done one after the other.
+
+        Args:
+            file: another file, or what stands in it; None for the one that it was made with.
+
+        Returns:
+            What has changed.
+
+        Raises:
+            ConfigurationError: the file is wrong, or changes what wants a restart; says where. All
+                stays as it was.
+            ConnectionClosedError: it is not started, or it ends.
+
+        Cancellation: nothing has changed; or all of it is changed, also when nobody waits for it.
+        """
+        if self._agent is None:
+            raise ConnectionClosedError("the agent is not started: there is nothing to reload")
+        return await self.reloads.reload(self._agent, self._given if file is None else file)
+
+    async def _source(self, planned: Planned, folder: Path) -> CameraSource:
+        """Return what a camera's session is made of; an emulated one is started.
+
+        Raises:
+            SmartCamError: it cannot be.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            entry = planned.entry
+            url = entry.url or await self._emulate(planned, stack)
+            settings, frames = entry.settings(planned.name, url), None
+            if entry.frames is not None:
+                make = functools.partial(entry.frames.source, folder)
+                make()  # what cannot work is told now
+                frames = FramesOf(make, FrameAddress.parse(entry.frames.url).shown)
+            self._settings[planned.name] = settings
+            self._ros_frames[planned.name] = _ros_frames(entry.frames, folder)
+            return CameraSource(settings, frames, stack.pop_all())
 
     async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
         """Start an emulated camera; return its URL."""
@@ -189,6 +228,21 @@ class FleetServer(Server):
             stream.offer(event, 0.0)
 
     @property
+    def file(self) -> FleetFile:
+        """What stands in its file, as it was read last."""
+        return self.reloads.now.file
+
+    @property
+    def agent(self) -> Agent | None:
+        """The agent, None before it is started."""
+        return self._agent
+
+    @property
+    def bus_bytes(self) -> int:
+        """Bytes that wait to be said on the bus."""
+        return self._bus.waiting_bytes
+
+    @property
     def name(self) -> str:
         """The agent's name."""
         return "" if self._agent is None else self._agent.name
@@ -212,7 +266,22 @@ class FleetServer(Server):
     def urls(self) -> dict[str, str]:
         """The fleet URLs of its cameras, by name."""
         address = self.address
-        return {planned.name: address.of(planned.name).url for planned in self._plan}
+        return {name: address.of(name).url for name in self.reloads.now.plan}
+
+
+def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
+    """Return where frames come from as parameters of v4l2_camera."""
+    if entry is None:
+        return {}
+    found: dict[str, Any] = {"video_device": masked(entry.url)}
+    if entry.camera_info is not None:
+        found["camera_info_url"] = (folder / entry.camera_info).absolute().as_uri()
+    return found
+
+
+async def _end_emulators(sources: dict[str, CameraSource]) -> None:
+    for source in sources.values():
+        await source.emulator.aclose()
 
 
 def address_of(endpoint: str, file: FleetFile) -> FleetAddress:

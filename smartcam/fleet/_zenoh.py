@@ -79,6 +79,10 @@ class ZenohEnd(ZenohSession, Bus):
 
     # ------------------------------------------------------------------ what is said
 
+    @property
+    def waiting_bytes(self) -> int:
+        return self._sending
+
     def put(self, key: str, payload: bytes) -> None:
         session = self._session
         if session is None:

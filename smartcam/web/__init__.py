@@ -22,9 +22,18 @@ if TYPE_CHECKING:
     from smartcam.web._emulator import EmulatorSite
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
+    from smartcam.web._operations import OperationsSite
     from smartcam.web._wizard import WizardSite
 
-__all__ = ["CloudSite", "ColourSite", "EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
+__all__ = [
+    "CloudSite",
+    "ColourSite",
+    "EmulatorSite",
+    "FramesSite",
+    "LiveSite",
+    "OperationsSite",
+    "WizardSite",
+]
 
 _resolve = lazy(
     __name__,
@@ -34,6 +43,7 @@ _resolve = lazy(
         "_emulator": "EmulatorSite",
         "_frames": "FramesSite",
         "_live": "LiveSite",
+        "_operations": "OperationsSite",
         "_wizard": "WizardSite",
     },
 )

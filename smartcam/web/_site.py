@@ -6,7 +6,7 @@ import asyncio
 import importlib.resources
 import logging
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from aiohttp import web
 
@@ -80,7 +80,7 @@ class Site(Server):
         self._page = page
         self._files = ("base.css", "base.js", f"{page}.css", f"{page}.js", *files)
         self._port = port
-        self._open: _Open | None = None
+        self._open: OpenPort | None = None
 
     @property
     def port(self) -> int:
@@ -117,10 +117,10 @@ class Site(Server):
             access_log=None,
             shutdown_timeout=FAREWELL,
             keepalive_timeout=KEEP_ALIVE,
-            logger=_Calm(_log),
+            logger=calm(_log),
         )
         try:
-            listener = await _listen(self.host, self._port, local=self.token is None)
+            listener = await listening(self.host, self._port, local=self.token is None)
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(f"web: cannot listen on {self.api}: {exc}") from exc
         try:
@@ -130,7 +130,7 @@ class Site(Server):
             await runner.cleanup()
             raise
         self._port = listener.getsockname()[1]
-        self._open = _Open(runner, listener)
+        self._open = OpenPort(runner, listener)
 
     async def stop(self) -> None:
         """Close the port, every stream and every connection; does nothing if stopped.
@@ -161,7 +161,7 @@ class Site(Server):
         return application
 
 
-class _Open:
+class OpenPort:
     """A site's port while it is open.
 
     Not aiohttp's: that takes as many connections as come, and ``asyncio.Server`` fills the log
@@ -194,6 +194,11 @@ class _Calm(logging.LoggerAdapter[logging.Logger]):
         super().log(min(level, logging.INFO), msg, *args, **kwargs)
 
 
+def calm(logger: logging.Logger) -> logging.Logger:
+    """Return what aiohttp logs to, as if it was ``logger``."""
+    return cast("logging.Logger", _Calm(logger))
+
+
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:
     response.headers.update(HEADERS)
 
@@ -209,7 +214,7 @@ def _file(name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
     return serve
 
 
-async def _listen(host: str, port: int, *, local: bool) -> socket.socket:
+async def listening(host: str, port: int, *, local: bool = False) -> socket.socket:
     """Return a listening socket.
 
     Raises:

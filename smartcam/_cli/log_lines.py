@@ -1,0 +1,184 @@
+"""A log as lines of JSON, for programs that collect logs; ``docs/operations.md`` has the fields.
+
+Any thread may log. A line is put into a bounded queue, and a thread writes it: where nobody reads
+the pipe, that thread waits, and nobody else. What finds no room is dropped and counted, and told as
+soon as there is room.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import queue
+import select
+import threading
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Container, Iterator
+
+MOST_WAITING = 10_000
+"""Lines that wait for being written."""
+
+MOST_TEXT = 1 << 16
+"""Characters of a message, or of an exception's text; what is longer is cut."""
+
+FAREWELL = 1.0
+"""Seconds that the last lines may take at the end."""
+
+FIELDS = ("time", "level", "logger", "message", "agent", "camera", "exception", "dropped")
+"""Of a line, in this order; the last two stand there where there is something to say."""
+
+
+class JsonLines(logging.Formatter):
+    """Makes a record a line.
+
+    Args:
+        agent: returns the agent's name.
+        cameras: returns the names of its cameras.
+    """
+
+    def __init__(self, agent: Callable[[], str], cameras: Callable[[], Container[str]]) -> None:
+        super().__init__()
+        self._agent, self._cameras = agent, cameras
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        try:
+            message = record.getMessage()
+        except Exception as exc:  # noqa: BLE001 - arguments that do not fit are somebody's mistake
+            message = f"{record.msg!r} {record.args!r} ({exc})"
+        fields: dict[str, Any] = {
+            "time": _time(record.created),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": message[:MOST_TEXT],
+            "agent": self._agent() or None,
+            "camera": self._camera(record),
+        }
+        if record.exc_info and record.exc_info[0] is not None:
+            fields["exception"] = self.formatException(record.exc_info)[-MOST_TEXT:]
+        elif record.exc_text:
+            fields["exception"] = record.exc_text[-MOST_TEXT:]
+        return json.dumps(fields)
+
+    def _camera(self, record: logging.LogRecord) -> str | None:
+        """Return the camera that a record is about: whose name it has as an argument, if any."""
+        said = getattr(record, "camera", None)
+        if isinstance(said, str):
+            return said
+        cameras = self._cameras()
+        given = record.args if isinstance(record.args, tuple) else ()
+        for one in given[:2]:
+            name = one if isinstance(one, str) else str(one) if isinstance(one, Exception) else ""
+            for part in (name, name.partition(": ")[0]):
+                if part and part in cameras:
+                    return part
+        return None
+
+
+def _time(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
+
+
+class LineHandler(logging.Handler):
+    """Has a thread write lines to a file; never waits for it.
+
+    Args:
+        descriptor: of the file.
+        most: lines that wait.
+
+    Attributes:
+        dropped: lines that found no room.
+    """
+
+    def __init__(self, descriptor: int, most: int = MOST_WAITING) -> None:
+        super().__init__()
+        self.dropped: int = 0
+        self._told = 0
+        self._descriptor = descriptor
+        self._lines: queue.Queue[str | None] = queue.Queue(most)
+        self._ending = threading.Event()
+        self._over = threading.Event()
+        # not to be waited for at the end of the process: it may hang in a pipe
+        self._thread = threading.Thread(target=self._write_all, name="smartcam.log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Take a record."""
+        try:
+            self._lines.put_nowait(self.format(record))
+        except queue.Full:
+            self.dropped += 1  # the handler's lock is held
+        except Exception:  # noqa: BLE001 - the last place
+            self.handleError(record)
+
+    def close(self) -> None:
+        """Write what waits, in bounded time. Idempotent."""
+        if not self._ending.is_set():
+            self._ending.set()
+            with contextlib.suppress(queue.Full):
+                self._lines.put_nowait(None)  # wakes the thread; one that is busy sees it anyway
+            self._over.wait(FAREWELL)
+        super().close()
+
+    def _write_all(self) -> None:
+        try:
+            while not (self._ending.is_set() and self._lines.empty()):
+                line = self._lines.get()
+                if line is not None:
+                    self._write(line)
+                if (dropped := self.dropped) > self._told:
+                    self._write(self._lost(dropped - self._told))
+                    self._told = dropped
+        except OSError:
+            pass  # nobody reads any more
+        finally:
+            self._over.set()
+
+    def _lost(self, count: int) -> str:
+        made = {"name": "smartcam.log", "levelno": logging.WARNING, "levelname": "WARNING"}
+        text = f"{count} lines of this log were dropped: they were not read fast enough"
+        fields = json.loads(self.format(logging.makeLogRecord({**made, "msg": text})))
+        return json.dumps({**fields, "dropped": count})
+
+    def _write(self, line: str) -> None:
+        left = memoryview(f"{line}\n".encode())
+        while left:
+            try:
+                left = left[os.write(self._descriptor, left) :]
+            except BlockingIOError:  # somebody has made it so
+                select.select([], [self._descriptor], [], 1.0)
+
+
+@contextlib.contextmanager
+def json_log(
+    level: int,
+    agent: Callable[[], str],
+    cameras: Callable[[], Container[str]],
+    *,
+    descriptor: int = 2,
+    most: int = MOST_WAITING,
+) -> Iterator[LineHandler]:
+    """In here everything that is logged in this process is written as lines of JSON."""
+    root = logging.getLogger()
+    handlers, before = root.handlers[:], root.level
+    handler = LineHandler(descriptor, most)
+    handler.setFormatter(JsonLines(agent, cameras))
+    for one in handlers:
+        root.removeHandler(one)
+    root.addHandler(handler)
+    root.setLevel(level)
+    logging.captureWarnings(True)
+    try:
+        yield handler
+    finally:
+        logging.captureWarnings(False)
+        root.removeHandler(handler)
+        root.setLevel(before)
+        for one in handlers:
+            root.addHandler(one)
+        handler.close()
