@@ -20,6 +20,7 @@ from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
+from smartcam.observers import Observer
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
@@ -44,6 +45,11 @@ class FleetServer(Server):
         bus: an end of another bus than the file says.
         folder: that paths in it are in, where it is not a path itself.
 
+    Attributes:
+        file: what stands in it.
+        folder: that paths in it are in.
+        observers: see what its sessions see; put some in before it is started.
+
     Raises:
         ConfigurationError: something in it cannot work.
         MissingExtraError: PyYAML, or the bus' engine, is not installed.
@@ -53,7 +59,8 @@ class FleetServer(Server):
         self, file: str | Path | FleetFile, *, bus: Bus | None = None, folder: Path | None = None
     ) -> None:
         self.file: FleetFile = file if isinstance(file, FleetFile) else load_fleet(file)
-        self._folder = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
+        self.observers: list[Observer] = []
+        self.folder: Path = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
             self._plan = self.file.plan()
         except ValueError as exc:
@@ -86,7 +93,7 @@ class FleetServer(Server):
                 cameras[planned.name] = planned.entry.settings(planned.name, url)
                 entry = planned.entry.frames
                 if entry is not None:
-                    make = functools.partial(entry.source, self._folder)
+                    make = functools.partial(entry.source, self.folder)
                     make()  # what cannot work is told now
                     frames[planned.name] = FramesOf(make, FrameAddress.parse(entry.url).shown)
             history = (file.history.results, file.history.bytes)
@@ -98,6 +105,7 @@ class FleetServer(Server):
                 history=history,
                 on_event=self._tell,
                 frames=frames,
+                observers=self.observers,
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
@@ -118,7 +126,7 @@ class FleetServer(Server):
 
         file, own = self.file, self.file.agent_name
         said = {planned.name: planned.entry.ros2 for planned in self._plan}
-        found = {name: one.load_calibration(self._folder) for name, one in said.items()}
+        found = {name: one.load_calibration(self.folder) for name, one in said.items()}
         return RosFleet(
             bus,
             file.fleet,
@@ -150,7 +158,7 @@ class FleetServer(Server):
         if emulated.scenario is None:
             camera = EmulatedCamera(seed=seed)
         else:
-            scenario = load_scenario(self._folder / emulated.scenario)
+            scenario = load_scenario(self.folder / emulated.scenario)
             scenario = scenario.model_copy(update={"seed": seed})
             camera = emulated_class(scenario.protocol).from_scenario(scenario, host="127.0.0.1")
         await stack.enter_async_context(camera)

@@ -44,6 +44,13 @@ CAMERA_METADATA = "smartcam.camera"
 """Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
 told; a later one goes before an earlier one."""
 
+STATE_METADATA = "smartcam.state"
+"""Name of the metadata records that say what a camera was at their place in the file: where a file
+begins while there is a session, and behind a gap."""
+
+GAP = "RecordingGap"
+"""What :class:`RecordedError` has for a class where records were not written."""
+
 MAX_MESSAGE = 1 << 26
 """Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
 room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
@@ -70,6 +77,9 @@ class RecordedError(NamedTuple):
         error: name of the exception's class.
         text: what it says.
         triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+        since: of a gap (``error`` is ``RecordingGap``): when the first record came that was not
+            written, UTC; ``at`` is when the last did. None of other errors.
+        records: of a gap: how many were not written. None of other errors.
     """
 
     camera: str
@@ -77,6 +87,76 @@ class RecordedError(NamedTuple):
     error: str
     text: str
     triggered_at: datetime | None
+    since: datetime | None = None
+    records: int | None = None
+
+
+class RecordedState(NamedTuple):
+    """What a camera was at a place in the file.
+
+    Attributes:
+        camera: name of the camera.
+        connected: there was a session.
+        application: id of the active one, None where it was not known.
+        status: None where it was not known.
+        endian: that the last status told.
+        at: when, UTC; None until it is written.
+    """
+
+    camera: str
+    connected: bool = False
+    application: int | None = None
+    status: Status | None = None
+    endian: int = 0
+    at: datetime | None = None
+
+    def after(self, event: CameraEvent) -> RecordedState:
+        """Return what it is after an event."""
+        match event:
+            case Connected() | Reconnected():
+                return self._replace(connected=True)
+            case Disconnected():
+                return RecordedState(self.camera)
+            case StatusChanged(status=status):
+                return self._replace(status=status)
+            case ApplicationChanged(application=application):
+                return self._replace(application=application)
+            case _:
+                return self
+
+    def facts(self, endian: int) -> dict[str, str]:
+        """Return what stands in the file, now."""
+        found = {
+            "camera": self.camera,
+            "at": datetime.now(UTC).isoformat(),
+            "connected": "yes" if self.connected else "no",
+            "endian": str(endian),
+        }
+        if self.application is not None:
+            found["application"] = str(self.application)
+        if self.status is not None:
+            found["status"] = str(int(self.status))
+        return found
+
+    @classmethod
+    def of(cls, facts: Mapping[str, str]) -> RecordedState:
+        """Return what stands in a file.
+
+        Raises:
+            ValueError: it is none.
+        """
+        application, status = facts.get("application"), facts.get("status")
+        camera, endian = facts.get("camera", ""), facts.get("endian", "0")
+        if not 1 <= len(camera) <= MAX_NAME or endian not in {"0", "1"}:
+            raise ValueError(f"a state of camera {camera!r:.60}, endian {endian!r:.20}")
+        return cls(
+            camera,
+            facts.get("connected") == "yes",
+            None if application is None else int(application),
+            None if status is None else Status(int(status)),
+            int(endian),
+            _time(facts.get("at", "")),
+        )
 
 
 Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError
@@ -323,6 +403,8 @@ def _error(fields: dict[str, Any]) -> RecordedError:
         _get(fields, "error", str),
         _get(fields, "text", str),
         _optional_when(fields, "triggered_at"),
+        _optional_when(fields, "since"),
+        _optional(fields, "records", int),
     )
 
 
@@ -418,6 +500,8 @@ KINDS: dict[str, Kind] = {
             "error": _text("name of the exception's class"),
             "text": _text("what it says"),
             "triggered_at": _TRIGGERED_AT,
+            "since": _when("RecordingGap: since when records were not written"),
+            "records": _integer("RecordingGap: how many were not written"),
         },
         ("camera", "at", "error", "text"),
         _object,
