@@ -383,6 +383,7 @@ class RecordingFile:
 
     def note(self, name: str, facts: dict[str, str]) -> None:
         """Write facts under a name, behind what was added."""
+        self._writer.flush()  # the chunk, which would stand behind it
         self._writer.add_metadata(name, facts)
 
     def check(self) -> None:
