@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,8 +13,10 @@ from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam.models import Connected, Disconnected, Reconnected
 
 if TYPE_CHECKING:
+    from smartcam.exceptions import RecordingError
     from smartcam.fleet import FleetServer
     from smartcam.models import CameraEvent
+    from smartcam.recording import FleetRecorder
 
 
 @click.command(
@@ -34,15 +38,49 @@ async def serve(file: str | None, schema: bool, options: Options) -> None:
         return
     if file is None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
-    async with smartcam.fleet.serve(file) as server:
-        await server.wait_tried()
-        events = server.events()
-        for name in server.hosts:
-            value = _camera(server, name)
-            why = "" if value["connected"] else f"  not connected: {value['reason']}"
-            options.show(value, f"{value['url']}{why}")
-        async for event in events:
-            tell(server, event, options)
+    server = smartcam.fleet.serve(file)
+    async with contextlib.AsyncExitStack() as stack:
+        if server.file.record is not None:
+            await stack.enter_async_context(_recorder(server, options))
+        await share(await stack.enter_async_context(server), options)
+
+
+def _recorder(server: FleetServer, options: Options) -> FleetRecorder:
+    """Return what records the cameras, and says where it cannot."""
+    from smartcam.recording import FleetRecorder
+
+    def say(trouble: RecordingError | None) -> None:
+        lost = {name: one.lost for name, one in recorder.accounts.items() if one.lost}
+        value = {
+            "recordings": str(recorder.path),
+            "recording": trouble is None,
+            "reason": None if trouble is None else str(trouble),
+            "lost": lost,
+            "at": datetime.now(UTC),
+        }
+        if trouble is None:
+            text = f"recorded again; {sum(lost.values())} records were not written"
+        else:
+            text = f"{trouble}; nothing is recorded until it is better"
+        if options.as_json:
+            options.show(value, "")
+        else:
+            click.echo(f"{datetime.now():%H:%M:%S} {text}", err=True)
+
+    recorder = FleetRecorder(server, on_trouble=say)
+    return recorder
+
+
+async def share(server: FleetServer, options: Options) -> None:
+    """Say where the cameras of a started agent are, and what comes and goes, until it is cut off."""
+    await server.wait_tried()
+    events = server.events()
+    for name in server.hosts:
+        value = _camera(server, name)
+        why = "" if value["connected"] else f"  not connected: {value['reason']}"
+        options.show(value, f"{value['url']}{why}")
+    async for event in events:
+        tell(server, event, options)
 
 
 def _camera(server: FleetServer, name: str) -> dict[str, Any]:

@@ -203,6 +203,7 @@ class _Hooks(Observer):
         y_down, lenient = (False, False) if entry is None else (entry.y_down, entry.lenient)
         track = self._writer.track(camera, _Reading(camera, spec, y_down, lenient).items)
         said = {
+            "fleet": file.fleet,
             "interpret_as": spec,
             "application": None if entry is None else entry.application,
             "y_down": y_down or None,

@@ -34,6 +34,7 @@ from smartcam.recording._recorder import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
     from smartcam.recording._folder import RecordingFolder
     from smartcam.recording._form import Item
 

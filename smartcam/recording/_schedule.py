@@ -227,8 +227,10 @@ def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
 
 
 class _Seams:
-    """Makes steps of what a recording says of its own: where it begins, and where something is
-    missing, so that nothing is taken for what it is not."""
+    """Makes steps of what a recording says of itself: where it begins, and what is missing.
+
+    So nothing is taken for what it is not.
+    """
 
     def __init__(self) -> None:
         self._whole = False  # what came before is known
@@ -254,9 +256,7 @@ class _Seams:
         return found
 
 
-def _steps(
-    items: Iterable[Item | RecordedState], dialect: FramedDialect
-) -> Iterator[_ReplayStep]:
+def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Iterator[_ReplayStep]:
     """Yield the steps among the items; their times never go back.
 
     Raises:
@@ -297,9 +297,7 @@ def _steps(
         yield step
 
 
-def _steps_without_frames(
-    items: Iterable[Item | RecordedState], endian: str
-) -> list[_ReplayStep]:
+def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) -> list[_ReplayStep]:
     """Return the steps of a camera of a fleet, of which there are results and events, in order.
 
     A trigger stands in front of the first of its results; one without a result is left out.
