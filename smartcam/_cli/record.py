@@ -238,10 +238,10 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
 @click.command(
     help="Emulate the recorded cameras: each trigger gets the recorded containers, byte for byte "
     "and after the same time, and what came by itself comes again. Prints one line per camera, its "
-    "URL. When a recording is over its triggers get no result, unless --loop. A folder that an agent "
-    "recorded (record: in its fleet file) is played as a fleet: its cameras under their names, through "
-    "an agent, whose fleet URLs are printed; --port is the agent's then. --from and --until are times "
-    "such as 2026-01-02T03:04:05, local unless they say Z or +01:00."
+    "URL. When a recording is over its triggers get no result, unless --loop. A folder that an "
+    "agent recorded (record: in its fleet file) is played as a fleet: its cameras under their "
+    "names, through an agent, whose fleet URLs are printed; --port is the agent's then. A TIME is "
+    "2026-01-02T03:04:05, by the local clock unless it ends in Z or +01:00."
 )
 @click.argument("recording", metavar="RUN.mcap|FOLDER", type=click.Path())
 @click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
@@ -275,7 +275,7 @@ async def replay(
 ) -> None:
     """Play a recording."""
     loaded = _loaded(recording, since, until)
-    if Path(recording).is_dir():
+    if loaded.files != (loaded.path,):
         if transport is not None:
             raise click.UsageError("--transport is for a file: programs come to a folder's agent")
         cameras = None if camera is None else [camera]

@@ -65,14 +65,14 @@ def _recorder(server: FleetServer, options: Options) -> FleetRecorder:
         if options.as_json:
             options.show(value, "")
         else:
-            click.echo(f"{datetime.now():%H:%M:%S} {text}", err=True)
+            click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} {text}", err=True)
 
     recorder = FleetRecorder(server, on_trouble=say)
     return recorder
 
 
 async def share(server: FleetServer, options: Options) -> None:
-    """Say where the cameras of a started agent are, and what comes and goes, until it is cut off."""
+    """Say where the cameras of a started agent are, and what comes and goes, until cut off."""
     await server.wait_tried()
     events = server.events()
     for name in server.hosts:

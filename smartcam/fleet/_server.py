@@ -20,7 +20,6 @@ from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
-from smartcam.observers import Observer
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._file import Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
+    from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
 OPEN_TIMEOUT = 10.0
@@ -123,6 +123,7 @@ class FleetServer(Server):
 
     def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
+    from smartcam.observers import Observer
 
         file, own = self.file, self.file.agent_name
         said = {planned.name: planned.entry.ros2 for planned in self._plan}

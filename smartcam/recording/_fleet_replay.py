@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 from typing import TYPE_CHECKING, Any
 
 from smartcam._server import Server
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
     from smartcam.fleet import FleetServer
     from smartcam.recording._reader import RecordedCamera, Recording
+    from smartcam.recording._replay import ReplayedCamera
+    from smartcam.recording._replay_lines import ReplayedLines
 
 
 class FleetReplay(Server):
@@ -59,7 +62,8 @@ class FleetReplay(Server):
         self._server: FleetServer | None = None
         self._stack = contextlib.AsyncExitStack()
         self.skipped: dict[str, str] = {}
-        self._played: dict[str, Any] = {}
+        self._played: dict[str, ReplayedCamera | ReplayedLines] = {}
+        self._on_over = on_over
         for name in recording.cameras if cameras is None else cameras:
             try:
                 self._played[name] = replay(
@@ -67,15 +71,21 @@ class FleetReplay(Server):
                     camera=name,
                     speed=speed,
                     loop=loop,
-                    on_over=lambda name=name: on_over(name),
+                    on_over=functools.partial(self._over, name),
                 )
             except ConfigurationError as exc:
                 if cameras is not None:
                     raise
                 self.skipped[name] = str(exc)
+        # of these nothing will ever be left
+        self._silent = {name for name, one in self._played.items() if not one.remaining}
         if not self._played:
             why = "; ".join(self.skipped.values()) or "no camera is in it"
             raise ConfigurationError(f"recording {recording.path}: nothing can be played: {why}")
+
+    def _over(self, name: str) -> None:
+        if name not in self._silent:
+            self._on_over(name)
 
     @property
     def server(self) -> FleetServer:
