@@ -123,7 +123,6 @@ class FleetServer(Server):
 
     def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
-    from smartcam.observers import Observer
 
         file, own = self.file, self.file.agent_name
         said = {planned.name: planned.entry.ros2 for planned in self._plan}

@@ -268,9 +268,9 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
     for item in items:
         if isinstance(item, RecordedState) and item.at is not None:
             at = max(at, item.at.timestamp())
-        for step in seams.steps(item, at):
-            active = step.number if step.what is _What.NAMED else active
-            yield step
+        for seam in seams.steps(item, at):
+            active = seam.number if seam.what is _What.NAMED else active
+            yield seam
         if isinstance(item, Disconnected):
             yield _ReplayStep(at, _What.LOST)
         if not isinstance(item, TraceEntry) or item.fields is None:
