@@ -15,7 +15,8 @@ from smartcam.models import CameraEvent, Result, StatusChanged
 from smartcam.observers import Observer, TraceEntry
 from smartcam.protocols.messages import ResultContainer
 from smartcam.recording._folder import RecordingFolder
-from smartcam.recording._folder_writer import Clocks, FolderWriter, Limits, RecordingAccount, Track
+from smartcam.recording._folder_files import Clocks, Limits
+from smartcam.recording._folder_writer import FolderWriter
 from smartcam.recording._form import RecordedError, load_extra
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet import FleetServer
     from smartcam.fleet._recording_file import RecordSection
+    from smartcam.recording._folder_track import RecordingAccount, Track
     from smartcam.recording._form import Item
 
 
@@ -89,7 +91,7 @@ class FleetRecorder(Server):
 
         Cancellation: leaves it stopped.
         """
-        if self._writer is not None:
+        if self._observer is not None:
             return
         if self._server.hosts:
             raise ConfigurationError(

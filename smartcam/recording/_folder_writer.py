@@ -7,20 +7,19 @@ told in the files as soon as there is one that takes it.
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import logging
 import os
 import shutil
 import threading
-import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
-from smartcam.recording._form import GAP, STATE_METADATA, RecordedError, RecordedState
+from smartcam.recording._folder_files import Clocks, FolderFiles, Limits
+from smartcam.recording._folder_track import Gap, Track
 from smartcam.recording._recorder import (
     CHUNK,
     CLOSE_TIMEOUT,
@@ -28,14 +27,13 @@ from smartcam.recording._recorder import (
     MAX_WAITING,
     OVERHEAD,
     Description,
-    RecordingFile,
-    opened,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.recording._folder import RecordingFolder
+    from smartcam.recording._folder_track import RecordingAccount
     from smartcam.recording._form import Item
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
@@ -46,143 +44,8 @@ ROOM = 4 * CHUNK
 RETRIES = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that did not take something is tried again; the last for ever."""
 
-LOOK = 10.0
-"""Seconds after which it is looked again what is in the folder, where files are begun."""
-
-STEP = 64
-"""Items after which a file's size is looked at."""
-
 EVENT_ROOM = 2
 """How much more may wait before events are left out, too: they say what the camera is."""
-
-
-class RecordingAccount(NamedTuple):
-    """What became of a camera's records: frames, results, events and errors, all counted alike.
-
-    Attributes:
-        written: on the disk.
-        waiting: for the disk.
-        lost: not written: the disk was full, gone or too slow, or it could not be read back.
-    """
-
-    written: int = 0
-    waiting: int = 0
-    lost: int = 0
-
-
-class Limits(NamedTuple):
-    """When a file is over, and what is kept.
-
-    Attributes:
-        size: bytes of a file.
-        age: seconds that a file is written.
-        keep: bytes of all files.
-    """
-
-    size: float
-    age: float
-    keep: float
-
-
-class Clocks(NamedTuple):
-    """Where the time comes from.
-
-    Attributes:
-        wall: seconds since 1970, for names.
-        steady: seconds, for ages and delays.
-    """
-
-    wall: Callable[[], float] = time.time
-    steady: Callable[[], float] = time.monotonic
-
-
-@dataclass(eq=False)
-class Gap:
-    """Records that were not written.
-
-    Attributes:
-        since: when the first of them came.
-        until: when the last of them came.
-        count: how many.
-        reason: why.
-    """
-
-    since: datetime
-    until: datetime
-    count: int
-    reason: str
-
-    def error(self, camera: str) -> RecordedError:
-        """Return what stands in the file."""
-        text = (
-            f"{self.count} records from {self.since.isoformat()} to {self.until.isoformat()} were "
-            f"not written: {self.reason}"
-        )
-        return RecordedError(camera, self.until, GAP, text, None, self.since, self.count)
-
-
-class Track:
-    """What is recorded of one camera.
-
-    Args:
-        camera: its name.
-        read: makes items of what was put in, in the thread.
-
-    Attributes:
-        endian: that its last status told.
-        offered: records that came.
-        written: records on the disk.
-        lost: records that are not, and will not be.
-        overflow: the gap that grows where too much waits; None where nothing is left out.
-    """
-
-    def __init__(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> None:
-        self.camera = camera
-        self.read = read
-        self.offered = self.written = self.lost = 0
-        self.overflow: Gap | None = None
-        self.state = RecordedState(camera)
-        self.endian = 0
-        self.facts: dict[str, str] = {"camera": camera}
-        self.gap: Gap | None = None  # not told in a file that is on the disk
-        self.gap_told = False  # it is in the file's next chunk
-        self.file: RecordingFile | None = None
-        self.begun = 0.0  # when the file was, on the steady clock
-        self.good = 0  # bytes of the file that are on the disk
-
-    @property
-    def account(self) -> RecordingAccount:
-        """What became of its records."""
-        offered, written, lost = self.offered, self.written, self.lost
-        return RecordingAccount(written, max(0, offered - written - lost), lost)
-
-    def lose(self, given: list[Any], reason: str) -> None:
-        """Count what was put in and is not written; what it says of the camera is kept."""
-        for one in given:
-            if isinstance(one, Description):
-                self.facts |= one.facts
-            elif isinstance(one, Gap):
-                self._widen(one)  # it is counted
-            else:
-                self.follow(one)
-                self.lose_one(reason)
-
-    def lose_one(self, reason: str) -> None:
-        """Count a record that is not written."""
-        at = datetime.now(UTC)
-        self.lost += 1
-        self._widen(Gap(at, at, 1, reason))
-
-    def follow(self, item: object) -> None:
-        """Keep what an item says of the camera."""
-        if isinstance(item, CameraEvent):
-            self.state = self.state.after(item)
-
-    def _widen(self, more: Gap) -> None:
-        if self.gap is None:
-            self.gap = replace(more)
-        else:
-            self.gap.until, self.gap.count = more.until, self.gap.count + more.count
 
 
 @dataclass(eq=False)
@@ -226,16 +89,14 @@ class FolderWriter:
         tell: Callable[[RecordingError | None], None],
         clocks: Clocks | None = None,
     ) -> None:
-        self._folder, self._limits, self._mcap, self._tell = folder, limits, mcap, tell
-        self._clocks = clocks or Clocks()
+        self._folder, self._tell, self._clocks = folder, tell, clocks or Clocks()
+        self._files = FolderFiles(folder, limits, mcap, self._clocks)
         self._more = threading.Condition()
         self._waiting = _Waiting()
         self._closing = False
         self._tracks: dict[str, Track] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
-        self._looked = 0.0
-        self._stuck: set[str] = set()  # files that could not be deleted
 
     # ------------------------------------------------------------------ from any thread
 
@@ -270,12 +131,12 @@ class FolderWriter:
             size: its bytes.
             event: it says what the camera is.
         """
-        waiting = self._waiting
         with self._more:
+            waiting = self._waiting
             track.offered += 1
             room = MAX_WAITING * EVENT_ROOM if event else MAX_WAITING
             if self._closing or waiting.bytes > room:
-                self._leave_out(track)
+                self._leave_out(track, given)
                 return
             before = waiting.bytes
             waiting.items.append((track, given))
@@ -283,13 +144,17 @@ class FolderWriter:
             if not before or before < CHUNK <= waiting.bytes:
                 self._more.notify()
 
-    def _leave_out(self, track: Track) -> None:
+    def _leave_out(self, track: Track, given: Any) -> None:
         at = datetime.now(UTC)
-        track.lost += 1
+        track.left_out += 1
         if track.overflow is None:
             track.overflow = Gap(at, at, 0, "the disk is too slow")
             self._waiting.items.append((track, track.overflow))
-        track.overflow.until, track.overflow.count = at, track.overflow.count + 1
+        gap = track.overflow
+        gap.until, gap.count = at, gap.count + 1
+        if isinstance(given, CameraEvent):
+            gap.events.pop(type(given), None)
+            gap.events[type(given)] = given
 
     def start(self) -> None:
         """Enter the folder and start the thread. It blocks for as long as the disk wants.
@@ -298,7 +163,7 @@ class FolderWriter:
             ConfigurationError: another recorder writes in the folder.
         """
         try:
-            self._folder.enter()
+            self._files.enter()
         except OSError as exc:
             self._fail(exc)
         self._thread = threading.Thread(
@@ -330,8 +195,8 @@ class FolderWriter:
                 items, over = self._take()
                 self._write(items)
         finally:
-            for track in self._tracks.values():
-                self._finish(track)
+            for track in self._all_tracks():
+                self._files.finish(track)
             self._folder.leave()
 
     def _take(self) -> tuple[dict[Track, list[Any]], bool]:
@@ -354,9 +219,10 @@ class FolderWriter:
         try:
             if self._ready(found):
                 for track, given in found.items():
-                    self._write_track(track, given)
-                self._end_old()
-                self._delete_old()
+                    self._files.write(track, given)
+                tracks = self._all_tracks()
+                self._files.end_old(tracks)
+                self._files.delete_old(tracks)
                 if found:
                     self._heal()
         except (OSError, ConfigurationError) as exc:
@@ -381,165 +247,14 @@ class FolderWriter:
             return True
         if now < trouble.again or not found:
             return False
-        self._folder.enter()
-        self._looked = now
+        self._files.enter()
         if trouble.full and shutil.disk_usage(self._folder.path).free < ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return True
 
-    def _write_track(self, track: Track, given: list[Any]) -> None:
-        """Write what came of a camera; what is on the disk is taken out of ``given``.
-
-        Raises:
-            OSError: the disk did not take the rest.
-        """
-        done = written = 0
-        try:
-            for place, one in enumerate(given):
-                if track.file is None or (not place % STEP and self._is_over(track)):
-                    self._flush(track, written)
-                    done, written = place, 0
-                    self._begin(track)
-                written += self._add(track, one)
-            self._flush(track, written)
-            done = len(given)
-        except BaseException:
-            self._cut(track)
-            raise
-        finally:
-            del given[:done]
-
-    def _is_over(self, track: Track) -> bool:
-        aged = self._clocks.steady() - track.begun >= self._limits.age
-        return track.file is not None and (aged or track.file.size >= self._limits.size)
-
-    def _add(self, track: Track, one: Any) -> int:
-        """Add what was put in to the file; return how many records that were."""
-        file = track.file
-        if file is None:  # not so: it was begun
-            return 0
-        if track.gap is not None and not track.gap_told:
-            self._add_gap(track, file, track.gap)
-            track.gap_told = True
-        if isinstance(one, Gap):
-            self._add_gap(track, file, one)
-            return 0
-        if isinstance(one, Description):
-            track.facts |= one.facts
-            file.add(Description(track.facts))
-            return 0
-        written = records = 0
-        for item in track.read(one):
-            records += 1
-            try:
-                file.add(item)
-            except (ValueError, TypeError, RecursionError) as exc:  # nobody could read it back
-                track.lose_one(str(exc))
-            else:
-                written += 1
-            track.follow(item)
-        track.offered += records - 1  # a result that cannot be read is an error, too
-        return written
-
-    @staticmethod
-    def _add_gap(track: Track, file: RecordingFile, gap: Gap) -> None:
-        file.add(gap.error(track.camera))
-        file.note(STATE_METADATA, track.state.facts(track.endian))
-
-    def _begin(self, track: Track) -> None:
-        """Begin a camera's next file, and end the one before, if any.
-
-        Raises:
-            OSError: it cannot be made.
-        """
-        now = self._clocks.steady()
-        if now - self._looked > LOOK:
-            self._folder.look()
-            self._looked = now
-        path = self._folder.next_path(track.camera, self._clocks.wall())
-        file = RecordingFile(opened(path, overwrite=False), self._mcap, path)
-        try:
-            file.start()
-            file.add(Description(track.facts))
-            file.note(STATE_METADATA, track.state.facts(track.endian))
-            file.flush()
-        except BaseException:
-            file.close()
-            with contextlib.suppress(OSError):
-                path.unlink()
-            raise
-        self._folder.add(path)
-        before, track.file = track.file, file
-        track.begun, track.good = now, file.size
-        if before is not None:
-            self._end(before)
-
-    def _flush(self, track: Track, written: int) -> None:
-        """Have what was added put on the disk, and count it."""
-        file = track.file
-        if file is None:
-            return
-        file.flush()
-        file.check()
-        track.good = file.size
-        track.written += written
-        if track.gap_told:
-            track.gap, track.gap_told = None, False
-        self._folder.grown(file.path, file.size)
-
-    def _cut(self, track: Track) -> None:
-        """Leave a file with what is on the disk: its last chunk may be half of one."""
-        file, track.file = track.file, None
-        track.gap_told = False
-        if file is not None:
-            file.cut(track.good)
-            self._folder.grown(file.path, track.good)
-
-    def _end(self, file: RecordingFile) -> None:
-        """End a file; what of its index the disk does not take is left out."""
-        try:
-            file.finish()
-        finally:
-            file.close()
-            self._folder.grown(file.path, file.size)
-
-    def _finish(self, track: Track) -> None:
-        file, track.file = track.file, None
-        if file is not None:
-            try:
-                self._end(file)
-            except (OSError, ValueError) as exc:
-                file.cut(track.good)
-                logger.warning("%s has no end: %s", file.path, exc)
-
-    def _end_old(self) -> None:
-        """End files that are old enough, of cameras that say nothing."""
-        for track in self._tracks_now():
-            if self._is_over(track) and self._clocks.steady() - track.begun >= self._limits.age:
-                self._finish(track)
-
-    def _tracks_now(self) -> list[Track]:
+    def _all_tracks(self) -> list[Track]:
         with self._more:
             return [*self._tracks.values()]
-
-    # ------------------------------------------------------------------ the bound on the disk
-
-    def _delete_old(self) -> None:
-        """Delete the oldest files until what is left is within the bound."""
-        folder = self._folder
-        while folder.bytes > self._limits.keep:
-            found = [one for one in folder.files.values() if one.name not in self._stuck]
-            if not found:
-                return
-            oldest = min(found)
-            for track in self._tracks_now():
-                if track.file is not None and track.file.path.name == oldest.name:
-                    self._finish(track)  # it goes on in a new one
-            try:
-                folder.delete(oldest.name)
-            except OSError as exc:
-                self._stuck.add(oldest.name)
-                logger.warning("%s cannot be deleted: %s", folder.path / oldest.name, exc)
 
     # ------------------------------------------------------------------ trouble
 

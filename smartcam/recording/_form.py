@@ -44,10 +44,6 @@ CAMERA_METADATA = "smartcam.camera"
 """Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
 told; a later one goes before an earlier one."""
 
-STATE_METADATA = "smartcam.state"
-"""Name of the metadata records that say what a camera was at their place in the file: where a file
-begins while there is a session, and behind a gap."""
-
 GAP = "RecordingGap"
 """What :class:`RecordedError` has for a class where records were not written."""
 
@@ -89,74 +85,6 @@ class RecordedError(NamedTuple):
     triggered_at: datetime | None
     since: datetime | None = None
     records: int | None = None
-
-
-class RecordedState(NamedTuple):
-    """What a camera was at a place in the file.
-
-    Attributes:
-        camera: name of the camera.
-        connected: there was a session.
-        application: id of the active one, None where it was not known.
-        status: None where it was not known.
-        endian: that the last status told.
-        at: when, UTC; None until it is written.
-    """
-
-    camera: str
-    connected: bool = False
-    application: int | None = None
-    status: Status | None = None
-    endian: int = 0
-    at: datetime | None = None
-
-    def after(self, event: CameraEvent) -> RecordedState:
-        """Return what it is after an event."""
-        match event:
-            case Connected() | Reconnected():
-                return self._replace(connected=True)
-            case Disconnected():
-                return RecordedState(self.camera)
-            case StatusChanged(status=status):
-                return self._replace(status=status)
-            case ApplicationChanged(application=application):
-                return self._replace(application=application)
-            case _:
-                return self
-
-    def facts(self, endian: int) -> dict[str, str]:
-        """Return what stands in the file, now."""
-        found = {
-            "camera": self.camera,
-            "at": datetime.now(UTC).isoformat(),
-            "connected": "yes" if self.connected else "no",
-            "endian": str(endian),
-        }
-        if self.application is not None:
-            found["application"] = str(self.application)
-        if self.status is not None:
-            found["status"] = str(int(self.status))
-        return found
-
-    @classmethod
-    def of(cls, facts: Mapping[str, str]) -> RecordedState:
-        """Return what stands in a file.
-
-        Raises:
-            ValueError: it is none.
-        """
-        application, status = facts.get("application"), facts.get("status")
-        camera, endian = facts.get("camera", ""), facts.get("endian", "0")
-        if not 1 <= len(camera) <= MAX_NAME or endian not in {"0", "1"}:
-            raise ValueError(f"a state of camera {camera!r:.60}, endian {endian!r:.20}")
-        return cls(
-            camera,
-            facts.get("connected") == "yes",
-            None if application is None else int(application),
-            None if status is None else Status(int(status)),
-            int(endian),
-            _time(facts.get("at", "")),
-        )
 
 
 Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError
@@ -292,7 +220,12 @@ def _camera_name(fields: Mapping[str, Any]) -> str:
     return name
 
 
-def _time(text: str) -> datetime:
+def time_of(text: str) -> datetime:
+    """Return the time that a text says, UTC.
+
+    Raises:
+        ValueError: it is none, or has no time zone.
+    """
     at = datetime.fromisoformat(text)
     if at.tzinfo is None:
         raise ValueError(f"the time {text!r:.60} has no time zone")
@@ -300,12 +233,12 @@ def _time(text: str) -> datetime:
 
 
 def _when_of(fields: Mapping[str, Any], name: str) -> datetime:
-    return _time(_get(fields, name, str))
+    return time_of(_get(fields, name, str))
 
 
 def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
     text = _optional(fields, name, str)
-    return None if text is None else _time(text)
+    return None if text is None else time_of(text)
 
 
 def status_of(names: object) -> Status:

@@ -23,9 +23,7 @@ from smartcam.recording._form import (
     GAP,
     KINDS,
     MAX_CAMERAS,
-    STATE_METADATA,
     RecordedError,
-    RecordedState,
     count_values,
     message_fields,
 )
@@ -38,6 +36,7 @@ from smartcam.recording._records import (
     RecordReader,
     Schema,
 )
+from smartcam.recording._state import STATE_METADATA, RecordedState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sized

@@ -416,7 +416,9 @@ class RecordingFile:
 
     def close(self) -> None:
         """Close the file; what it does not take any more is dropped."""
-        with contextlib.suppress(OSError, ValueError):
+        if self._stream.closed:
+            return
+        with contextlib.suppress(OSError):
             self._size = self._stream.tell()
         with contextlib.suppress(OSError):
             self._stream.close()

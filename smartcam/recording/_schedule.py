@@ -25,7 +25,8 @@ from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Transport, Verdict
 from smartcam.protocols._bvs import BVS, HANDBOOK
-from smartcam.recording._form import GAP, RecordedError, RecordedState, status_of
+from smartcam.recording._form import GAP, RecordedError, status_of
+from smartcam.recording._state import RecordedState
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import is_fleet, parse_address
 
