@@ -70,6 +70,7 @@ class FleetServer(Server):
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
         self._ros: RosFleet | None = None
         self._agent: Agent | None = None
+        self._hosts: dict[str, Host] = {}
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
 
@@ -107,11 +108,16 @@ class FleetServer(Server):
                 frames=frames,
                 observers=self.observers,
             )
+            self._hosts = agent.hosts  # observers want them from their first result on
+            stack.callback(self._forget_hosts)
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
             if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
                 self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus, cameras))
             self._agent, self._stack = agent, stack.pop_all()
+
+    def _forget_hosts(self) -> None:
+        self._hosts = {}
 
     def _more(self) -> dict[str, Any]:
         """Return further settings of the engine."""
@@ -197,7 +203,7 @@ class FleetServer(Server):
     @property
     def hosts(self) -> dict[str, Host]:
         """Its cameras by name, empty before it is started."""
-        return {} if self._agent is None else self._agent.hosts
+        return self._hosts
 
     @property
     def address(self) -> FleetAddress:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.models import CameraEvent
+from smartcam.models import CameraEvent, Connected, Reconnected
 from smartcam.recording._form import GAP, RecordedError
-from smartcam.recording._recorder import Description
+from smartcam.recording._recorder import Description, address_facts
 from smartcam.recording._state import RecordedState
 
 if TYPE_CHECKING:
@@ -118,6 +118,8 @@ class Track:
         """Keep what an item says of the camera."""
         if isinstance(item, CameraEvent):
             self.state = self.state.after(item)
+        if isinstance(item, (Connected, Reconnected)):
+            self.facts |= address_facts(item.url)
 
     def follow_all(self, gap: Gap) -> None:
         """Keep what the events of a gap say of the camera."""

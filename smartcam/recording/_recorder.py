@@ -373,7 +373,7 @@ class RecordingFile:
                 self._message("errors", item.camera, item.at, item)
             case _:
                 if isinstance(item, (Connected, Reconnected)):
-                    self._describe({"camera": item.camera, **_address_facts(item.url)})
+                    self._describe({"camera": item.camera, **address_facts(item.url)})
                 self._message("events", item.camera, item.at, item)
 
     @property
@@ -456,7 +456,8 @@ class RecordingFile:
             self._writer.add_metadata(CAMERA_METADATA, now)
 
 
-def _address_facts(url: str) -> dict[str, str]:
+def address_facts(url: str) -> dict[str, str]:
+    """Return what an address says of a camera."""
     if is_fleet(url):  # its own dialect is known to the agent
         return {"url": url, "protocol": "fleet"}
     try:
