@@ -11,7 +11,9 @@ from pydantic import Field, PlainValidator, WithJsonSchema
 from smartcam.fleet._ros_file import Fields
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    Fits = Callable[[str, str], bool]
 
 BYTES: Mapping[str, int] = {
     "B": 1,
@@ -113,7 +115,9 @@ class RecordSection(Fields):
 
     def chooses(self, camera: str) -> bool:
         """Return whether a camera of this name is recorded."""
-        return any(_matches(one.split("/"), camera.split("/")) for one in self.cameras)
+        return any(
+            _matches(one.split("/"), camera.split("/"), "**", _part_fits) for one in self.cameras
+        )
 
     def path(self, folder: Path) -> Path:
         """Return the folder of the files.
@@ -137,15 +141,27 @@ def mistakes_of(section: RecordSection, folder: Path) -> Iterator[tuple[tuple[st
         yield ("record", "folder"), f"{path} is there, and is no folder"
 
 
-def _matches(pattern: list[str], parts: list[str]) -> bool:
-    if not pattern:
-        return not parts
-    head, *rest = pattern
-    if head == "**":
-        return any(_matches(rest, parts[place:]) for place in range(len(parts) + 1))
-    return bool(parts) and _fits(head, parts[0]) and _matches(rest, parts[1:])
+def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:
+    """Return whether items fit a pattern; ``many`` in it stands for any number of them."""
+    places = _passed({0}, pattern, many)
+    for item in items:
+        stayed = {place for place in places if place < len(pattern) and pattern[place] == many}
+        gone = {
+            place + 1
+            for place in places - stayed
+            if place < len(pattern) and fits(pattern[place], item)
+        }
+        places = _passed(stayed | gone, pattern, many)
+    return len(pattern) in places
 
 
-def _fits(pattern: str, part: str) -> bool:
-    text = ".*".join(map(re.escape, pattern.split("*")))
-    return re.fullmatch(text, part) is not None
+def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
+    """Return places in a pattern with those behind what may stand for nothing."""
+    for place, one in enumerate(pattern):
+        if place in places and one == many:
+            places = places | {place + 1}
+    return places
+
+
+def _part_fits(pattern: str, part: str) -> bool:
+    return _matches(pattern, part, "*", str.__eq__)

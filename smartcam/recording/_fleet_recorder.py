@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +16,7 @@ from smartcam.models import CameraEvent, Result, StatusChanged
 from smartcam.observers import Observer, TraceEntry
 from smartcam.protocols.messages import ResultContainer
 from smartcam.recording._folder import RecordingFolder
-from smartcam.recording._folder_files import Clocks, Limits
+from smartcam.recording._folder_files import Limits
 from smartcam.recording._folder_writer import FolderWriter
 from smartcam.recording._form import RecordedError, load_extra
 
@@ -68,14 +69,14 @@ class FleetRecorder(Server):
         section: RecordSection | None = None,
         *,
         on_trouble: Callable[[RecordingError | None], None] = lambda _: None,
-        _clocks: Clocks | None = None,
+        _clock: Callable[[], float] = time.monotonic,
     ) -> None:
         section = section or server.file.record
         if section is None:
             raise ConfigurationError(f"fleet {server.file.fleet}: record: is not in its file")
         self.section: RecordSection = section
         self.path: Path = section.path(server.folder)
-        self._server, self._on_trouble, self._clocks = server, on_trouble, _clocks
+        self._server, self._on_trouble, self._clock = server, on_trouble, _clock
         self._writer: FolderWriter | None = None
         self._observer: Observer | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -103,7 +104,7 @@ class FleetRecorder(Server):
             Limits(section.size, section.age, section.keep),
             load_extra("mcap.writer"),
             self._tell,
-            self._clocks,
+            self._clock,
         )
         self._loop, self._writer = asyncio.get_running_loop(), writer
         try:

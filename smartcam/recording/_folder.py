@@ -1,6 +1,6 @@
 """A folder of recordings that follow each other: names, whose they are, how much there is.
 
-A file's name is its camera's, with ``.`` for ``/``, and when it was begun, UTC:
+A file's name is its camera's, with ``.`` for ``/``, and when the first in it came, UTC:
 ``line1.cam3_20260102T030405.678Z.mcap``. Sorted by name a camera's files are in order.
 """
 
@@ -42,7 +42,7 @@ class FileName(NamedTuple):
 
     Attributes:
         camera: its camera.
-        at: when it was begun, UTC, in whole milliseconds.
+        at: when the first in it came, UTC, in whole milliseconds; later where the clock went back.
     """
 
     camera: str
@@ -178,14 +178,14 @@ class RecordingFolder:
     def _note(self, name: FileName) -> None:
         self._last[name.camera] = max(name.at, self._last.get(name.camera, EPOCH))
 
-    def next_path(self, camera: str, now: float) -> Path:
+    def next_path(self, camera: str, at: datetime) -> Path:
         """Return the path of a camera's next file: it sorts behind all that were.
 
         Args:
             camera: its name.
-            now: seconds since 1970.
+            at: when what comes first in it came.
         """
-        whole = EPOCH + timedelta(milliseconds=int(now * 1000))
+        whole = max(EPOCH, at - timedelta(microseconds=at.microsecond % 1000))
         last = self._last.get(camera)
         if last is not None:
             whole = max(whole, last + timedelta(milliseconds=1))

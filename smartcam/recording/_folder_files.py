@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.recording._folder_track import Gap
@@ -41,18 +41,6 @@ class Limits(NamedTuple):
     keep: float
 
 
-class Clocks(NamedTuple):
-    """Where the time comes from.
-
-    Attributes:
-        wall: seconds since 1970, for names.
-        steady: seconds, for ages and delays.
-    """
-
-    wall: Callable[[], float] = time.time
-    steady: Callable[[], float] = time.monotonic
-
-
 class FolderFiles:
     """Writes what came of each camera to its files.
 
@@ -60,18 +48,20 @@ class FolderFiles:
         folder: that they are in.
         limits: of files.
         mcap: the library's module ``mcap.writer``.
-        clocks: where the time comes from.
+        clock: seconds, for the files' age.
     """
 
-    def __init__(self, folder: RecordingFolder, limits: Limits, mcap: Any, clocks: Clocks) -> None:
-        self._folder, self._limits, self._mcap, self._clocks = folder, limits, mcap, clocks
+    def __init__(
+        self, folder: RecordingFolder, limits: Limits, mcap: Any, clock: Callable[[], float]
+    ) -> None:
+        self._folder, self._limits, self._mcap, self._clock = folder, limits, mcap, clock
         self._looked = -math.inf  # when it was looked what is in the folder
         self._stuck: set[str] = set()  # files that could not be deleted
 
     def enter(self) -> None:
         """Enter the folder; raises as :meth:`RecordingFolder.enter`."""
         self._folder.enter()
-        self._looked = self._clocks.steady()
+        self._looked = self._clock()
 
     def write(self, track: Track, given: list[Any]) -> None:
         """Write what came of a camera; what is on the disk is taken out of ``given``.
@@ -85,7 +75,7 @@ class FolderFiles:
                 if track.file is None or (not place % STEP and self._is_over(track)):
                     self._flush(track, written)
                     done, written = place, 0
-                    self._begin(track)
+                    self._begin(track, one)
                 written += self._add(track, one)
             self._flush(track, written)
             done = len(given)
@@ -96,7 +86,7 @@ class FolderFiles:
             del given[:done]
 
     def _is_over(self, track: Track) -> bool:
-        aged = self._clocks.steady() - track.begun >= self._limits.age
+        aged = self._clock() - track.begun >= self._limits.age
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
     def _add(self, track: Track, one: Any) -> int:
@@ -139,17 +129,17 @@ class FolderFiles:
         file.add(gap.error(track.camera))
         file.note(STATE_METADATA, track.state.facts(track.endian))
 
-    def _begin(self, track: Track) -> None:
-        """Begin a camera's next file, and end the one before, if any.
+    def _begin(self, track: Track, first: Any) -> None:
+        """Begin a camera's next file, and end the one before, if any; ``first``: what it is for.
 
         Raises:
             OSError: it cannot be made.
         """
-        now = self._clocks.steady()
+        now = self._clock()
         if now - self._looked > LOOK:
             self._folder.look()
             self._looked = now
-        path = self._folder.next_path(track.camera, self._clocks.wall())
+        path = self._folder.next_path(track.camera, _time_of(first))
         file = RecordingFile(opened(path, overwrite=False), self._mcap, path)
         try:
             file.start()
@@ -202,7 +192,7 @@ class FolderFiles:
     def end_old(self, tracks: Iterable[Track]) -> None:
         """End files that are old enough, of cameras that say nothing."""
         for track in tracks:
-            if self._is_over(track) and self._clocks.steady() - track.begun >= self._limits.age:
+            if self._is_over(track) and self._clock() - track.begun >= self._limits.age:
                 self.finish(track)
 
     # ------------------------------------------------------------------ the bound on the disk
@@ -223,3 +213,10 @@ class FolderFiles:
             except OSError as exc:
                 self._stuck.add(oldest.name)
                 logger.warning("%s cannot be deleted: %s", folder.path / oldest.name, exc)
+
+
+def _time_of(given: Any) -> datetime:
+    """Return when what was put in came; now where it does not say."""
+    item = getattr(given, "result", given)
+    at = getattr(item, "received_at", None) or getattr(item, "at", None)
+    return at if isinstance(at, datetime) else datetime.now(UTC)

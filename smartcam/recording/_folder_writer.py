@@ -12,13 +12,14 @@ import logging
 import os
 import shutil
 import threading
+import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
-from smartcam.recording._folder_files import Clocks, FolderFiles, Limits
+from smartcam.recording._folder_files import FolderFiles, Limits
 from smartcam.recording._folder_track import Gap, Track
 from smartcam.recording._recorder import (
     CHUNK,
@@ -75,7 +76,7 @@ class FolderWriter:
         limits: of files.
         mcap: the library's module ``mcap.writer``.
         tell: called in the thread with why nothing is written, and with None when it is again.
-        clocks: where the time comes from.
+        clock: seconds, for the files' age and delays.
 
     Attributes:
         trouble: why nothing is written at the time; None where all is well.
@@ -87,10 +88,10 @@ class FolderWriter:
         limits: Limits,
         mcap: Any,
         tell: Callable[[RecordingError | None], None],
-        clocks: Clocks | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._folder, self._tell, self._clocks = folder, tell, clocks or Clocks()
-        self._files = FolderFiles(folder, limits, mcap, self._clocks)
+        self._folder, self._tell, self._clock = folder, tell, clock
+        self._files = FolderFiles(folder, limits, mcap, clock)
         self._more = threading.Condition()
         self._waiting = _Waiting()
         self._closing = False
@@ -242,7 +243,7 @@ class FolderWriter:
             ConfigurationError: another recorder has the folder now.
             OSError: the folder is not there, or there is no room.
         """
-        trouble, now = self._trouble, self._clocks.steady()
+        trouble, now = self._trouble, self._clock()
         if trouble is None:
             return True
         if now < trouble.again or not found:
@@ -266,7 +267,7 @@ class FolderWriter:
         told = RecordingError(prefix + reason.removeprefix(prefix))
         told.__cause__ = error
         full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
-        again = self._clocks.steady() + RETRIES[min(tries, len(RETRIES) - 1)]
+        again = self._clock() + RETRIES[min(tries, len(RETRIES) - 1)]
         self._trouble = _Trouble(told, reason, full, again, tries)
         if before is None:
             logger.warning("%s; nothing is recorded until it is better", told)

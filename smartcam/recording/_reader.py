@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar, overload
 
@@ -238,12 +239,13 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
     except OSError as exc:
         raise ConfigurationError(f"recording {folder}: {exc.strerror or exc}") from exc
     found: list[Path] = []
-    for place, (name, path) in enumerate(named):
-        follows = named[place + 1][0] if place + 1 < len(named) else None
-        over = follows is not None and follows.camera == name.camera and since is not None
-        if over and follows is not None and since is not None and follows.at <= since:
-            continue
-        if until is None or name.at <= until:
+    begins: list[FileName | None] = [name for name, _ in named]
+    for (name, path), follows in zip(named, [*begins[1:], None], strict=False):
+        if follows is not None and follows.camera == name.camera and since is not None:
+            over = follows.at + timedelta(milliseconds=1) <= since
+        else:
+            over = False
+        if not over and (until is None or name.at <= until):
             found.append(Path(path))
     if not found:
         raise ConfigurationError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,6 @@ from smartcam.fleet._bus import MemoryBus
 from smartcam.fleet._recording_file import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
 from smartcam.recording._folder import FileName, files_of
-from smartcam.recording._folder_files import Clocks
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
 
 NAME = "line1/cam1"
@@ -42,11 +42,11 @@ def server(folder: Path, *urls: str) -> FleetServer:
 
 @contextlib.asynccontextmanager
 async def recording(
-    place: Path, *urls: str, clocks: Clocks | None = None, **fields: Any
+    place: Path, *urls: str, clock: Callable[[], float] = time.monotonic, **fields: Any
 ) -> AsyncIterator[tuple[FleetRecorder, FleetServer]]:
     """Record cameras into ``place/rec``."""
     agent = server(place, *urls)
-    recorder = FleetRecorder(agent, section(**fields), _clocks=clocks)
+    recorder = FleetRecorder(agent, section(**fields), _clock=clock)
     async with recorder, agent:
         await agent.wait_tried()
         yield recorder, agent
