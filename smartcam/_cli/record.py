@@ -42,22 +42,13 @@ if TYPE_CHECKING:
     from smartcam.recording import BagCounts, Recording
 
 
-class _Time(click.ParamType):
-    """A time of the day on some day."""
+def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
+    """Return a time with its zone."""
+    try:
+        return None if value is None else datetime.fromisoformat(value).astimezone(UTC)
+    except (ValueError, OverflowError) as exc:
+        raise click.BadParameter(f"{value!r} is no time such as 2026-01-02T03:04:05Z") from exc
 
-    name = "time"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> datetime:
-        """Return it with a time zone."""
-        try:
-            return datetime.fromisoformat(value).astimezone(UTC)
-        except (ValueError, OverflowError):
-            self.fail(f"{value!r} is no time such as 2026-01-02T03:04:05Z", param, ctx)
-
-
-TIME = _Time()
 
 _camera = click.option(
     "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
@@ -246,8 +237,10 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
 @click.argument("recording", metavar="RUN.mcap|FOLDER", type=click.Path())
 @click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
 @click.option("--loop", is_flag=True, help="Begin again when it is over.")
-@click.option("--from", "since", metavar="TIME", type=TIME, help="Play what came from then on.")
-@click.option("--until", metavar="TIME", type=TIME, help="Play what came until then.")
+@click.option(
+    "--from", "since", metavar="TIME", callback=_time, help="Play what came from then on."
+)
+@click.option("--until", metavar="TIME", callback=_time, help="Play what came until then.")
 @_camera
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(

@@ -26,12 +26,12 @@ from smartcam.models import Status
 from smartcam.recording import FleetRecorder, Recorder, load_recording
 from smartcam.recording import _folder_files as folder_files
 from smartcam.recording import _folder_writer as folder_writer
-from smartcam.recording import _recorder as recorder_module
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folder_files import FolderFiles, Limits
 from smartcam.recording._folder_track import Track
 from smartcam.recording._form import GAP
 from smartcam.recording._schedule import plan_replay
+from smartcam.recording._state import RecordedState
 from tests.fleet.fleetkit import NumberedCamera
 from tests.recording.folderkit import (
     NAME,
@@ -71,7 +71,7 @@ class Disk:
         self.stuck: threading.Event | None = None
         self.calls = 0
         self._real = os.fsync
-        monkeypatch.setattr(recorder_module.os, "fsync", self._fsync)
+        monkeypatch.setattr(os, "fsync", self._fsync)
 
     def _fsync(self, descriptor: int) -> None:
         self.calls += 1
@@ -218,7 +218,8 @@ async def test_full_disk_is_told_once_counted_and_heals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING, "smartcam.recording")
-    disk, told = Disk(monkeypatch), []
+    disk = Disk(monkeypatch)
+    told: list[RecordingError | None] = []
     async with NumberedCamera() as box:
         agent = server(tmp_path, box.url)
         recorder = FleetRecorder(agent, section(), on_trouble=told.append)
@@ -339,9 +340,10 @@ async def test_slow_disk_costs_records_and_neither_memory_nor_time(
     assert "too slow" in gaps[0].text
     assert runs(whole)[-1] == box.runs
     assert sum(whole.counts) == account.written + len(gaps)
-    last = [one for one in whole.all_items() if hasattr(one, "connected")][-1]
+    last = [one for one in whole.all_items() if isinstance(one, RecordedState)][-1]
     assert last.application == 1  # events were kept
-    assert Status.RUNNING in last.status  # type: ignore[operator]
+    assert last.status is not None
+    assert Status.RUNNING in last.status
 
 
 async def test_record_that_makes_no_json_is_counted_and_the_rest_is_written(
