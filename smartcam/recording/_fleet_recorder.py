@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from smartcam.fleet import FleetServer
     from smartcam.fleet._recording_file import RecordSection
-    from smartcam.recording._folder_track import RecordingAccount, Track
+    from smartcam.recording._folder_track import CameraTrack, RecordingAccount
     from smartcam.recording._form import Item
 
 
-class _Came(NamedTuple):
+class _SeenResult(NamedTuple):
     """A result as an agent has it."""
 
     result: Result[Any]  # its value says whose it is
@@ -160,7 +160,7 @@ class _Hooks(Observer):
 
     def __init__(self, server: FleetServer, section: RecordSection, writer: FolderWriter) -> None:
         self._server, self._section, self._writer = server, section, writer
-        self._tracks: dict[str, Track | None] = {}  # None: it is not recorded
+        self._tracks: dict[str, CameraTrack | None] = {}  # None: it is not recorded
 
     def on_state(self, event: CameraEvent) -> None:
         """Keep an event."""
@@ -174,7 +174,7 @@ class _Hooks(Observer):
         """Keep a result."""
         track = self._track(result.camera)
         if track is not None:
-            came = _Came(result, self._endian(result.camera))
+            came = _SeenResult(result, self._endian(result.camera))
             self._writer.put(track, came, 4 * len(result.raw))
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
@@ -190,21 +190,21 @@ class _Hooks(Observer):
         host = self._server.hosts.get(camera)
         return None if host is None else host.camera.endian
 
-    def _track(self, camera: str) -> Track | None:
+    def _track(self, camera: str) -> CameraTrack | None:
         try:
             return self._tracks[camera]
         except KeyError:
             track = self._tracks[camera] = self._new(camera)
             return track
 
-    def _new(self, camera: str) -> Track | None:
+    def _new(self, camera: str) -> CameraTrack | None:
         if not self._section.chooses(camera):
             return None
         file = self._server.file
         entry = next((one.entry for one in file.plan() if one.name == camera), None)
         spec = None if entry is None else entry.interpret_as
         y_down, lenient = (False, False) if entry is None else (entry.y_down, entry.lenient)
-        track = self._writer.track(camera, _Reading(camera, spec, y_down, lenient).items)
+        track = self._writer.track(camera, _SeenReading(camera, spec, y_down, lenient).items)
         said = {
             "fleet": file.fleet,
             "interpret_as": spec,
@@ -228,7 +228,7 @@ class _Frames(_Hooks):
             self._writer.put(track, entry, len(entry.hex))
 
 
-class _Reading:
+class _SeenReading:
     """Makes records of what came, in the writer's thread: a result's value is what it holds.
 
     Args:
@@ -246,7 +246,7 @@ class _Reading:
 
     def items(self, given: Any) -> Iterator[Item]:
         """Give the records."""
-        if not isinstance(given, _Came):
+        if not isinstance(given, _SeenResult):
             yield given
             return
         result = given.result._replace(value=None)
@@ -261,7 +261,7 @@ class _Reading:
             kind = type(exc).__name__
             yield RecordedError(self._camera, at, kind, str(exc), result.triggered_at)
 
-    def _read(self, given: _Came, endian: int, interpret: Interpretation) -> Result[Any]:
+    def _read(self, given: _SeenResult, endian: int, interpret: Interpretation) -> Result[Any]:
         result, cells, fault = given.result, None, None
         if result.value.cells:
             said: dict[str, Any] = json.loads(result.value.cells)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from smartcam.recording._folder import RecordingFolder
-    from smartcam.recording._folder_track import Track
+    from smartcam.recording._folder_track import CameraTrack
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
@@ -63,7 +63,7 @@ class FolderFiles:
         self._folder.enter()
         self._looked = self._clock()
 
-    def write(self, track: Track, given: list[Any]) -> None:
+    def write(self, track: CameraTrack, given: list[Any]) -> None:
         """Write what came of a camera; what is on the disk is taken out of ``given``.
 
         Raises:
@@ -85,11 +85,11 @@ class FolderFiles:
         finally:
             del given[:done]
 
-    def _is_over(self, track: Track) -> bool:
+    def _is_over(self, track: CameraTrack) -> bool:
         aged = self._clock() - track.begun >= self._limits.age
         return track.file is not None and (aged or track.file.size >= self._limits.size)
 
-    def _add(self, track: Track, one: Any) -> int:
+    def _add(self, track: CameraTrack, one: Any) -> int:
         """Add what was put in to the file; return how many records that were."""
         file = track.file
         if file is None:  # not so: it was begun
@@ -125,11 +125,11 @@ class FolderFiles:
         return written
 
     @staticmethod
-    def _add_gap(track: Track, file: RecordingFile, gap: Gap) -> None:
+    def _add_gap(track: CameraTrack, file: RecordingFile, gap: Gap) -> None:
         file.add(gap.error(track.camera))
         file.note(STATE_METADATA, track.state.facts(track.endian))
 
-    def _begin(self, track: Track, first: Any) -> None:
+    def _begin(self, track: CameraTrack, first: Any) -> None:
         """Begin a camera's next file, and end the one before, if any; ``first``: what it is for.
 
         Raises:
@@ -155,7 +155,7 @@ class FolderFiles:
         self.finish(track)
         track.file, track.begun, track.good = file, now, file.size
 
-    def _flush(self, track: Track, written: int) -> None:
+    def _flush(self, track: CameraTrack, written: int) -> None:
         """Have what was added put on the disk, and count it."""
         file = track.file
         if file is None:
@@ -168,7 +168,7 @@ class FolderFiles:
             track.gap, track.gap_told = None, False
         self._folder.grown(file.path, file.size)
 
-    def _cut(self, track: Track) -> None:
+    def _cut(self, track: CameraTrack) -> None:
         """Leave a file with what is on the disk: its last chunk may be half of one."""
         file, track.file = track.file, None
         track.gap_told = False
@@ -176,7 +176,7 @@ class FolderFiles:
             file.cut(track.good)
             self._folder.grown(file.path, track.good)
 
-    def finish(self, track: Track) -> None:
+    def finish(self, track: CameraTrack) -> None:
         """End a camera's file, if any; where the disk does not take its index it has none."""
         file, track.file = track.file, None
         if file is None:
@@ -189,7 +189,7 @@ class FolderFiles:
         file.close()
         self._folder.grown(file.path, file.size)
 
-    def end_old(self, tracks: Iterable[Track]) -> None:
+    def end_old(self, tracks: Iterable[CameraTrack]) -> None:
         """End files that are old enough, of cameras that say nothing."""
         for track in tracks:
             if self._is_over(track) and self._clock() - track.begun >= self._limits.age:
@@ -197,7 +197,7 @@ class FolderFiles:
 
     # ------------------------------------------------------------------ the bound on the disk
 
-    def delete_old(self, tracks: Sequence[Track]) -> None:
+    def delete_old(self, tracks: Sequence[CameraTrack]) -> None:
         """Delete the oldest files until what is left is within the bound."""
         folder = self._folder
         while folder.bytes > self._limits.keep:

@@ -59,7 +59,7 @@ class Gap:
         return RecordedError(camera, self.until, GAP, text, None, self.since, self.count)
 
 
-class Track:
+class CameraTrack:
     """What is recorded of one camera.
 
     Args:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
 from smartcam.recording._folder_files import FolderFiles, Limits
-from smartcam.recording._folder_track import Gap, Track
+from smartcam.recording._folder_track import CameraTrack, Gap
 from smartcam.recording._recorder import (
     CHUNK,
     CLOSE_TIMEOUT,
@@ -61,10 +61,10 @@ class _Trouble:
 
 
 @dataclass(eq=False)
-class _Waiting:
+class _DiskQueue:
     """What waits for the thread."""
 
-    items: list[tuple[Track, Any]] = field(default_factory=list[tuple[Track, Any]])
+    items: list[tuple[CameraTrack, Any]] = field(default_factory=list[tuple[CameraTrack, Any]])
     bytes: int = 0
 
 
@@ -93,9 +93,9 @@ class FolderWriter:
         self._folder, self._tell, self._clock = folder, tell, clock
         self._files = FolderFiles(folder, limits, mcap, clock)
         self._more = threading.Condition()
-        self._waiting = _Waiting()
+        self._waiting = _DiskQueue()
         self._closing = False
-        self._tracks: dict[str, Track] = {}
+        self._tracks: dict[str, CameraTrack] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
 
@@ -112,18 +112,18 @@ class FolderWriter:
         with self._more:
             return {name: track.account for name, track in self._tracks.items()}
 
-    def track(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> Track:
+    def track(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> CameraTrack:
         """Return a new track."""
         with self._more:
-            track = self._tracks[camera] = Track(camera, read)
+            track = self._tracks[camera] = CameraTrack(camera, read)
         return track
 
-    def describe(self, track: Track, facts: dict[str, str]) -> None:
+    def describe(self, track: CameraTrack, facts: dict[str, str]) -> None:
         """Keep facts about a camera in each of its files."""
         with self._more:
             self._waiting.items.append((track, Description({"camera": track.camera, **facts})))
 
-    def put(self, track: Track, given: Any, size: int, *, event: bool = False) -> None:
+    def put(self, track: CameraTrack, given: Any, size: int, *, event: bool = False) -> None:
         """Have something written; where too much waits it is left out and counted. Never waits.
 
         Args:
@@ -145,7 +145,7 @@ class FolderWriter:
             if not before or before < CHUNK <= waiting.bytes:
                 self._more.notify()
 
-    def _leave_out(self, track: Track, given: Any) -> None:
+    def _leave_out(self, track: CameraTrack, given: Any) -> None:
         at = datetime.now(UTC)
         track.left_out += 1
         if track.overflow is None:
@@ -200,22 +200,22 @@ class FolderWriter:
                 self._files.finish(track)
             self._folder.leave()
 
-    def _take(self) -> tuple[dict[Track, list[Any]], bool]:
+    def _take(self) -> tuple[dict[CameraTrack, list[Any]], bool]:
         """Wait for something; return it by its camera, and whether that was the last."""
         with self._more:
             self._more.wait_for(lambda: self._waiting.items or self._closing, INTERVAL)
             if self._waiting.items:
                 self._more.wait_for(lambda: self._closing or self._waiting.bytes > CHUNK, INTERVAL)
-            taken, self._waiting = self._waiting, _Waiting()
+            taken, self._waiting = self._waiting, _DiskQueue()
             for track in self._tracks.values():
                 track.overflow = None
             over = self._closing
-        found: dict[Track, list[Any]] = {}
+        found: dict[CameraTrack, list[Any]] = {}
         for track, item in taken.items:
             found.setdefault(track, []).append(item)
         return found, over
 
-    def _write(self, found: dict[Track, list[Any]]) -> None:
+    def _write(self, found: dict[CameraTrack, list[Any]]) -> None:
         """Write what came, or count it; never raises."""
         try:
             if self._ready(found):
@@ -236,7 +236,7 @@ class FolderWriter:
             for track, given in found.items():
                 track.lose(given, trouble.reason)
 
-    def _ready(self, found: dict[Track, list[Any]]) -> bool:
+    def _ready(self, found: dict[CameraTrack, list[Any]]) -> bool:
         """Return whether the disk is to be tried; where it had failed, look whether there is room.
 
         Raises:
@@ -253,7 +253,7 @@ class FolderWriter:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return True
 
-    def _all_tracks(self) -> list[Track]:
+    def _all_tracks(self) -> list[CameraTrack]:
         with self._more:
             return [*self._tracks.values()]
 

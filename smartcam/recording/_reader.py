@@ -215,7 +215,7 @@ def load_recording(
     for at in (since, until):
         if at is not None and at.tzinfo is None:
             raise ConfigurationError(f"recording {path}: the time {at} has no time zone")
-    look = _Look(path, since, until)
+    look = _FolderLook(path, since, until)
     if not path.is_dir():
         look.take(_Scan(path))
         return look.recording((path,))
@@ -256,7 +256,7 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
 
 
 @dataclass(slots=True)
-class _Look:
+class _FolderLook:
     """What is found while files are looked through."""
 
     path: Path

@@ -28,7 +28,7 @@ from smartcam.recording import _folder_files as folder_files
 from smartcam.recording import _folder_writer as folder_writer
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folder_files import FolderFiles, Limits
-from smartcam.recording._folder_track import Track
+from smartcam.recording._folder_track import CameraTrack
 from smartcam.recording._form import GAP
 from smartcam.recording._schedule import plan_replay
 from smartcam.recording._state import RecordedState
@@ -160,7 +160,7 @@ def test_names_sort_also_where_the_clock_goes_back(tmp_path: Path) -> None:
         files_of = RecordingFolder(folder)
         writer = FolderFiles(files_of, Limits(1e9, 60.0, 1e9), mcap, ages.__next__)
         writer.enter()
-        track = Track(NAME, lambda given: iter([given]))
+        track = CameraTrack(NAME, lambda given: iter([given]))
         for one in seconds:
             writer.write(track, [frame(one, "> Query")._replace(camera=NAME)])
         writer.finish(track)
