@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -11,6 +12,7 @@ import click
 
 from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
 from smartcam._cli.running import first
+from smartcam._cli.serve import share
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
 from smartcam.backoff import Backoff
@@ -28,7 +30,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.fleet import FleetCamera
-from smartcam.recording import BagRecorder, Recorder, load_recording, write_pcap
+from smartcam.recording import BagRecorder, FleetReplay, Recorder, load_recording, write_pcap
 from smartcam.recording import replay as replay_camera
 from smartcam.recording._bag_recording import BagConversion
 from smartcam.ros2._camera_reading import in_pixels, own_interpreter
@@ -38,6 +40,15 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
     from smartcam.recording import BagCounts, Recording
+
+
+def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
+    """Return a time with its zone."""
+    try:
+        return None if value is None else datetime.fromisoformat(value).astimezone(UTC)
+    except (ValueError, OverflowError) as exc:
+        raise click.BadParameter(f"{value!r} is no time such as 2026-01-02T03:04:05Z") from exc
+
 
 _camera = click.option(
     "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
@@ -218,11 +229,18 @@ def _show_bag(path: str | Path, counts: BagCounts, options: Options) -> None:
 @click.command(
     help="Emulate the recorded cameras: each trigger gets the recorded containers, byte for byte "
     "and after the same time, and what came by itself comes again. Prints one line per camera, its "
-    "URL. When a recording is over its triggers get no result, unless --loop."
+    "URL. When a recording is over its triggers get no result, unless --loop. A folder that an "
+    "agent recorded (record: in its fleet file) is played as a fleet: its cameras under their "
+    "names, through an agent, whose fleet URLs are printed; --port is the agent's then. A TIME is "
+    "2026-01-02T03:04:05, by the local clock unless it ends in Z or +01:00."
 )
-@click.argument("recording", metavar="RUN.mcap", type=click.Path())
+@click.argument("recording", metavar="RUN.mcap|FOLDER", type=click.Path())
 @click.option("--speed", type=float, default=1.0, show_default=True, help="How many times faster.")
 @click.option("--loop", is_flag=True, help="Begin again when it is over.")
+@click.option(
+    "--from", "since", metavar="TIME", callback=_time, help="Play what came from then on."
+)
+@click.option("--until", metavar="TIME", callback=_time, help="Play what came until then.")
 @_camera
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
@@ -244,10 +262,27 @@ async def replay(
     host: str,
     port: int,
     transport: Literal["tcp", "udp"] | None,
+    since: datetime | None,
+    until: datetime | None,
     options: Options,
 ) -> None:
     """Play a recording."""
-    loaded = _loaded(recording)
+    loaded = _loaded(recording, since, until)
+    if loaded.files != (loaded.path,):
+        if transport is not None:
+            raise click.UsageError("--transport is for a file: programs come to a folder's agent")
+        cameras = None if camera is None else [camera]
+        place = f"[{host}]" if ":" in host else host
+        played = FleetReplay(
+            loaded,
+            cameras=cameras,
+            speed=speed,
+            loop=loop,
+            listen=f"tcp/{place}:{port}",
+            on_over=_camera_over,
+        )
+        await _play_fleet(played, options)
+        return
     names = list(loaded.cameras) if camera is None else [camera]
     async with contextlib.AsyncExitStack() as stack:
         for index, name in enumerate(names or [None]):
@@ -264,6 +299,18 @@ async def replay(
             await stack.enter_async_context(emulator)
             options.show({**camera_value(emulator), "camera": emulator.name}, emulator.url)
         await asyncio.Event().wait()
+
+
+async def _play_fleet(played: FleetReplay, options: Options) -> None:
+    """Play a folder, until it is cut off."""
+    for name, why in played.skipped.items():
+        click.echo(f"smartcam: note: {name} is not played: {why}", err=True)
+    async with played:
+        await share(played.server, options)
+
+
+def _camera_over(name: str) -> None:
+    click.echo(f"smartcam: note: {name}: the recording is over: nothing of it is left", err=True)
 
 
 def _over() -> None:
@@ -329,9 +376,9 @@ async def bag(
     _show_bag(output, counts, options)
 
 
-def _loaded(path: str) -> Recording:
+def _loaded(path: str, since: datetime | None = None, until: datetime | None = None) -> Recording:
     """Return a recording; where it stops being readable stands on stderr."""
-    loaded = load_recording(Path(path))
-    if loaded.remark:
-        click.echo(f"smartcam: note: {path}: {loaded.remark}", err=True)
+    loaded = load_recording(Path(path), since=since, until=until)
+    for remark in loaded.remark.splitlines():
+        click.echo(f"smartcam: note: {path}: {remark}", err=True)
     return loaded

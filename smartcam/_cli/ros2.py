@@ -54,19 +54,16 @@ async def ros2(
 
 
 async def _served(path: str, given: dict[str, object], options: Options) -> None:
-    from smartcam._cli.serve import tell
+    from smartcam._cli.serve import Serving
     from smartcam.fleet import load_fleet
     from smartcam.fleet._server import FleetServer
 
     file = load_fleet(path)
     already = {} if file.ros2 is None else file.ros2.model_dump(exclude_unset=True)
     file = file.model_copy(update={"ros2": _section({**already, **given})})
-    async with FleetServer(file, folder=Path(path).parent) as server:
-        await server.wait_tried()
-        events = server.events()
-        _show(server.ros_nodes, server.address.url, options)
-        async for event in events:
-            tell(server, event, options)
+    server = FleetServer(file, folder=Path(path).parent)
+    url = server.address.url
+    await Serving(server, options, False, lambda: _show(server.ros_nodes, url, options)).run()
 
 
 async def _of_fleet(url: str, given: dict[str, object], options: Options) -> None:

@@ -8,6 +8,7 @@ import json
 import logging
 import signal
 import sys
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -20,10 +21,12 @@ from smartcam.exceptions import SmartCamError
 from smartcam.models import Connected, Disconnected, Reconnected
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Callable, Iterator
 
+    from smartcam.exceptions import RecordingError
     from smartcam.fleet import FleetChanges, FleetServer
     from smartcam.models import CameraEvent
+    from smartcam.recording import FleetRecorder
 
 logger: logging.Logger = logging.getLogger("smartcam.serve")
 
@@ -62,7 +65,7 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
     section = server.file.operations
     as_lines = (log or (section and section.log)) == "json"
     with _logged(server, options) if as_lines else contextlib.nullcontext():
-        await _Serving(server, options, as_lines).run()
+        await Serving(server, options, as_lines).run()
 
 
 @contextlib.contextmanager
@@ -84,17 +87,25 @@ def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
             raise SystemExit(exit_code(exc)) from exc
 
 
-class _Serving:
+class Serving:
     """A server in its process: what it says of itself, and the signals that it hears.
 
     Args:
         server: the agent.
         options: of the command.
         as_lines: what happens is logged, and not printed for people.
+        show: says what is there, once it is; None: a line of each camera.
     """
 
-    def __init__(self, server: FleetServer, options: Options, as_lines: bool) -> None:
+    def __init__(
+        self,
+        server: FleetServer,
+        options: Options,
+        as_lines: bool,
+        show: Callable[[], None] | None = None,
+    ) -> None:
         self._server, self._options, self._as_lines = server, options, as_lines
+        self._show: Callable[[], None] = show or self._show_cameras
         self._notifier = Notifier()
         self._ready = False
 
@@ -104,6 +115,9 @@ class _Serving:
             stack.callback(notifier.close)
             wanted = stack.enter_context(_hangup())
             await stack.enter_async_context(self._watched())
+            if server.file.record is not None:
+                recorder = _recorder(server, self._options, self._as_lines)
+                await stack.enter_async_context(recorder)
             await stack.enter_async_context(server)
             stack.callback(notifier.stopping)
             server.reloads.tell = self._on_reload
@@ -113,15 +127,19 @@ class _Serving:
             self._ready = True
             notifier.ready(self._status())
             events = server.events()
-            for name in [*server.hosts]:
-                value = _camera(server, name)
-                why = "" if value["connected"] else f"  not connected: {value['reason']}"
-                self._say(name, value, f"{value['url']}{why}", connected=value["connected"])
+            self._show()
             async for event in events:
                 if self._as_lines:
                     self._log(event)
                 if self._options.as_json or not self._as_lines:
                     tell(server, event, self._options)
+
+    def _show_cameras(self) -> None:
+        server = self._server
+        for name in [*server.hosts]:
+            value = _camera(server, name)
+            why = "" if value["connected"] else f"  not connected: {value['reason']}"
+            self._say(name, value, f"{value['url']}{why}", connected=value["connected"])
 
     @contextlib.asynccontextmanager
     async def _watched(self) -> AsyncIterator[None]:
@@ -214,6 +232,46 @@ async def _while_here(work: Any) -> AsyncIterator[None]:
     finally:
         task.cancel()
         await asyncio.wait({task})
+
+
+def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRecorder:
+    """Return what records the cameras, and says where it cannot."""
+    from smartcam.recording import FleetRecorder
+
+    def say(trouble: RecordingError | None) -> None:
+        lost = {name: one.lost for name, one in recorder.accounts.items() if one.lost}
+        value = {
+            "recordings": str(recorder.path),
+            "recording": trouble is None,
+            "reason": None if trouble is None else str(trouble),
+            "lost": lost,
+            "at": datetime.now(UTC),
+        }
+        if trouble is None:
+            text = f"recorded again; {sum(lost.values())} records were not written"
+        else:
+            text = f"{trouble}; nothing is recorded until it is better"
+        if as_lines:
+            logger.log(logging.INFO if trouble is None else logging.ERROR, "%s", text)
+        if options.as_json:
+            options.show(value, "")
+        elif not as_lines:
+            click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} {text}", err=True)
+
+    recorder = FleetRecorder(server, on_trouble=say)
+    return recorder
+
+
+async def share(server: FleetServer, options: Options) -> None:
+    """Say where the cameras of a started agent are, and what comes and goes, until cut off."""
+    await server.wait_tried()
+    events = server.events()
+    for name in server.hosts:
+        value = _camera(server, name)
+        why = "" if value["connected"] else f"  not connected: {value['reason']}"
+        options.show(value, f"{value['url']}{why}")
+    async for event in events:
+        tell(server, event, options)
 
 
 def _camera(server: FleetServer, name: str) -> dict[str, Any]:

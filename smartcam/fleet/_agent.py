@@ -41,13 +41,14 @@ from smartcam.fleet._wire import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
     from typing import Self
 
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.fleet._frames import FramesOf
     from smartcam.fleet._keys import Keys
     from smartcam.models import CameraEvent
+    from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -113,6 +114,7 @@ class Agent:
         history: results that are kept for each camera, and their bytes.
         on_event: is told what happens to the cameras.
         frames: where the frames of each camera come from that has any, by the camera's name.
+        observers: see what the sessions see.
     """
 
     def __init__(
@@ -125,9 +127,11 @@ class Agent:
         history: tuple[int, int] = (10_000, 1 << 24),
         on_event: Callable[[CameraEvent], None] = lambda _: None,
         frames: Mapping[str, FramesOf] | None = None,
+        observers: Iterable[Observer] = (),
     ) -> None:
         self.name = name
         self._frames = dict(frames or {})
+        self._observers = tuple(observers)
         self._sender, self._encoder = FrameSender(bus, keys), FrameEncoder()
         self.epoch: int = time.time_ns()
         self._keys, self._bus = keys, bus
@@ -206,7 +210,18 @@ class Agent:
         found = frames_of or NO_FRAMES
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
         events = self._on_event
-        host = Host(name, settings, bus, keys, self.epoch, self._history, events, topics, frames)
+        host = Host(
+            name,
+            settings,
+            bus,
+            keys,
+            self.epoch,
+            self._history,
+            events,
+            topics,
+            frames,
+            self._observers,
+        )
         host.numbers = self._numbers_at.pop(name, host.numbers)
         self.hosts[name] = host
         running = self.begin(host.run(), f"smartcam.fleet.{name}")

@@ -30,6 +30,7 @@ from smartcam.fleet._address import (
     missing_certificates,
 )
 from smartcam.fleet._operations_file import OperationsSection  # noqa: TC001 - pydantic does
+from smartcam.fleet._recording_file import RecordSection, mistakes_of
 from smartcam.fleet._ros_file import Fields, RosCamera, RosSection, node_names
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address
@@ -326,6 +327,9 @@ class FleetFile(Fields):
     operations: OperationsSection | None = Field(
         None, description="how smartcam serve is watched: health, numbers, log; {} is enough"
     )
+    record: RecordSection | None = Field(
+        None, description="record the cameras beside the agent; {} is enough"
+    )
     cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
         description="by name, such as line1/cam3; emulated ones at a name that ends in /**",
         min_length=1,
@@ -424,6 +428,8 @@ Mistake = tuple["Sequence[int | str]", str]
 def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
     """Give what cannot work of a file, and where."""
     yield from _of_certificates(file, folder)
+    if file.record is not None:
+        yield from mistakes_of(file.record, folder)
     found: dict[str, Planned] = {}
     taken: dict[tuple[str, int], str] = {}
     for name, entry in file.cameras.items():

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._shared import Carried, Owner
     from smartcam.fleet._topics import Topics
     from smartcam.models import CameraEvent, Result, Status
+    from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
 MOST_STATES = 1000
@@ -74,6 +75,7 @@ class Host:
         on_event: is told what happens to the camera.
         topics: where it is said in JSON.
         frames: its frames.
+        observers: see what its sessions see.
 
     Attributes:
         gate: whose commands may pass.
@@ -97,6 +99,7 @@ class Host:
         on_event: Callable[[CameraEvent], None],
         topics: Topics,
         frames: SharedFrames,
+        observers: Sequence[Observer] = (),
     ) -> None:
         self.name = name
         self.frames = frames
@@ -107,7 +110,7 @@ class Host:
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
         self.triggers: collections.Counter[str] = collections.Counter()
-        self._epoch, self._tell = epoch, on_event
+        self._epoch, self._tell, self._observers = epoch, on_event, observers
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
@@ -152,7 +155,7 @@ class Host:
 
     def _make(self) -> SharedCamera:
         tap = Tap(self._on_results, self._on_status, self._on_event, self._on_end)
-        return SharedCamera(self.settings, tap)
+        return SharedCamera(self.settings, tap, self._observers)
 
     # ------------------------------------------------------------------ life
 

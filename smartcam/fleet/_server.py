@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._file import FramesEntry, Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
+    from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
 OPEN_TIMEOUT = 10.0
@@ -47,6 +48,11 @@ class FleetServer(Server):
         bus: an end of another bus than the file says.
         folder: that paths in it are in, where it is not a path itself.
 
+    Attributes:
+        file: what stands in it.
+        folder: that paths in it are in.
+        observers: see what its sessions see; put some in before it is started.
+
     Raises:
         ConfigurationError: something in it cannot work.
         MissingExtraError: PyYAML, or the bus' engine, is not installed.
@@ -56,13 +62,14 @@ class FleetServer(Server):
         self, file: str | Path | FleetFile, *, bus: Bus | None = None, folder: Path | None = None
     ) -> None:
         self._given = file
+        self.observers: list[Observer] = []
         found = file if isinstance(file, FleetFile) else load_fleet(file)
-        self._folder = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
+        self.folder: Path = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
-            now = loaded(found, self._folder)
+            now = loaded(found, self.folder)
         except ValueError as exc:
             raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
-        self.reloads: Reloader = Reloader(self._folder, now, self._source)
+        self.reloads: Reloader = Reloader(self.folder, now, self._source)
         listen, connect = self.file.endpoints
         self._listen, self._connect = listen, connect = with_ports(listen), connect
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
@@ -71,6 +78,7 @@ class FleetServer(Server):
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._agent: Agent | None = None
+        self._hosts: dict[str, Host] = {}
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
 
@@ -88,11 +96,11 @@ class FleetServer(Server):
         file = self.file
         async with contextlib.AsyncExitStack() as stack:
             sources: dict[str, CameraSource] = {}
-            self.reloads = Reloader(self._folder, self.reloads.now, self._source)
+            self.reloads = Reloader(self.folder, self.reloads.now, self._source)
             self.reloads.sources = sources
             stack.push_async_callback(_end_emulators, sources)
             for name, planned in self.reloads.now.plan.items():
-                sources[name] = await self._source(planned, self._folder)
+                sources[name] = await self._source(planned, self.folder)
             history = (file.history.results, file.history.bytes)
             agent = Agent(
                 file.agent_name,
@@ -102,7 +110,10 @@ class FleetServer(Server):
                 history=history,
                 on_event=self._tell,
                 frames={name: source.frames for name, source in sources.items() if source.frames},
+                observers=self.observers,
             )
+            self._hosts = agent.hosts  # observers want them from their first result on
+            stack.callback(self._forget_hosts)
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
             service = ReloadService(agent, self._bus, Keys(file.fleet), self.reload)
@@ -111,6 +122,9 @@ class FleetServer(Server):
             if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
                 self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
             self._agent, self._stack = agent, stack.pop_all()
+
+    def _forget_hosts(self) -> None:
+        self._hosts = {}
 
     def _more(self) -> dict[str, Any]:
         """Return further settings of the engine."""
@@ -125,7 +139,7 @@ class FleetServer(Server):
 
         file, own = self.file, self.file.agent_name
         said = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
-        found = {name: one.load_calibration(self._folder) for name, one in said.items()}
+        found = {name: one.load_calibration(self.folder) for name, one in said.items()}
         return RosFleet(
             bus,
             file.fleet,
@@ -201,7 +215,7 @@ class FleetServer(Server):
         if emulated.scenario is None:
             camera = EmulatedCamera(seed=seed)
         else:
-            scenario = load_scenario(self._folder / emulated.scenario)
+            scenario = load_scenario(self.folder / emulated.scenario)
             scenario = scenario.model_copy(update={"seed": seed})
             camera = emulated_class(scenario.protocol).from_scenario(scenario, host="127.0.0.1")
         await stack.enter_async_context(camera)
@@ -255,7 +269,7 @@ class FleetServer(Server):
     @property
     def hosts(self) -> dict[str, Host]:
         """Its cameras by name, empty before it is started."""
-        return {} if self._agent is None else self._agent.hosts
+        return self._hosts
 
     @property
     def address(self) -> FleetAddress:

@@ -7,6 +7,7 @@ which program's trigger brought it. A layout matters only as far as it has an ``
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.camera_state import CameraState
@@ -16,11 +17,11 @@ from smartcam.client import SmartCamera
 from smartcam.exceptions import SmartCamError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from datetime import datetime
+    from collections.abc import Callable, Iterable, Sequence
 
     from smartcam._client.triggering import TriggerRequest
     from smartcam.models import CameraEvent, Result, Status
+    from smartcam.observers import Observer
     from smartcam.protocols.messages import ResultContainer
     from smartcam.settings import CameraSettings
 
@@ -105,7 +106,7 @@ class TappedListeners(Listeners):
 
     @property
     def streams_results(self) -> bool:
-        return not self.observed
+        return True
 
     @property
     def hears_results(self) -> bool:
@@ -136,6 +137,9 @@ class TappedListeners(Listeners):
             self.tap.status(status)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
+        if self.observed:
+            for result in results:
+                self._observers.result(result)
         super().offer_burst(results, now, size)
         if self.tap is not None:
             self.tap.results(results, True, False)
@@ -152,10 +156,13 @@ class SharedCamera(SmartCamera[Carried]):
     Args:
         settings: validated options; their interpretation is for the programs.
         tap: is told of everything.
+        observers: see what it sees; a result's value is a :class:`Carried`.
     """
 
-    def __init__(self, settings: CameraSettings, tap: Tap) -> None:
-        super().__init__(settings)
+    def __init__(
+        self, settings: CameraSettings, tap: Tap, observers: Iterable[Observer] = ()
+    ) -> None:
+        super().__init__(settings, observers=observers)
         self._listeners.tap = tap
 
     _listeners: TappedListeners
@@ -194,7 +201,14 @@ class SharedCamera(SmartCamera[Carried]):
             application: have this one running for it.
             timeout: seconds.
         """
-        return await self._trigger(application, request, timeout)
+        if not self._observed:
+            return await self._trigger(application, request, timeout)
+        called_at = datetime.now(UTC)
+        try:
+            return await self._trigger(application, request, timeout)
+        except SmartCamError as error:
+            self._observers.error(self.name, error, called_at)
+            raise
 
     async def ensure(self, application: int, timeout: float) -> None:
         """Have an application running and ready, as ``application=`` does at the start."""

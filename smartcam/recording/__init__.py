@@ -14,6 +14,8 @@ The container is MCAP, which Foxglove and others open. It needs the extra ``reco
 from smartcam.recording._bag_items import BagCounts
 from smartcam.recording._bag_recorder import BagRecorder
 from smartcam.recording._bag_recording import write_bag
+from smartcam.recording._fleet_recorder import FleetRecorder
+from smartcam.recording._fleet_replay import FleetReplay
 from smartcam.recording._pcap import write_pcap
 from smartcam.recording._reader import Recording, load_recording
 from smartcam.recording._recorder import Recorder
@@ -22,6 +24,8 @@ from smartcam.recording._replay import ReplayedCamera, replay
 __all__ = [
     "BagCounts",
     "BagRecorder",
+    "FleetRecorder",
+    "FleetReplay",
     "Recorder",
     "Recording",
     "ReplayedCamera",

@@ -44,6 +44,9 @@ CAMERA_METADATA = "smartcam.camera"
 """Name of the metadata records about a camera: ``camera``, ``url``, ``dialect`` and what else was
 told; a later one goes before an earlier one."""
 
+GAP = "RecordingGap"
+"""What :class:`RecordedError` has for a class where records were not written."""
+
 MAX_MESSAGE = 1 << 26
 """Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
 room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
@@ -70,6 +73,9 @@ class RecordedError(NamedTuple):
         error: name of the exception's class.
         text: what it says.
         triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+        since: of a gap (``error`` is ``RecordingGap``): when the first record came that was not
+            written, UTC; ``at`` is when the last did. None of other errors.
+        records: of a gap: how many were not written. None of other errors.
     """
 
     camera: str
@@ -77,6 +83,8 @@ class RecordedError(NamedTuple):
     error: str
     text: str
     triggered_at: datetime | None
+    since: datetime | None = None
+    records: int | None = None
 
 
 Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError
@@ -212,7 +220,12 @@ def _camera_name(fields: Mapping[str, Any]) -> str:
     return name
 
 
-def _time(text: str) -> datetime:
+def time_of(text: str) -> datetime:
+    """Return the time that a text says, UTC.
+
+    Raises:
+        ValueError: it is none, or has no time zone.
+    """
     at = datetime.fromisoformat(text)
     if at.tzinfo is None:
         raise ValueError(f"the time {text!r:.60} has no time zone")
@@ -220,12 +233,12 @@ def _time(text: str) -> datetime:
 
 
 def _when_of(fields: Mapping[str, Any], name: str) -> datetime:
-    return _time(_get(fields, name, str))
+    return time_of(_get(fields, name, str))
 
 
 def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
     text = _optional(fields, name, str)
-    return None if text is None else _time(text)
+    return None if text is None else time_of(text)
 
 
 def status_of(names: object) -> Status:
@@ -323,6 +336,8 @@ def _error(fields: dict[str, Any]) -> RecordedError:
         _get(fields, "error", str),
         _get(fields, "text", str),
         _optional_when(fields, "triggered_at"),
+        _optional_when(fields, "since"),
+        _optional(fields, "records", int),
     )
 
 
@@ -418,6 +433,8 @@ KINDS: dict[str, Kind] = {
             "error": _text("name of the exception's class"),
             "text": _text("what it says"),
             "triggered_at": _TRIGGERED_AT,
+            "since": _when("RecordingGap: since when records were not written"),
+            "records": _integer("RecordingGap: how many were not written"),
         },
         ("camera", "at", "error", "text"),
         _object,

@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar, overload
 
-from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
+from smartcam.exceptions import (
+    ConfigurationError,
+    MissingExtraError,
+    RecordingError,
+    SmartCamError,
+)
 from smartcam.models import CameraEvent, Result
 from smartcam.observers import TraceEntry
+from smartcam.recording._folder import ENDING, FileName, files_of
 from smartcam.recording._form import (
     CAMERA_METADATA,
+    EPOCH,
     FILE_METADATA,
     FORMAT,
+    GAP,
     KINDS,
     MAX_CAMERAS,
     RecordedError,
@@ -28,6 +37,7 @@ from smartcam.recording._records import (
     RecordReader,
     Schema,
 )
+from smartcam.recording._state import STATE_METADATA, RecordedState
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sized
@@ -72,16 +82,21 @@ class RecordedCamera(NamedTuple):
 class Recording:
     """An MCAP file of :class:`~smartcam.recording.Recorder`; made by :func:`load_recording`.
 
-    Its items are read from the file each time, in the order in which they were recorded.
+    Or a folder of :class:`~smartcam.recording.FleetRecorder`. Its items are read from the file each
+    time, in the order in which they were recorded; those of a folder camera by camera.
 
     Attributes:
-        path: the file.
+        path: the file, or the folder.
         version: of the smartcam that wrote it.
         cameras: the cameras in it, by name, in the order in which they appear.
         counts: how many items of each kind there are.
         began: time of the first item, UTC; None where there is none.
         ended: time of the last item, UTC.
-        remark: "" for a whole file; otherwise where it stops being readable, and why.
+        remark: "" for a whole file; otherwise where it stops being readable, and why. Of a folder
+            what is to say of its files, one a line.
+        files: the file itself; of a folder its files, camera by camera, each camera's in order.
+        since: items before it are left out, UTC; None where none are.
+        until: items behind it are left out, UTC; None where none are.
     """
 
     path: Path
@@ -91,6 +106,9 @@ class Recording:
     began: datetime | None
     ended: datetime | None
     remark: str
+    files: tuple[Path, ...]
+    since: datetime | None = None
+    until: datetime | None = None
 
     @property
     def seconds(self) -> float:
@@ -121,9 +139,40 @@ class Recording:
 
     def items(self, camera: str | None = None) -> Iterator[Item]:
         """Yield everything, of all cameras or of one."""
-        for found in _Scan(self.path).items():
-            if camera is None or found.camera == camera:
+        for found in self.all_items(camera):
+            if not isinstance(found, RecordedState) and (
+                self.since is None or _when(found) >= self.since
+            ):
                 yield found
+
+    def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
+        """Yield what a replay wants: also what is before ``since``, and what a camera was.
+
+        Where the rest of a file could not be read, and another one follows, there is a gap.
+        """
+        for path in self._files_of(camera):
+            scan, last = _Scan(path), None
+            try:
+                for found in scan.items(states=True):
+                    at = _when(found)
+                    if self.until is not None and at > self.until:
+                        continue
+                    if camera is None or found.camera == camera:
+                        last = found.camera, at
+                        yield found
+            except SmartCamError as exc:
+                if path == self.path:
+                    raise
+                scan.remark = str(exc)
+            if scan.remark and path != self.path and last is not None:
+                name, at = last
+                yield RecordedError(name, at, GAP, scan.remark, None)
+
+    def _files_of(self, camera: str | None) -> Iterator[Path]:
+        for path in self.files:
+            name = None if path == self.path else FileName.parse(path.name)
+            if name is None or camera is None or name.camera == camera:
+                yield path
 
     def frames(self, camera: str | None = None) -> Iterator[TraceEntry]:
         """Yield the frames."""
@@ -145,36 +194,128 @@ class Recording:
         return (item for item in self.items(camera) if isinstance(item, kind))
 
 
-def load_recording(path: str | Path) -> Recording:
+def load_recording(
+    path: str | Path, *, since: datetime | None = None, until: datetime | None = None
+) -> Recording:
     """Look through a recording; what can be read of a file that was cut off, is.
 
+    Args:
+        path: the file; or the folder of a :class:`~smartcam.recording.FleetRecorder`, whose files
+            that cannot be read are in ``remark``.
+        since: leave out what is before; with a time zone.
+        until: leave out what is behind; with a time zone.
+
     Raises:
-        ConfigurationError: the file cannot be read, is no MCAP, or is another program's.
+        ConfigurationError: the file cannot be read, is no MCAP, or is another program's; nothing
+            of a folder can be read; a time has no time zone.
         RecordingError: it goes beyond a bound that no recording comes near, or the disk fails.
         MissingExtraError: what inflates its chunks is not installed.
     """
-    scan = _Scan(Path(path))
-    counts = dict.fromkeys(KINDS, 0)
+    path = Path(path)
+    for at in (since, until):
+        if at is not None and at.tzinfo is None:
+            raise ConfigurationError(f"recording {path}: the time {at} has no time zone")
+    look = _FolderLook(path, since, until)
+    if not path.is_dir():
+        look.take(_Scan(path))
+        return look.recording((path,))
+    files = _files_in(path, since, until)
+    for file in files:
+        try:
+            look.take(_Scan(file))
+        except MissingExtraError:
+            raise
+        except SmartCamError as exc:
+            look.remarks.append(str(exc))
+    if not look.version:
+        raise ConfigurationError("\n".join(look.remarks))
+    return look.recording(tuple(files))
+
+
+def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> list[Path]:
+    """Return the files of a folder that may have something of a time, camera by camera."""
+    try:
+        named = sorted((name, entry.path) for name, entry in files_of(folder))
+    except OSError as exc:
+        raise ConfigurationError(f"recording {folder}: {exc.strerror or exc}") from exc
+    found: list[Path] = []
+    begins: list[FileName | None] = [name for name, _ in named]
+    for (name, path), follows in zip(named, [*begins[1:], None], strict=False):
+        if follows is not None and follows.camera == name.camera and since is not None:
+            over = follows.at + timedelta(milliseconds=1) <= since
+        else:
+            over = False
+        if not over and (until is None or name.at <= until):
+            found.append(Path(path))
+    if not found:
+        raise ConfigurationError(
+            f"recording {folder}: no recordings of a fleet are in this folder"
+            f"{' at that time' if named else ''}; expected CAMERA_TIME{ENDING}"
+        )
+    return found
+
+
+@dataclass(slots=True)
+class _FolderLook:
+    """What is found while files are looked through."""
+
+    path: Path
+    since: datetime | None
+    until: datetime | None
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
     began: datetime | None = None
     ended: datetime | None = None
-    names: dict[str, None] = {}
-    for item in scan.items():
-        names[item.camera] = None
-        _check_cameras(scan.path, names)
-        counts[_kind(item)] += 1
-        at = item.received_at if isinstance(item, Result) else item.at
-        began = at if began is None else min(began, at)
-        ended = at if ended is None else max(ended, at)
-        del item  # the next one may be large, too
-    return Recording(
-        path=scan.path,
-        version=scan.file_facts.get("version", ""),
-        cameras={name: _camera(name, scan.camera_facts.get(name, {})) for name in names},
-        counts=Counts(**counts),
-        began=began,
-        ended=ended,
-        remark=scan.remark,
-    )
+    version: str = ""
+    names: dict[str, None] = field(default_factory=dict[str, None])
+    facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    remarks: list[str] = field(default_factory=list[str])
+
+    def take(self, scan: _Scan) -> None:
+        """Look through a file; raises as :meth:`_Scan.items`."""
+        try:
+            for item in scan.items():
+                self._take_item(item)
+                del item  # the next one may be large, too
+        finally:
+            for name, facts in scan.camera_facts.items():
+                self.facts[name] = {**self.facts.get(name, {}), **facts}
+            _check_cameras(self.path, self.facts)
+            self.version = scan.file_facts.get("version", self.version)
+        if scan.remark:
+            said = scan.remark if scan.path == self.path else f"{scan.path.name}: {scan.remark}"
+            self.remarks.append(said)
+
+    def _take_item(self, item: Item) -> None:
+        at = _when(item)
+        if self.until is not None and at > self.until:
+            return
+        self.names[item.camera] = None
+        _check_cameras(self.path, self.names)
+        if self.since is not None and at < self.since:
+            return
+        self.counts[_kind(item)] += 1
+        self.began = at if self.began is None else min(self.began, at)
+        self.ended = at if self.ended is None else max(self.ended, at)
+
+    def recording(self, files: tuple[Path, ...]) -> Recording:
+        """Return what was found."""
+        return Recording(
+            path=self.path,
+            version=self.version,
+            cameras={name: _camera(name, self.facts.get(name, {})) for name in self.names},
+            counts=Counts(**self.counts),
+            began=self.began,
+            ended=self.ended,
+            remark="\n".join(self.remarks),
+            files=files,
+            since=self.since,
+            until=self.until,
+        )
+
+
+def _when(item: Item | RecordedState) -> datetime:
+    at = item.received_at if isinstance(item, Result) else item.at
+    return EPOCH if at is None else at
 
 
 def _check_cameras(path: Path, names: Sized) -> None:
@@ -220,8 +361,14 @@ class _Scan:
     remark: str = ""  # where it stops being readable, and why
     values: int = 0  # in its messages so far
 
-    def items(self) -> Iterator[Item]:
-        """Yield everything that can be read.
+    @overload
+    def items(self) -> Iterator[Item]: ...
+
+    @overload
+    def items(self, *, states: Literal[True]) -> Iterator[Item | RecordedState]: ...
+
+    def items(self, *, states: bool = False) -> Iterator[Item | RecordedState]:
+        """Yield everything that can be read; with ``states`` also what a camera was.
 
         Raises:
             ConfigurationError: it is no recording of ours.
@@ -253,7 +400,10 @@ class _Scan:
                 except (CutOffError, ValueError, OverflowError, RecursionError) as exc:
                     self.remark = _remark(count, exc)
                     break
-                if item is not None:
+                if isinstance(item, RecordedState):
+                    if states:
+                        yield item
+                elif item is not None:
                     count += 1
                     yield item
                     item = None  # the next one may be large, too
@@ -261,7 +411,7 @@ class _Scan:
 
     def _take(
         self, record: Record, schemas: dict[int, str], kinds: dict[int, Kind], place: int
-    ) -> Item | None:
+    ) -> Item | RecordedState | None:
         match record:
             case Schema(number, name):
                 schemas[number] = name
@@ -280,6 +430,8 @@ class _Scan:
             case Metadata(name, facts) if name == CAMERA_METADATA:
                 self.camera_facts[facts.get("camera", "")] = facts
                 _check_cameras(self.path, self.camera_facts)
+            case Metadata(name, facts) if name == STATE_METADATA:
+                return RecordedState.of(facts)
             case _:
                 pass
         return None

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import errno
 import json
 import os
 import stat
@@ -166,7 +167,7 @@ class Recorder(Observer):
         except (OSError, ValueError) as exc:
             reason = exc.strerror if isinstance(exc, OSError) else exc
             raise ConfigurationError(f"recording {self.path}: {reason}") from exc
-        return _File(stream, writer)
+        return RecordingFile(stream, writer, self.path)
 
     def close(self) -> None:
         """Write what waits and end the file; idempotent.
@@ -331,10 +332,17 @@ def _open_whole(path: str, flags: int) -> int:
     return os.open(path, flags & ~os.O_TRUNC, 0o666)
 
 
-class _File:
-    """An MCAP file that is being written; ``mcap`` is the library's module ``mcap.writer``."""
+class RecordingFile:
+    """An MCAP file that is being written.
 
-    def __init__(self, stream: IO[bytes], mcap: Any) -> None:
+    Args:
+        stream: it, open.
+        mcap: the library's module ``mcap.writer``.
+        path: where it is.
+    """
+
+    def __init__(self, stream: IO[bytes], mcap: Any, path: Path) -> None:
+        self.path = path
         self._stream = stream  # closed at the end
         self._writer = mcap.Writer(stream, chunk_size=CHUNK)
         self._on_disk = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
@@ -342,6 +350,7 @@ class _File:
         self._channels: dict[tuple[str, str], int] = {}
         self._numbers: dict[int, int] = {}
         self._facts: dict[str, dict[str, str]] = {}
+        self._size = 0  # when it was closed
 
     def start(self) -> None:
         """Write what stands first."""
@@ -364,8 +373,35 @@ class _File:
                 self._message("errors", item.camera, item.at, item)
             case _:
                 if isinstance(item, (Connected, Reconnected)):
-                    self._describe({"camera": item.camera, **_address_facts(item.url)})
+                    self._describe({"camera": item.camera, **address_facts(item.url)})
                 self._message("events", item.camera, item.at, item)
+
+    @property
+    def size(self) -> int:
+        """Bytes so far, without the chunk that is being filled."""
+        return self._size if self._stream.closed else self._stream.tell()
+
+    def note(self, name: str, facts: dict[str, str]) -> None:
+        """Write facts under a name, behind what was added."""
+        self._writer.flush()  # the chunk, which would stand behind it
+        self._writer.add_metadata(name, facts)
+
+    def check(self) -> None:
+        """Look whether the file is still where it was.
+
+        Raises:
+            OSError: it was deleted, or moved away with its folder.
+        """
+        own = os.fstat(self._stream.fileno())
+        if not os.path.samestat(own, self.path.stat()):
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self.path))
+
+    def cut(self, size: int) -> None:
+        """Close the file with its first ``size`` bytes, as far as the disk does that."""
+        self.close()
+        with contextlib.suppress(OSError):
+            os.truncate(self.path, size)
+        self._size = size
 
     def flush(self) -> None:
         """End the chunk and have it put on the disk."""
@@ -380,6 +416,10 @@ class _File:
 
     def close(self) -> None:
         """Close the file; what it does not take any more is dropped."""
+        if self._stream.closed:
+            return
+        with contextlib.suppress(OSError):
+            self._size = self._stream.tell()
         with contextlib.suppress(OSError):
             self._stream.close()
 
@@ -416,7 +456,8 @@ class _File:
             self._writer.add_metadata(CAMERA_METADATA, now)
 
 
-def _address_facts(url: str) -> dict[str, str]:
+def address_facts(url: str) -> dict[str, str]:
+    """Return what an address says of a camera."""
     if is_fleet(url):  # its own dialect is known to the agent
         return {"url": url, "protocol": "fleet"}
     try:

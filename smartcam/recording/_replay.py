@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._clock import Clock, TimerHandle
     from smartcam.emulator._scene import TableScene
-    from smartcam.emulator._wire_camera import WireCamera
     from smartcam.layout import Field
     from smartcam.models import ByteOrder, Status
     from smartcam.recording._reader import Recording
@@ -415,7 +414,7 @@ def replay(
     loop: bool = False,
     on_over: Callable[[], None] | None = None,
     **options: Any,
-) -> WireCamera:
+) -> ReplayedCamera | ReplayedLines:
     """Return an emulated camera that plays a recording, of whatever protocol.
 
     One of frames is a :class:`ReplayedCamera`. One of lines gives the n-th of equal lines what the

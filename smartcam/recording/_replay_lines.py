@@ -132,6 +132,11 @@ class ReplayedLines(LineCamera):
         self.protocol = load_protocol(known.protocol)
         self.max_links, self.write_limit = kind.max_links, kind.write_limit
         super().__init__(**{"name": known.name, **options})
+        if recording.since is not None:
+            raise ConfigurationError(
+                f"recording {recording.path}: camera {known.name!r} speaks in lines, which are "
+                "played from the begin, not from a time on"
+            )
         self.plan: LinesPlan = plan_lines(recording.items(known.name), self._bare)
         if not self.plan.answers:
             raise ConfigurationError(

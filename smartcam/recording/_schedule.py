@@ -25,7 +25,8 @@ from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Transport, Verdict
 from smartcam.protocols._bvs import BVS, HANDBOOK
-from smartcam.recording._form import status_of
+from smartcam.recording._form import GAP, RecordedError, status_of
+from smartcam.recording._state import RecordedState
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import is_fleet, parse_address
 
@@ -39,6 +40,10 @@ if TYPE_CHECKING:
 
 CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
 """What an operator of the emulated camera can set; the other bits follow from what it does."""
+
+TOGETHER = 0.1
+"""Seconds behind its first container in which an inspection's others come, where the camera says
+all the time that it waits for a trigger."""
 
 MAX_REPLAY = 1 << 30
 """Bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times a second."""
@@ -101,14 +106,16 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     """
     known = recording.camera(camera)
     dialect, transport = _spoken(recording, known)
-    items = recording.items(known.name)
-    if is_fleet(known.url):
+    items = recording.all_items(known.name)
+    if is_fleet(known.url) or known.facts.get("frames") == "no":
         steps = _steps_without_frames(items, known.facts.get("endian", "0"))
         free = _free_running(steps)
         steps = _settled(steps, free)
     else:
         steps = list(_steps(items, dialect))
         free = _free_running(steps)
+    if recording.since is not None:
+        steps = _since(steps, recording.since.timestamp())
     maker = _ScheduleMaker(free)
     for step in steps:
         maker.take(step)
@@ -210,7 +217,47 @@ _PLAIN = {
 _ANSWERS = {("<", "SwitchAnswer"): _What.SWITCHED, ("<", "QueryAnswer"): _What.NAMED}
 
 
-def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_ReplayStep]:
+def _since(steps: Iterable[_ReplayStep], at: float) -> list[_ReplayStep]:
+    """Return steps of which those before a time only say what the camera is then."""
+    single = {_What.TRIGGER, _What.CONTAINER, _What.SWITCH}
+    return [
+        step._replace(at=max(step.at, at))
+        for step in steps
+        if step.at >= at or step.what not in single
+    ]
+
+
+class _Seams:
+    """Makes steps of what a recording says of itself: where it begins, and what is missing.
+
+    So nothing is taken for what it is not.
+    """
+
+    def __init__(self) -> None:
+        self._whole = False  # what came before is known
+
+    def steps(self, item: Item | RecordedState, at: float) -> list[_ReplayStep]:
+        """Return the steps of an item at a time that does not go back."""
+        if isinstance(item, RecordedError) and item.error == GAP:
+            self._whole = False
+            return [_ReplayStep(at, _What.LOST)]
+        if not isinstance(item, RecordedState):
+            self._whole = True
+            return []
+        if not item.connected:
+            return [_ReplayStep(at, _What.LOST)]
+        if self._whole:
+            return []
+        self._whole = True
+        found = [_ReplayStep(at, _What.CONNECTED)]
+        if item.application is not None:
+            found.append(_ReplayStep(at, _What.NAMED, item.application))
+        if item.status is not None:
+            found.append(_ReplayStep(at, _What.STATUS, item.endian, item.status))
+        return found
+
+
+def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Iterator[_ReplayStep]:
     """Yield the steps among the items; their times never go back.
 
     Raises:
@@ -218,7 +265,13 @@ def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_ReplaySte
         RecordingError: there is too much of them.
     """
     at, active, size = 0.0, m.UNNAMED_APPLICATION, 0
+    seams = _Seams()
     for item in items:
+        if isinstance(item, RecordedState) and item.at is not None:
+            at = max(at, item.at.timestamp())
+        for seam in seams.steps(item, at):
+            active = seam.number if seam.what is _What.NAMED else active
+            yield seam
         if isinstance(item, Disconnected):
             yield _ReplayStep(at, _What.LOST)
         if not isinstance(item, TraceEntry) or item.fields is None:
@@ -245,7 +298,7 @@ def _steps(items: Iterable[Item], dialect: FramedDialect) -> Iterator[_ReplaySte
         yield step
 
 
-def _steps_without_frames(items: Iterable[Item], endian: str) -> list[_ReplayStep]:
+def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) -> list[_ReplayStep]:
     """Return the steps of a camera of a fleet, of which there are results and events, in order.
 
     A trigger stands in front of the first of its results; one without a result is left out.
@@ -258,8 +311,11 @@ def _steps_without_frames(items: Iterable[Item], endian: str) -> list[_ReplaySte
         raise ConfigurationError(f"recording: endian {endian:.20} came, expected 0 or 1")
     steps: list[_ReplayStep] = []
     triggered_at, size = None, 0
+    seams = _Seams()
     for item in items:
-        at = (item.received_at if isinstance(item, Result) else item.at).timestamp()
+        when = item.received_at if isinstance(item, Result) else item.at
+        at = 0.0 if when is None else when.timestamp()
+        steps += seams.steps(item, at)
         match item:
             case Connected() | Reconnected():
                 steps.append(_ReplayStep(at, _What.CONNECTED))
@@ -321,7 +377,7 @@ def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
     settled: list[_ReplayStep] = []
     active: int | None = None
     for step in steps:
-        if step.what in {_What.SWITCHED, _What.CONTAINER}:
+        if step.what in {_What.SWITCHED, _What.NAMED, _What.CONTAINER}:
             active = step.number
         if step.what is _What.STATUS:
             bits = step.bits & ~(Status.OVERTRIGGERED | Status.WAITING_FOR_TRIGGER)
@@ -398,6 +454,7 @@ class _ScheduleMaker:
         self._drops = 0  # triggers dropped since the last take
         self._waits_from = self._waited_until = 0.0  # when Waiting for Trigger rose, and fell
         self._open: Take | None = None  # its inspection may send more
+        self._opened = 0.0  # when it sent its first container
         self._began_unasked: float | None = None  # an inspection that nobody had triggered
         self._reference = 0.0  # the next unasked one is counted from here
         self._switching: tuple[float, int] | None = None
@@ -477,7 +534,7 @@ class _ScheduleMaker:
 
     def _on_trigger(self, _: _ReplayStep) -> None:
         self._open = None
-        if self._status is not None and Status.WAITING_FOR_TRIGGER in self._status:
+        if self._waits:
             self._give_up()  # where it waits, the inspection before is over
         self._triggers.append(self.now)
 
@@ -504,13 +561,26 @@ class _ScheduleMaker:
             self._open = Take([step.data], self.now - began, drops=self._drops)
             self._drops = 0
             found.triggered.append(self._open)
-        elif self._open is not None:
+        elif self._open is not None and not self._is_over():
             self._open.containers.append(step.data)
         else:
+            seen = self._began_unasked is not None or not self._waits
             began = self.now if self._began_unasked is None else self._began_unasked
-            self._open = Take([step.data], self.now - began, gap=self._gap(began))
-            found.unasked.append(self._open)
+            take = Take([step.data], self.now - began, gap=self._gap(began))
+            found.unasked.append(take)
+            self._open = take if seen else None
+        if self._open is not None and len(self._open.containers) == 1:
+            self._opened = self.now
         self._began_unasked = None
+
+    @property
+    def _waits(self) -> bool:
+        """Whether the last status says that the camera waits for a trigger."""
+        return self._status is not None and Status.WAITING_FOR_TRIGGER in self._status
+
+    def _is_over(self) -> bool:
+        """Whether the open inspection sends no more: no status tells, where it waits throughout."""
+        return self._waits and self.now - self._opened > TOGETHER
 
     # ------------------------------------------------------------------ inside
 

@@ -287,3 +287,21 @@ def test_plan_of_a_fleets_camera_that_cannot_be_played_is_refused(
     recording = write(tmp_path / "run.mcap", [*met(), shared(1, b"a")], **facts)
     with pytest.raises(ConfigurationError, match=text):
         plan_replay(recording)
+
+
+def test_plan_unasked_under_a_constant_waiting_are_each_for_itself(tmp_path: Path) -> None:
+    """The status says nothing of them: 20,000 of them are no single inspection of that many."""
+    items = [container(1 + place / 1000, place.to_bytes(4, "little")) for place in range(200)]
+    app = plan(tmp_path, *items).applications[5]
+    assert [take.containers for take in app.unasked] == [
+        [place.to_bytes(4, "little")] for place in range(200)
+    ]
+    assert {round(take.gap, 6) for take in app.unasked[1:]} == {0.001}
+    assert (app.triggered, app.waits) == ([], True)
+
+
+def test_plan_unasked_behind_a_trigger_under_a_constant_waiting(tmp_path: Path) -> None:
+    made = plan(tmp_path, "1 > Trigger, 1.2 'a', 1.25 'b', 2 'c', 3 'd', 4 > Trigger, 4.1 'e'")
+    app = made.applications[5]
+    assert [take.containers for take in app.triggered] == [[b"a", b"b"], [b"e"]]
+    assert [take.containers for take in app.unasked] == [[b"c"], [b"d"]]

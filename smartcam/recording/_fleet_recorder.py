@@ -1,0 +1,275 @@
+"""Recording beside an agent: what its sessions see goes into a folder."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._client.interpretation import Interpretation
+from smartcam._server import Server
+from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
+from smartcam.models import CameraEvent, Result, StatusChanged
+from smartcam.observers import Observer, TraceEntry
+from smartcam.protocols.messages import ResultContainer
+from smartcam.recording._folder import RecordingFolder
+from smartcam.recording._folder_files import Limits
+from smartcam.recording._folder_writer import FolderWriter
+from smartcam.recording._form import RecordedError, load_extra
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from smartcam.fleet import FleetServer
+    from smartcam.fleet._recording_file import RecordSection
+    from smartcam.recording._folder_track import CameraTrack, RecordingAccount
+    from smartcam.recording._form import Item
+
+
+class _SeenResult(NamedTuple):
+    """A result as an agent has it."""
+
+    result: Result[Any]  # its value says whose it is
+    endian: int | None  # None where it is not known
+
+
+class FleetRecorder(Server):
+    """Records the cameras of an agent into a folder, as ``record:`` in a fleet file says.
+
+    ::
+
+        server = smartcam.fleet.serve("fleet.yaml")
+        async with FleetRecorder(server), server:
+            ...
+
+    It is started before the server, and stopped behind it. What a disk does never holds up the
+    agent: where it is full, gone or too slow, records are left out and counted, which
+    :attr:`accounts` and the files tell; it is tried again until it is better.
+
+    Args:
+        server: whose cameras; not started yet.
+        section: what is recorded, and where; default: what the server's file says.
+        on_trouble: called in the event loop with why nothing is written any more, and with None
+            when it is again.
+
+    Attributes:
+        path: the folder.
+
+    Raises:
+        ConfigurationError: the file says nothing of recording, and ``section`` is not given.
+    """
+
+    def __init__(
+        self,
+        server: FleetServer,
+        section: RecordSection | None = None,
+        *,
+        on_trouble: Callable[[RecordingError | None], None] = lambda _: None,
+        _clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        section = section or server.file.record
+        if section is None:
+            raise ConfigurationError(f"fleet {server.file.fleet}: record: is not in its file")
+        self.section: RecordSection = section
+        self.path: Path = section.path(server.folder)
+        self._server, self._on_trouble, self._clock = server, on_trouble, _clock
+        self._writer: FolderWriter | None = None
+        self._observer: Observer | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    async def start(self) -> None:
+        """Begin to write the folder.
+
+        A folder that cannot be made, or written, is no error: it is tried again.
+
+        Raises:
+            ConfigurationError: another recorder writes the folder, or the server was started.
+            MissingExtraError: the mcap library is not installed.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._observer is not None:
+            return
+        if self._server.hosts:
+            raise ConfigurationError(
+                f"recordings {self.path}: start the recorder before the server"
+            )
+        section = self.section
+        writer = FolderWriter(
+            RecordingFolder(self.path),
+            Limits(section.size, section.age, section.keep),
+            load_extra("mcap.writer"),
+            self._tell,
+            self._clock,
+        )
+        self._loop, self._writer = asyncio.get_running_loop(), writer
+        try:
+            await _whole(writer.start)
+        except BaseException:
+            self._writer = None
+            await _whole(writer.stop)
+            raise
+        kind = _Frames if section.frames else _Hooks
+        self._observer = kind(self._server, section, writer)
+        self._server.observers.append(self._observer)
+
+    async def stop(self) -> None:
+        """Write what waits and end the files; 30 s at most, usually some milliseconds.
+
+        Cancellation: the thread goes on to the end of it.
+        """
+        writer, observer = self._writer, self._observer
+        self._observer = None
+        if observer is not None:
+            self._server.observers.remove(observer)
+        if writer is not None:
+            await _whole(writer.stop)
+
+    @property
+    def accounts(self) -> dict[str, RecordingAccount]:
+        """What became of the records of each camera that had any."""
+        return {} if self._writer is None else self._writer.accounts
+
+    @property
+    def trouble(self) -> RecordingError | None:
+        """Why nothing is written at the time; None where all is well."""
+        return None if self._writer is None else self._writer.trouble
+
+    def _tell(self, trouble: RecordingError | None) -> None:
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._loop.call_soon_threadsafe(self._on_trouble, trouble)
+
+
+async def _whole(work: Callable[[], None]) -> None:
+    """Have something done in a thread, to its end even where the caller is cancelled."""
+    running = asyncio.ensure_future(asyncio.to_thread(work))
+    try:
+        await asyncio.shield(running)
+    except asyncio.CancelledError:
+        await asyncio.wait({running})
+        raise
+
+
+class _Hooks(Observer):
+    """Hands what an agent's sessions see to the writer."""
+
+    def __init__(self, server: FleetServer, section: RecordSection, writer: FolderWriter) -> None:
+        self._server, self._section, self._writer = server, section, writer
+        self._tracks: dict[str, CameraTrack | None] = {}  # None: it is not recorded
+
+    def on_state(self, event: CameraEvent) -> None:
+        """Keep an event."""
+        track = self._track(event.camera)
+        if track is not None:
+            if isinstance(event, StatusChanged):
+                track.endian = self._endian(event.camera) or 0
+            self._writer.put(track, event, 0, event=True)
+
+    def on_result(self, result: Result) -> None:
+        """Keep a result."""
+        track = self._track(result.camera)
+        if track is not None:
+            came = _SeenResult(result, self._endian(result.camera))
+            self._writer.put(track, came, 4 * len(result.raw))
+
+    def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
+        """Keep an error."""
+        track = self._track(camera)
+        if track is not None:
+            text = str(error)
+            kind = type(error).__name__
+            came = RecordedError(camera, datetime.now(UTC), kind, text, triggered_at)
+            self._writer.put(track, came, len(text))
+
+    def _endian(self, camera: str) -> int | None:
+        host = self._server.hosts.get(camera)
+        return None if host is None else host.camera.endian
+
+    def _track(self, camera: str) -> CameraTrack | None:
+        try:
+            return self._tracks[camera]
+        except KeyError:
+            track = self._tracks[camera] = self._new(camera)
+            return track
+
+    def _new(self, camera: str) -> CameraTrack | None:
+        if not self._section.chooses(camera):
+            return None
+        file = self._server.file
+        entry = next((one.entry for one in file.plan() if one.name == camera), None)
+        spec = None if entry is None else entry.interpret_as
+        y_down, lenient = (False, False) if entry is None else (entry.y_down, entry.lenient)
+        track = self._writer.track(camera, _SeenReading(camera, spec, y_down, lenient).items)
+        said = {
+            "fleet": file.fleet,
+            "interpret_as": spec,
+            "application": None if entry is None else entry.application,
+            "y_down": y_down or None,
+            "lenient": lenient or None,
+            "frames": None if self._section.frames else "no",
+        }
+        facts = {name: str(fact) for name, fact in said.items() if fact is not None}
+        self._writer.describe(track, facts)
+        return track
+
+
+class _Frames(_Hooks):
+    """Hands on frames, too."""
+
+    def on_frame(self, entry: TraceEntry) -> None:
+        """Keep a frame."""
+        track = self._track(entry.camera)
+        if track is not None:
+            self._writer.put(track, entry, len(entry.hex))
+
+
+class _SeenReading:
+    """Makes records of what came, in the writer's thread: a result's value is what it holds.
+
+    Args:
+        camera: its name.
+        spec: how its results are read; None: they are not.
+        y_down: as its settings say.
+        lenient: as its settings say.
+    """
+
+    def __init__(self, camera: str, spec: Any, y_down: bool, lenient: bool) -> None:
+        self._camera = camera
+        self._interpret: Interpretation | None = None
+        if spec is not None:
+            self._interpret = Interpretation(spec, lenient=lenient, y_down=y_down)
+
+    def items(self, given: Any) -> Iterator[Item]:
+        """Give the records."""
+        if not isinstance(given, _SeenResult):
+            yield given
+            return
+        result = given.result._replace(value=None)
+        if self._interpret is None or given.endian is None:
+            yield result
+            return
+        try:
+            yield self._read(given, given.endian, self._interpret)
+        except SmartCamError as exc:
+            yield result
+            at = datetime.now(UTC)
+            kind = type(exc).__name__
+            yield RecordedError(self._camera, at, kind, str(exc), result.triggered_at)
+
+    def _read(self, given: _SeenResult, endian: int, interpret: Interpretation) -> Result[Any]:
+        result, cells, fault = given.result, None, None
+        if result.value.cells:
+            said: dict[str, Any] = json.loads(result.value.cells)
+            fault, texts = said.get("fault"), said.get("cells")
+            cells = None if texts is None else tuple(texts)
+        container = ResultContainer(
+            application=result.application, data=result.raw, cells=cells, fault=fault
+        )
+        at = result.received_at
+        done = interpret(container, endian, camera=self._camera, number=result.number, at=at)
+        return result._replace(value=done.value, sequence=done.sequence)

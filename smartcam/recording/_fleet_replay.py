@@ -1,0 +1,149 @@
+"""A recording played as a fleet: its cameras under their names, through an agent."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+from typing import TYPE_CHECKING, Any
+
+from smartcam._server import Server
+from smartcam.exceptions import ConfigurationError
+from smartcam.recording._replay import replay
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from smartcam.fleet import FleetServer
+    from smartcam.recording._reader import RecordedCamera, Recording
+    from smartcam.recording._replay import ReplayedCamera
+    from smartcam.recording._replay_lines import ReplayedLines
+
+
+class FleetReplay(Server):
+    """Plays the cameras of a recording, each as an emulated one that an agent shares.
+
+    ::
+
+        async with FleetReplay(load_recording("recordings")) as played:
+            print(played.server.urls)
+
+    Each camera begins when its session does, all of them at about the same time; what a fleet's
+    programs trigger gets what was recorded for a trigger, what came by itself comes again.
+
+    Args:
+        recording: what to play; usually a folder of a :class:`FleetRecorder`.
+        cameras: their names; default: all of them.
+        speed: how many times faster than recorded, 0.001 to 1000.
+        loop: begin again where something is over.
+        listen: endpoint of the agent; port 0 takes a free one.
+        on_over: called once for each camera, with its name, when nothing of it is left.
+
+    Attributes:
+        skipped: why a camera is not played, by its name: there was no session with it, or none of
+            its make can be emulated.
+
+    Raises:
+        ConfigurationError: something given is wrong, or none of the cameras can be played.
+        MissingExtraError: the extra ``fleet`` is not installed.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        *,
+        cameras: Iterable[str] | None = None,
+        speed: float = 1.0,
+        loop: bool = False,
+        listen: str = "tcp/127.0.0.1:0",
+        on_over: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._recording, self._listen = recording, listen
+        self._server: FleetServer | None = None
+        self._stack = contextlib.AsyncExitStack()
+        self.skipped: dict[str, str] = {}
+        self._played: dict[str, ReplayedCamera | ReplayedLines] = {}
+        self._on_over = on_over
+        for name in recording.cameras if cameras is None else cameras:
+            try:
+                self._played[name] = replay(
+                    recording,
+                    camera=name,
+                    speed=speed,
+                    loop=loop,
+                    on_over=functools.partial(self._over, name),
+                )
+            except ConfigurationError as exc:
+                if cameras is not None:
+                    raise
+                self.skipped[name] = str(exc)
+        # of these nothing will ever be left
+        self._silent = {name for name, one in self._played.items() if not one.remaining}
+        if not self._played:
+            why = "; ".join(self.skipped.values()) or "no camera is in it"
+            raise ConfigurationError(f"recording {recording.path}: nothing can be played: {why}")
+
+    def _over(self, name: str) -> None:
+        if name not in self._silent:
+            self._on_over(name)
+
+    @property
+    def server(self) -> FleetServer:
+        """The agent.
+
+        Raises:
+            ConfigurationError: it is not started.
+        """
+        if self._server is None:
+            raise ConfigurationError(f"recording {self._recording.path}: it is not being played")
+        return self._server
+
+    async def start(self) -> None:
+        """Start the cameras and the agent, and begin to have sessions.
+
+        Raises:
+            ConnectFailedError: a port cannot be listened on.
+
+        Cancellation: leaves it stopped.
+        """
+        from smartcam.fleet import FleetFile, FleetServer
+
+        if self._server is not None:
+            return
+        async with contextlib.AsyncExitStack() as stack:
+            entries: dict[str, Any] = {}
+            fleet = None
+            for name, camera in self._played.items():
+                await stack.enter_async_context(camera)
+                known = self._recording.camera(name)
+                fleet = fleet or known.facts.get("fleet")
+                entries[name] = {"url": camera.url, **_said(known)}
+            told: dict[str, Any] = {"listen": self._listen, "cameras": entries}
+            if fleet is not None:
+                told["fleet"] = fleet
+            try:
+                file = FleetFile.model_validate(told)
+            except ValueError as exc:
+                raise ConfigurationError(f"recording {self._recording.path}: {exc}") from exc
+            server = await stack.enter_async_context(FleetServer(file))
+            self._server, self._stack = server, stack.pop_all()
+
+    async def stop(self) -> None:
+        """Stop the agent and the cameras. Harmless when done twice."""
+        self._server = None
+        await self._stack.aclose()
+
+
+def _said(camera: RecordedCamera) -> dict[str, Any]:
+    """Return what an agent is to know of a camera, besides where it is."""
+    found: dict[str, Any] = {}
+    spec = camera.interpret_as
+    if spec is not None:
+        found["interpret_as"] = spec
+        if spec.startswith("{"):
+            with contextlib.suppress(ValueError, SyntaxError, MemoryError, RecursionError):
+                found["interpret_as"] = ast.literal_eval(spec)
+    for name in ("y_down", "lenient"):
+        if camera.facts.get(name) == "True":
+            found[name] = True
+    return found

@@ -1,0 +1,223 @@
+"""A folder of recordings that follow each other: names, whose they are, how much there is.
+
+A file's name is its camera's, with ``.`` for ``/``, and when the first in it came, UTC:
+``line1.cam3_20260102T030405.678Z.mcap``. Sorted by name a camera's files are in order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam._locks import try_lock
+from smartcam.exceptions import ConfigurationError
+from smartcam.recording._form import EPOCH, PROFILE
+from smartcam.recording._records import MAGIC
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ENDING = ".mcap"
+
+_NAME = re.compile(
+    r"(?P<camera>[a-z0-9_-]+(?:\.[a-z0-9_-]+){0,3})_(?P<at>\d{8}T\d{6}\.\d{3})Z\.mcap", re.ASCII
+)
+_AT = "%Y%m%dT%H%M%S.%f"
+
+_HEAD = MAGIC + b"\x01"
+_PROFILE_AT = len(_HEAD) + 8
+"""Where the length of the header's profile stands, behind the record's own."""
+
+LOCK = ".smartcam.lock"
+"""The file that is locked where a folder cannot be: on Windows."""
+
+
+class FileName(NamedTuple):
+    """What a file's name says.
+
+    Attributes:
+        camera: its camera.
+        at: when the first in it came, UTC, in whole milliseconds; later where the clock went back.
+    """
+
+    camera: str
+    at: datetime
+
+    @classmethod
+    def parse(cls, name: str) -> FileName | None:
+        """Return what a name says; None where it is no name of a recorder's."""
+        found = _NAME.fullmatch(name)
+        if found is None:
+            return None
+        try:
+            at = datetime.strptime(found["at"], _AT).replace(tzinfo=UTC)
+        except ValueError:
+            return None
+        return cls(found["camera"].replace(".", "/"), at)
+
+    def __str__(self) -> str:
+        at = self.at.strftime("%Y%m%dT%H%M%S.") + f"{self.at.microsecond // 1000:03d}"
+        return f"{self.camera.replace('/', '.')}_{at}Z{ENDING}"
+
+
+@dataclass(order=True)
+class KnownFile:
+    """A file of the folder; the oldest is the least.
+
+    Attributes:
+        at: when it was begun.
+        name: its name.
+        size: its bytes.
+    """
+
+    at: datetime
+    name: str
+    size: int = field(compare=False)
+
+
+def is_ours(path: Path) -> bool:
+    """Return whether a file has the form of a recording of smartcam's; an empty one has not."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_PROFILE_AT + 4 + len(PROFILE))
+    except OSError:
+        return False
+    length = int.from_bytes(head[_PROFILE_AT : _PROFILE_AT + 4], "little")
+    return (
+        head.startswith(_HEAD)
+        and length == len(PROFILE)
+        and head[_PROFILE_AT + 4 :] == PROFILE.encode()
+    )
+
+
+def files_of(folder: Path) -> Iterator[tuple[FileName, os.DirEntry[str]]]:
+    """Give the files with a recorder's names, in no order; what they hold is not looked at.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    with os.scandir(folder) as found:
+        for entry in found:
+            name = FileName.parse(entry.name)
+            if name is not None and entry.is_file(follow_symlinks=False):
+                yield name, entry
+
+
+class RecordingFolder:
+    """A folder that one recorder writes in; not safe for threads.
+
+    Args:
+        path: the folder.
+
+    Attributes:
+        path: as given.
+        files: the recorder's files in it by name, as far as is known.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.files: dict[str, KnownFile] = {}
+        self._ours: dict[str, bool] = {}  # what was looked into
+        self._lock: int | None = None
+        self._made = False  # it was there once: it is not made again
+        self._last: dict[str, datetime] = {}  # when the last file of each camera was begun
+
+    def enter(self) -> None:
+        """Make the folder where it never was, lock it and look what is in it.
+
+        A folder that was there and is gone is not made again: it may have been a mount, and what
+        stands in its place may be small.
+
+        Raises:
+            ConfigurationError: another recorder writes in it.
+            OSError: it cannot be made, or read.
+        """
+        self.leave()
+        if not self._made:
+            self.path.mkdir(exist_ok=True)
+        flags = getattr(os, "O_DIRECTORY", None)
+        if flags is None:
+            lock = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT)
+        else:
+            lock = os.open(self.path, os.O_RDONLY | flags)
+        if try_lock(lock) is False:
+            os.close(lock)
+            raise ConfigurationError(f"recordings {self.path}: another recorder writes in it")
+        self._lock, self._made = lock, True
+        self.look()
+
+    def leave(self) -> None:
+        """Let another one have it. Idempotent."""
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            os.close(lock)
+
+    def look(self) -> None:
+        """Look what is there now.
+
+        Raises:
+            OSError: the folder cannot be read.
+        """
+        found: dict[str, KnownFile] = {}
+        ours: dict[str, bool] = {}
+        for name, entry in files_of(self.path):
+            known = self._ours.get(entry.name)
+            ours[entry.name] = known = is_ours(Path(entry.path)) if known is None else known
+            if known:
+                with contextlib.suppress(FileNotFoundError):
+                    size = entry.stat(follow_symlinks=False).st_size
+                    found[entry.name] = KnownFile(name.at, entry.name, size)
+            self._note(name)
+        self.files, self._ours = found, ours
+
+    def _note(self, name: FileName) -> None:
+        self._last[name.camera] = max(name.at, self._last.get(name.camera, EPOCH))
+
+    def next_path(self, camera: str, at: datetime) -> Path:
+        """Return the path of a camera's next file: it sorts behind all that were.
+
+        Args:
+            camera: its name.
+            at: when what comes first in it came.
+        """
+        whole = max(EPOCH, at - timedelta(microseconds=at.microsecond % 1000))
+        last = self._last.get(camera)
+        if last is not None:
+            whole = max(whole, last + timedelta(milliseconds=1))
+        name = FileName(camera, whole)
+        self._note(name)
+        return self.path / str(name)
+
+    def add(self, path: Path) -> None:
+        """Count a file that was just made."""
+        name = FileName.parse(path.name)
+        if name is not None:
+            self._ours[path.name] = True
+            self.files[path.name] = KnownFile(name.at, path.name, 0)
+
+    def grown(self, path: Path, size: int) -> None:
+        """Say how large a file is now."""
+        if path.name in self.files:
+            self.files[path.name].size = size
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the recorder's files together."""
+        return sum(one.size for one in self.files.values())
+
+    def delete(self, name: str) -> None:
+        """Delete a file of the recorder's; one that is not its own any more is left.
+
+        Raises:
+            OSError: it cannot be deleted.
+        """
+        path = self.path / name
+        if is_ours(path):
+            path.unlink(missing_ok=True)
+        self.files.pop(name, None)
+        self._ours.pop(name, None)

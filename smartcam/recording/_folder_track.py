@@ -1,0 +1,133 @@
+"""What is recorded of one camera beside an agent: its account, its file, what is missing in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.models import CameraEvent, Connected, Reconnected
+from smartcam.recording._form import GAP, RecordedError
+from smartcam.recording._recorder import Description, address_facts
+from smartcam.recording._state import RecordedState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.recording._form import Item
+    from smartcam.recording._recorder import RecordingFile
+
+
+class RecordingAccount(NamedTuple):
+    """What became of a camera's records: frames, results, events and errors, all counted alike.
+
+    Attributes:
+        written: on the disk.
+        waiting: for the disk.
+        lost: not written: the disk was full, gone or too slow, or it could not be read back.
+    """
+
+    written: int = 0
+    waiting: int = 0
+    lost: int = 0
+
+
+@dataclass(eq=False)
+class Gap:
+    """Records that were not written.
+
+    Attributes:
+        since: when the first of them came.
+        until: when the last of them came.
+        count: how many.
+        reason: why.
+        events: the last event of each kind among them, in order.
+    """
+
+    since: datetime
+    until: datetime
+    count: int
+    reason: str
+    events: dict[type, CameraEvent] = field(default_factory=dict[type, CameraEvent])
+
+    def error(self, camera: str) -> RecordedError:
+        """Return what stands in the file."""
+        text = (
+            f"{self.count} records from {self.since.isoformat()} to {self.until.isoformat()} were "
+            f"not written: {self.reason}"
+        )
+        return RecordedError(camera, self.until, GAP, text, None, self.since, self.count)
+
+
+class CameraTrack:
+    """What is recorded of one camera.
+
+    Args:
+        camera: its name.
+        read: makes items of what was put in, in the thread.
+
+    Attributes:
+        endian: that its last status told.
+        offered: records that came.
+        left_out: those of them that found no room to wait.
+        written: records on the disk.
+        lost: others that are not, and will not be.
+        overflow: the gap that grows where too much waits; None where nothing is left out.
+    """
+
+    def __init__(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> None:
+        self.camera = camera
+        self.read = read
+        self.offered = self.left_out = 0  # whoever puts something in counts these
+        self.written = self.lost = self.more = 0  # and the writer these
+        self.overflow: Gap | None = None
+        self.state = RecordedState(camera)
+        self.endian = 0
+        self.facts: dict[str, str] = {"camera": camera}
+        self.gap: Gap | None = None  # not told in a file that is on the disk
+        self.gap_told = False  # it is in the file's next chunk
+        self.file: RecordingFile | None = None
+        self.begun = 0.0  # when the file was, on the steady clock
+        self.good = 0  # bytes of the file that are on the disk
+
+    @property
+    def account(self) -> RecordingAccount:
+        """What became of its records."""
+        written, lost = self.written, self.lost + self.left_out
+        return RecordingAccount(written, self.offered + self.more - written - lost, lost)
+
+    def lose(self, given: list[Any], reason: str) -> None:
+        """Count what was put in and is not written; what it says of the camera is kept."""
+        for one in given:
+            if isinstance(one, Description):
+                self.facts |= one.facts
+            elif isinstance(one, Gap):
+                self._widen(one)  # it is counted
+                self.follow_all(one)
+            else:
+                self.follow(one)
+                self.lose_one(reason)
+
+    def lose_one(self, reason: str) -> None:
+        """Count a record that is not written."""
+        at = datetime.now(UTC)
+        self.lost += 1
+        self._widen(Gap(at, at, 1, reason))
+
+    def follow(self, item: object) -> None:
+        """Keep what an item says of the camera."""
+        if isinstance(item, CameraEvent):
+            self.state = self.state.after(item)
+        if isinstance(item, (Connected, Reconnected)):
+            self.facts |= address_facts(item.url)
+
+    def follow_all(self, gap: Gap) -> None:
+        """Keep what the events of a gap say of the camera."""
+        for event in gap.events.values():
+            self.follow(event)
+
+    def _widen(self, more: Gap) -> None:
+        if self.gap is None:
+            self.gap = replace(more)
+        else:
+            self.gap.until, self.gap.count = more.until, self.gap.count + more.count

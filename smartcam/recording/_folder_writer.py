@@ -1,0 +1,281 @@
+"""The thread that writes a folder of recordings: of each camera files that follow each other.
+
+What comes is put into one list, in bounds; the thread takes the list twice a second and has each
+camera's part of it put on the disk. What a disk does not take is counted, camera by camera, and
+told in the files as soon as there is one that takes it.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import shutil
+import threading
+import time
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError, RecordingError
+from smartcam.models import CameraEvent
+from smartcam.recording._folder_files import FolderFiles, Limits
+from smartcam.recording._folder_track import CameraTrack, Gap
+from smartcam.recording._recorder import (
+    CHUNK,
+    CLOSE_TIMEOUT,
+    INTERVAL,
+    MAX_WAITING,
+    OVERHEAD,
+    Description,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.recording._folder import RecordingFolder
+    from smartcam.recording._folder_track import RecordingAccount
+    from smartcam.recording._form import Item
+
+logger: logging.Logger = logging.getLogger("smartcam.recording")
+
+ROOM = 4 * CHUNK
+"""Bytes that must be free on a disk that was full before it is tried again."""
+
+RETRIES = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
+"""Seconds until a disk that did not take something is tried again; the last for ever."""
+
+EVENT_ROOM = 2
+"""How much more may wait before events are left out, too: they say what the camera is."""
+
+
+@dataclass(eq=False)
+class _Trouble:
+    """Why nothing is written at the time."""
+
+    error: RecordingError
+    reason: str  # without the folder
+    full: bool  # there was no room
+    again: float  # when it is tried again, on the steady clock
+    tries: int = 0
+
+
+@dataclass(eq=False)
+class _DiskQueue:
+    """What waits for the thread."""
+
+    items: list[tuple[CameraTrack, Any]] = field(default_factory=list[tuple[CameraTrack, Any]])
+    bytes: int = 0
+
+
+class FolderWriter:
+    """Writes what is put in.
+
+    Args:
+        folder: that the files are in.
+        limits: of files.
+        mcap: the library's module ``mcap.writer``.
+        tell: called in the thread with why nothing is written, and with None when it is again.
+        clock: seconds, for the files' age and delays.
+
+    Attributes:
+        trouble: why nothing is written at the time; None where all is well.
+    """
+
+    def __init__(
+        self,
+        folder: RecordingFolder,
+        limits: Limits,
+        mcap: Any,
+        tell: Callable[[RecordingError | None], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._folder, self._tell, self._clock = folder, tell, clock
+        self._files = FolderFiles(folder, limits, mcap, clock)
+        self._more = threading.Condition()
+        self._waiting = _DiskQueue()
+        self._closing = False
+        self._tracks: dict[str, CameraTrack] = {}
+        self._trouble: _Trouble | None = None
+        self._thread: threading.Thread | None = None
+
+    # ------------------------------------------------------------------ from any thread
+
+    @property
+    def trouble(self) -> RecordingError | None:
+        trouble = self._trouble
+        return None if trouble is None else trouble.error
+
+    @property
+    def accounts(self) -> dict[str, RecordingAccount]:
+        """What became of each camera's records."""
+        with self._more:
+            return {name: track.account for name, track in self._tracks.items()}
+
+    def track(self, camera: str, read: Callable[[Any], Iterator[Item]]) -> CameraTrack:
+        """Return a new track."""
+        with self._more:
+            track = self._tracks[camera] = CameraTrack(camera, read)
+        return track
+
+    def describe(self, track: CameraTrack, facts: dict[str, str]) -> None:
+        """Keep facts about a camera in each of its files."""
+        with self._more:
+            self._waiting.items.append((track, Description({"camera": track.camera, **facts})))
+
+    def put(self, track: CameraTrack, given: Any, size: int, *, event: bool = False) -> None:
+        """Have something written; where too much waits it is left out and counted. Never waits.
+
+        Args:
+            track: whose it is.
+            given: what ``read`` of the track makes items of.
+            size: its bytes.
+            event: it says what the camera is.
+        """
+        with self._more:
+            waiting = self._waiting
+            track.offered += 1
+            room = MAX_WAITING * EVENT_ROOM if event else MAX_WAITING
+            if self._closing or waiting.bytes > room:
+                self._leave_out(track, given)
+                return
+            before = waiting.bytes
+            waiting.items.append((track, given))
+            waiting.bytes += size + OVERHEAD
+            if not before or before < CHUNK <= waiting.bytes:
+                self._more.notify()
+
+    def _leave_out(self, track: CameraTrack, given: Any) -> None:
+        at = datetime.now(UTC)
+        track.left_out += 1
+        if track.overflow is None:
+            track.overflow = Gap(at, at, 0, "the disk is too slow")
+            self._waiting.items.append((track, track.overflow))
+        gap = track.overflow
+        gap.until, gap.count = at, gap.count + 1
+        if isinstance(given, CameraEvent):
+            gap.events.pop(type(given), None)
+            gap.events[type(given)] = given
+
+    def start(self) -> None:
+        """Enter the folder and start the thread. It blocks for as long as the disk wants.
+
+        Raises:
+            ConfigurationError: another recorder writes in the folder.
+        """
+        try:
+            self._files.enter()
+        except OSError as exc:
+            self._fail(exc)
+        self._thread = threading.Thread(
+            target=self._run, name=f"smartcam.recordings[{self._folder.path.name}]", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Write what waits and end the files; bounded. It blocks. Idempotent."""
+        with self._more:
+            self._closing = True
+            self._more.notify()
+        thread = self._thread
+        if thread is not None:
+            thread.join(CLOSE_TIMEOUT)
+            if thread.is_alive():
+                logger.error(
+                    "recordings %s: the disk did not take the rest within %g s",
+                    self._folder.path,
+                    CLOSE_TIMEOUT,
+                )
+
+    # ------------------------------------------------------------------ the thread
+
+    def _run(self) -> None:
+        try:
+            over = False
+            while not over:
+                items, over = self._take()
+                self._write(items)
+        finally:
+            for track in self._all_tracks():
+                self._files.finish(track)
+            self._folder.leave()
+
+    def _take(self) -> tuple[dict[CameraTrack, list[Any]], bool]:
+        """Wait for something; return it by its camera, and whether that was the last."""
+        with self._more:
+            self._more.wait_for(lambda: self._waiting.items or self._closing, INTERVAL)
+            if self._waiting.items:
+                self._more.wait_for(lambda: self._closing or self._waiting.bytes > CHUNK, INTERVAL)
+            taken, self._waiting = self._waiting, _DiskQueue()
+            for track in self._tracks.values():
+                track.overflow = None
+            over = self._closing
+        found: dict[CameraTrack, list[Any]] = {}
+        for track, item in taken.items:
+            found.setdefault(track, []).append(item)
+        return found, over
+
+    def _write(self, found: dict[CameraTrack, list[Any]]) -> None:
+        """Write what came, or count it; never raises."""
+        try:
+            if self._ready(found):
+                for track, given in found.items():
+                    self._files.write(track, given)
+                tracks = self._all_tracks()
+                self._files.end_old(tracks)
+                self._files.delete_old(tracks)
+                if found:
+                    self._heal()
+        except (OSError, ConfigurationError) as exc:
+            self._fail(exc)
+        except Exception as exc:
+            logger.exception("recordings %s: unexpected", self._folder.path)
+            self._fail(exc)
+        trouble = self._trouble
+        if trouble is not None:
+            for track, given in found.items():
+                track.lose(given, trouble.reason)
+
+    def _ready(self, found: dict[CameraTrack, list[Any]]) -> bool:
+        """Return whether the disk is to be tried; where it had failed, look whether there is room.
+
+        Raises:
+            ConfigurationError: another recorder has the folder now.
+            OSError: the folder is not there, or there is no room.
+        """
+        trouble, now = self._trouble, self._clock()
+        if trouble is None:
+            return True
+        if now < trouble.again or not found:
+            return False
+        self._files.enter()
+        if trouble.full and shutil.disk_usage(self._folder.path).free < ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return True
+
+    def _all_tracks(self) -> list[CameraTrack]:
+        with self._more:
+            return [*self._tracks.values()]
+
+    # ------------------------------------------------------------------ trouble
+
+    def _fail(self, error: Exception) -> None:
+        before = self._trouble
+        tries = 0 if before is None else before.tries + 1
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        prefix = f"recordings {self._folder.path}: "
+        told = RecordingError(prefix + reason.removeprefix(prefix))
+        told.__cause__ = error
+        full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
+        again = self._clock() + RETRIES[min(tries, len(RETRIES) - 1)]
+        self._trouble = _Trouble(told, reason, full, again, tries)
+        if before is None:
+            logger.warning("%s; nothing is recorded until it is better", told)
+            self._tell(told)
+
+    def _heal(self) -> None:
+        """The disk took something."""
+        if self._trouble is not None:
+            self._trouble = None
+            logger.warning("recordings %s: recorded again", self._folder.path)
+            self._tell(None)

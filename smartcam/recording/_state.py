@@ -1,0 +1,92 @@
+"""What a camera was at a place in a recording, for who does not read what came before."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.models import (
+    ApplicationChanged,
+    CameraEvent,
+    Connected,
+    Disconnected,
+    Reconnected,
+    Status,
+    StatusChanged,
+)
+from smartcam.recording._form import MAX_NAME, time_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+STATE_METADATA = "smartcam.state"
+"""Name of the metadata records that say what a camera was at their place in the file: where a file
+begins while there is a session, and behind a gap."""
+
+
+class RecordedState(NamedTuple):
+    """What a camera was at a place in the file.
+
+    Attributes:
+        camera: name of the camera.
+        connected: there was a session.
+        application: id of the active one, None where it was not known.
+        status: None where it was not known.
+        endian: that the last status told.
+        at: when, UTC; None until it is written.
+    """
+
+    camera: str
+    connected: bool = False
+    application: int | None = None
+    status: Status | None = None
+    endian: int = 0
+    at: datetime | None = None
+
+    def after(self, event: CameraEvent) -> RecordedState:
+        """Return what it is after an event."""
+        match event:
+            case Connected() | Reconnected():
+                return self._replace(connected=True)
+            case Disconnected():
+                return RecordedState(self.camera)
+            case StatusChanged(status=status):
+                return self._replace(status=status)
+            case ApplicationChanged(application=application):
+                return self._replace(application=application)
+            case _:
+                return self
+
+    def facts(self, endian: int) -> dict[str, str]:
+        """Return what stands in the file, now."""
+        found = {
+            "camera": self.camera,
+            "at": datetime.now(UTC).isoformat(),
+            "connected": "yes" if self.connected else "no",
+            "endian": str(endian),
+        }
+        if self.application is not None:
+            found["application"] = str(self.application)
+        if self.status is not None:
+            found["status"] = str(int(self.status))
+        return found
+
+    @classmethod
+    def of(cls, facts: Mapping[str, str]) -> RecordedState:
+        """Return what stands in a file.
+
+        Raises:
+            ValueError: it is none.
+        """
+        application, status = facts.get("application"), facts.get("status")
+        camera, endian = facts.get("camera", ""), facts.get("endian", "0")
+        if not 1 <= len(camera) <= MAX_NAME or endian not in {"0", "1"}:
+            raise ValueError(f"a state of camera {camera!r:.60}, endian {endian!r:.20}")
+        return cls(
+            camera,
+            facts.get("connected") == "yes",
+            None if application is None else int(application),
+            None if status is None else Status(int(status)),
+            int(endian),
+            time_of(facts.get("at", "")),
+        )

@@ -1,0 +1,83 @@
+"""A recorder beside an agent whose cameras count, all in this process."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+from smartcam.fleet import FleetFile, FleetServer
+from smartcam.fleet._bus import MemoryBus
+from smartcam.fleet._recording_file import RecordSection
+from smartcam.recording import FleetRecorder, Recording, load_recording
+from smartcam.recording._folder import FileName, files_of
+from tests.fleet.fleetkit import LAYOUT, PATIENCE
+
+NAME = "line1/cam1"
+
+
+def section(**fields: Any) -> RecordSection:
+    """Return what a file says, with sizes as small as a test wants."""
+    said = {"folder": "rec", "size": 1e8, "age": 3600.0, "keep": 1e10, "cameras": ("**",)}
+    return RecordSection.model_construct(**{**said, "frames": True, **fields})
+
+
+def server(folder: Path, *urls: str) -> FleetServer:
+    """Return the agent of cameras ``line1/cam1``, ... at these addresses."""
+    entries = {
+        f"line1/cam{place}": {
+            "url": url,
+            "application": 1,
+            "interpret_as": LAYOUT,
+            "reconnect": {"initial": 0.01, "maximum": 0.05},
+        }
+        for place, url in enumerate(urls, 1)
+    }
+    file = FleetFile.model_validate({"cameras": entries})
+    return FleetServer(file, bus=MemoryBus().end(), folder=folder)
+
+
+@contextlib.asynccontextmanager
+async def recording(
+    place: Path, *urls: str, clock: Callable[[], float] = time.monotonic, **fields: Any
+) -> AsyncIterator[tuple[FleetRecorder, FleetServer]]:
+    """Record cameras into ``place/rec``."""
+    agent = server(place, *urls)
+    recorder = FleetRecorder(agent, section(**fields), _clock=clock)
+    async with recorder, agent:
+        await agent.wait_tried()
+        yield recorder, agent
+
+
+async def until(true: Callable[[], object]) -> None:
+    """Wait for something that a thread does."""
+    async with asyncio.timeout(PATIENCE):
+        while not true():  # noqa: ASYNC110 - a thread does it
+            await asyncio.sleep(0.005)
+
+
+def files(folder: Path, camera: str = NAME) -> list[Path]:
+    """Return the files of a camera, in order."""
+    found = [(name, Path(entry.path)) for name, entry in files_of(folder / "rec")]
+    return [path for name, path in sorted(found) if name.camera == camera]
+
+
+def runs(found: Recording, camera: str = NAME) -> list[int]:
+    """Return the numbers that the camera's results have."""
+    return [result.value["run"] for result in found.results(camera)]
+
+
+def all_runs(folder: Path, camera: str = NAME) -> list[int]:
+    """Return the numbers of all results in a folder, file by file as they sort by name."""
+    names = sorted(path.name for path in files(folder, camera))
+    return [run for name in names for run in runs(load_recording(folder / "rec" / name), camera)]
+
+
+def name_of(path: Path) -> FileName:
+    """Return what a file's name says."""
+    found = FileName.parse(path.name)
+    assert found is not None
+    return found
