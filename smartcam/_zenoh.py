@@ -57,6 +57,9 @@ TURN = 64
 
 CLOSE_TIMEOUT = 5.0
 
+DECLARED_AT_ONCE = 32
+"""Things declared in one turn of the event loop, where there are many."""
+
 _ONE = (1).to_bytes(8, sys.byteorder)
 
 
@@ -193,7 +196,7 @@ class ZenohSession:
         self._link, self._more, self._what = link, dict(more or {}), what
         self._zenoh = engine()
         self._session: Any = None
-        self._declared: set[ZenohDeclared] = set()
+        self._declared: dict[ZenohDeclared, None] = {}  # in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._bytes = 0
@@ -203,6 +206,7 @@ class ZenohSession:
         self._told_dropped = False
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
+        self._reopening = False
         self._look: asyncio.TimerHandle | None = None  # for connections that linger
 
     # ------------------------------------------------------------------ life
@@ -214,10 +218,17 @@ class ZenohSession:
             ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
             ConfigurationError: the engine refuses a setting.
         """
-        self._loop = loop = asyncio.get_running_loop()
-        zenoh = self._zenoh
+        self._loop = asyncio.get_running_loop()
+        await self._open(timeout)
+        self._end_lingering()
+        self._bell = _LoopBell.on(self._loop, self._drain)
+        return self
+
+    async def _open(self, timeout: float) -> None:
+        loop, zenoh = self._loop, self._zenoh
         config = zenoh.Config()
-        for path, value in {**self._link.settings(timeout), **self._more}.items():
+        settings = {**self._link.settings(timeout), **self._more}
+        for path, value in settings.items():
             try:
                 config.insert_json5(path, json.dumps(value))
             except zenoh.ZError as exc:
@@ -236,9 +247,32 @@ class ZenohSession:
         except asyncio.CancelledError:
             opening.add_done_callback(_close_late)
             raise
-        self._end_lingering()
-        self._bell = _LoopBell.on(loop, self._drain)
-        return self
+
+    async def reopen(self, timeout: float) -> None:
+        """Have a new session in the place of this one, with all that is declared.
+
+        Those at the other ends of its connections see it go and come; nothing is said or heard in
+        between. What is declared meanwhile is declared with all else.
+
+        Raises:
+            ConnectFailedError: it cannot listen again within ``timeout`` seconds; it is away until
+                it is tried again.
+
+        Cancellation: as an error.
+        """
+        session, self._session = self._session, None
+        if session is not None:
+            self._reopening = True
+            old = [one.lose() for one in tuple(self._declared)]
+            await self._loop.run_in_executor(None, _lose, session, old)
+        if not self._reopening:
+            raise ConfigurationError(f"{self._what} is not open")
+        await self._open(timeout)
+        for number, one in enumerate(tuple(self._declared)):
+            if number % DECLARED_AT_ONCE == 0:
+                await asyncio.sleep(0)
+            one.again()
+        self._reopening = False
 
     def _end_lingering(self) -> None:
         """Look at the connections now, and again before a new one can be cut off for its lease."""
@@ -255,6 +289,7 @@ class ZenohSession:
     async def close(self) -> None:
         """Close it; what was declared is gone with it. Idempotent."""
         session, self._session = self._session, None
+        self._reopening = False
         if self._look is not None:
             self._look.cancel()
         self._waiting.clear()
@@ -362,13 +397,13 @@ class ZenohSession:
 
     def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; it is closed with this end."""
-        made = how(self.session)
-        self._declared.add(one)
+        made = None if self._reopening else how(self.session)
+        self._declared[one] = None
         return made
 
     def forget(self, one: ZenohDeclared) -> None:
         """It is closed."""
-        self._declared.discard(one)
+        self._declared.pop(one, None)
 
     @property
     def session(self) -> Any:
@@ -450,11 +485,31 @@ class ZenohDeclared:
         self._end = end
         self._closed = False
         self._it: Any = None
+        self._how: Callable[[Any], Any] = _nothing
+        self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
         """Declare what ``how`` makes of the engine's session."""
+        self._how = how
         self._it = self._end.declare(self, how)
         return self
+
+    def when_lost(self, call: Callable[[], None]) -> Self:
+        """Have something called in the event loop when its session is lost to a new one."""
+        self._on_lost = call
+        return self
+
+    def lose(self) -> Any:
+        """Its session is about to end; return what is to be kept until it has."""
+        it, self._it = self._it, None
+        if self._on_lost is not None:
+            self._end.later(self.call, self._on_lost)
+        return None if self._by_dropping else it
+
+    def again(self) -> None:
+        """Declare it at the session that is there now."""
+        if not self._closed and self._it is None:
+            self._it = self._how(self._end.session)
 
     def call(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call back, unless it was closed meanwhile."""
@@ -467,8 +522,17 @@ class ZenohDeclared:
             self._closed = True
             self._end.forget(self)
             it, self._it = self._it, None
-            if not self._by_dropping:
+            if not self._by_dropping and it is not None:
                 quietly(it.undeclare)
+
+
+def _lose(session: Any, declared: list[Any]) -> None:
+    session.close()
+    declared.clear()  # which takes long before
+
+
+def _nothing(_: Any) -> None:
+    pass
 
 
 def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:

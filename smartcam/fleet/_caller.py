@@ -10,11 +10,13 @@ from smartcam.exceptions import (
     ConnectionClosedError,
     ConnectionLostError,
     LinkError,
+    NotAllowedError,
     RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
 )
+from smartcam.fleet._certificates import may_command
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._wire import BusMessage, TriggerOrder, TriggerReply, encode, encode_order, grace
@@ -357,6 +359,7 @@ class Caller:
         met: Met | None,
     ) -> Reply:
         """Say a call, and return the reply to it; ``deadline`` is this side's."""
+        self._check_allowed(do)
         program, key = self.program, self._key(agent, do)
         waiting = program.expect(number, self)
         timer = asyncio.get_running_loop().call_at(deadline, _expire, waiting)
@@ -384,7 +387,7 @@ class Caller:
 
     def tell(self, do: str, arguments: dict[str, Any]) -> None:
         """Have something done without waiting for it, if there is an agent."""
-        if self.met is not None:
+        if self.met is not None and self._allowed(do):
             fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
             self._insist(self._key(self.met.agent, do), fields)
 
@@ -431,6 +434,32 @@ class Caller:
         self._insisting.add(task)
         task.add_done_callback(self._insisting.discard)
 
+    def _allowed(self, do: str) -> bool:
+        identity = self.program.bus.identity
+        return do not in COMMANDS or identity is None or may_command(identity.role)
+
+    def _check_allowed(self, do: str) -> None:
+        """Refuse what the bus would swallow.
+
+        Raises:
+            NotAllowedError: the role of this program's certificate forbids it.
+        """
+        identity = self.program.bus.identity
+        if identity is not None and not self._allowed(do):
+            raise NotAllowedError(
+                f"{self.name}: {do} is a command, and this program's certificate is that of "
+                f"{identity}, who may look; nothing was sent",
+                role=identity.role,
+                certificate=identity.name,
+            )
+
+    def _perhaps(self, do: str) -> str:
+        """Return what else silence may mean."""
+        identity = self.program.bus.identity
+        if identity is None:
+            return ""
+        return f"; nobody is there, or {do} is not allowed for {identity}"
+
     def _key(self, agent: str, do: str) -> str:
         return self.program.keys.call(agent, self.camera, command=do in COMMANDS)
 
@@ -439,12 +468,12 @@ class Caller:
         if do == "trigger":
             return TriggerTimeoutError(
                 f"{self.name}: the {agent} said nothing within {waited:.3g} s; whether the camera "
-                "was triggered is unknown",
+                f"was triggered is unknown{self._perhaps(do)}",
                 waited=waited,
             )
         return ResponseTimeoutError(
             f"{self.name}: the {agent} said nothing to {do} within {waited:.3g} s; whether it was "
-            "done is unknown",
+            f"done is unknown{self._perhaps(do)}",
             waited=waited,
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 from pathlib import Path
@@ -11,11 +12,15 @@ from smartcam._server import Server
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.camera import DEFAULT_MAX_QUEUE
 from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._access import access_control
+from smartcam.fleet._access_file import access_mistakes, access_of
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._agent import Agent
+from smartcam.fleet._certificates import AGENT
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
+from smartcam.fleet._renewal import CertificateWatch
 from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
@@ -23,9 +28,11 @@ from smartcam.models import CameraEvent
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from typing import Literal
 
     from smartcam.emulator._wire_camera import WireCamera
+    from smartcam.fleet._access_file import Access
     from smartcam.fleet._bus import Bus
     from smartcam.fleet._file import Planned
     from smartcam.fleet._host import Host
@@ -59,6 +66,8 @@ class FleetServer(Server):
         except ValueError as exc:
             raise ConfigurationError(f"fleet {self.file.fleet}: {exc}") from exc
         listen, connect = self.file.endpoints
+        for _, mistake in access_mistakes(self.file.access, listen):
+            raise ConfigurationError(f"fleet {self.file.fleet}: {mistake}")
         self._listen, self._connect = listen, connect = with_ports(listen), connect
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
         self._ros: RosFleet | None = None
@@ -101,17 +110,71 @@ class FleetServer(Server):
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
-            if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
+            self._check_role()
+            stack.push_async_callback(self._leave_ros)
+            await self._enter_ros()
+            if self.file.certificates is not None and isinstance(self._bus, ZenohEnd):
+                watching = self._watch_certificates(self._bus, agent)
+                stack.push_async_callback(_end, watching)
             self._agent, self._stack = agent, stack.pop_all()
 
     def _more(self) -> dict[str, Any]:
         """Return further settings of the engine."""
-        if self.file.ros2 is None:
-            return {}
-        from smartcam.ros2._context import SETTINGS
+        found: dict[str, Any] = {}
+        domain: int | None = None
+        if self.file.ros2 is not None:
+            from smartcam.ros2._context import SETTINGS, RosContext
 
-        return dict(SETTINGS)
+            found |= SETTINGS
+            domain = RosContext(domain=self.file.ros2.domain).domain
+        if self._access == "roles":
+            found["access_control"] = access_control(domain)
+        return found
+
+    @property
+    def _access(self) -> Access | None:
+        return access_of(self.file.access, self._listen)
+
+    def _check_role(self) -> None:
+        """Refuse to guard by roles with a certificate that has none: nobody could use it.
+
+        Raises:
+            ConfigurationError: the certificate has another role, or none.
+        """
+        identity = self._bus.identity
+        if self._access == "roles" and identity is not None and identity.role != AGENT:
+            raise ConfigurationError(
+                f"fleet {self.file.fleet}: access: roles wants a certificate whose common name is "
+                f"{AGENT}, as smartcam fleet certificates makes them; that of "
+                f"{identity.folder} has {identity.role!r:.60}. access: any-certificate takes every "
+                "certificate of its authority"
+            )
+
+    def _watch_certificates(self, bus: ZenohEnd, agent: Agent) -> asyncio.Task[None]:
+        """Take renewed certificates from now on."""
+        watch = CertificateWatch(
+            bus, listens=bool(self._listen), busy=lambda: agent.busy, away=self._away_from_ros
+        )
+        return asyncio.get_running_loop().create_task(
+            watch.run(), name="smartcam.fleet.certificates"
+        )
+
+    async def _enter_ros(self) -> None:
+        if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
+            self._ros = self._seen_in_ros(self._bus)
+            await self._ros.start()
+
+    async def _leave_ros(self) -> None:
+        ros, self._ros = self._ros, None
+        if ros is not None:
+            await ros.stop()
+
+    @contextlib.asynccontextmanager
+    async def _away_from_ros(self) -> AsyncIterator[None]:
+        """Have no nodes for a while: what is said once for all would be lost with the session."""
+        await self._leave_ros()
+        yield
+        await self._enter_ros()
 
     def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
@@ -131,7 +194,7 @@ class FleetServer(Server):
 
     async def stop(self) -> None:
         """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
-        self._agent = self._ros = None
+        self._agent = None
         await self._stack.aclose()
         for stream in self._events:
             stream.end(None)
@@ -200,6 +263,11 @@ class FleetServer(Server):
         """The fleet URLs of its cameras, by name."""
         address = self.address
         return {planned.name: address.of(planned.name).url for planned in self._plan}
+
+
+async def _end(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.wait({task})
 
 
 def address_of(endpoint: str, file: FleetFile) -> FleetAddress:

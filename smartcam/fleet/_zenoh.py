@@ -13,6 +13,7 @@ import contextlib
 import functools
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from smartcam._zenoh import (
@@ -23,12 +24,16 @@ from smartcam._zenoh import (
     direct,
     quietly,
 )
+from smartcam.exceptions import ConnectFailedError
 from smartcam.fleet._bus import Bus, BusQuestion, Handle, Publisher
+from smartcam.fleet._certificates import read_identity, shake_hands
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from typing import Self
 
     from smartcam.fleet._bus import Data
+    from smartcam.fleet._certificates import Identity
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
@@ -76,6 +81,59 @@ class ZenohEnd(ZenohSession, Bus):
     def _threads(self) -> list[ThreadPoolExecutor]:
         sender, self._sender = self._sender, None
         return super()._threads() + ([] if sender is None else [sender])
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus.
+
+        Raises:
+            ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds; the
+                text says what is wrong with a certificate.
+            ConfigurationError: the certificates cannot work.
+        """
+        folder = self._link.certificates
+        if folder is None:
+            return await super().open(timeout)
+        loop = asyncio.get_running_loop()
+        end = loop.time() + timeout
+        await self.look_at_certificates()
+        try:
+            return await super().open(timeout)
+        except ConnectFailedError as exc:
+            if self._link.listen:
+                raise
+            if why := await self._why_refused(Path(folder), end - loop.time()):
+                raise self._failed(why) from exc
+            raise
+
+    async def look_at_certificates(self) -> Identity:
+        """Read whose its certificates are, as they are now.
+
+        Raises:
+            ConnectFailedError: they have expired.
+            ConfigurationError: they cannot work.
+        """
+        folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
+        identity = await loop.run_in_executor(None, read_identity, folder)
+        if identity.expired:
+            raise self._failed(identity.expired)
+        if identity.warning and (self.identity is None or self.identity.digest != identity.digest):
+            logger.warning("%s ! %s", self._link.place, identity.warning)
+        self.identity = identity
+        return identity
+
+    async def _why_refused(self, folder: Path, left: float) -> str:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(left):
+                for endpoint in self._link.connect:
+                    kind, _, place = endpoint.partition("/")
+                    host, _, port = place.rpartition(":")
+                    if kind == "tls":
+                        found = await shake_hands(host.strip("[]"), int(port), folder)
+                        if found.trouble:
+                            return found.trouble
+        return ""
 
     # ------------------------------------------------------------------ what is said
 
@@ -223,10 +281,23 @@ class ZenohEnd(ZenohSession, Bus):
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         put = self._zenoh.SampleKind.PUT
 
-        def on_sample(sample: Any) -> None:
-            self.in_loop(declared.call, 0, see, str(sample.key_expr), sample.kind == put)
+        there: dict[str, None] = {}
 
-        declared = _ZenohDeclared(self)
+        def on_presence(key: str, present: bool) -> None:
+            if present:
+                there[key] = None
+            else:
+                there.pop(key, None)
+            see(key, present)
+
+        def lost() -> None:  # who has gone when there is a new session is not told of then
+            for key in [*there]:
+                on_presence(key, False)
+
+        def on_sample(sample: Any) -> None:
+            self.in_loop(declared.call, 0, on_presence, str(sample.key_expr), sample.kind == put)
+
+        declared = _ZenohDeclared(self).when_lost(lost)
         return declared.of(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, direct(on_sample), history=True
@@ -237,7 +308,8 @@ class ZenohEnd(ZenohSession, Bus):
 
     def publish(self, publisher: Any, payload: bytes) -> None:
         """Have a publisher say something."""
-        quietly(publisher.put, payload)
+        if publisher is not None:  # else its session is about to be there
+            quietly(publisher.put, payload)
 
 
 class _ZenohDeclared(ZenohDeclared, Handle):
@@ -269,9 +341,13 @@ class _ZenohPublisher(Publisher):
         self._declared.of(lambda session: self._declare(declare(session), on_matching))
 
     def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
-        self._publisher = publisher
+        again, self._publisher = self._publisher is not None, publisher
         publisher.declare_matching_listener(direct(on_matching))
-        self._heard = publisher.matching_status.matching
+        heard = bool(publisher.matching_status.matching)
+        if again:
+            self._end.later(self._declared.call, self._on_heard, heard)
+        else:
+            self._heard = heard
         return publisher
 
     def _on_heard(self, heard: bool) -> None:
