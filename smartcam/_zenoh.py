@@ -57,6 +57,8 @@ TURN = 64
 
 CLOSE_TIMEOUT = 5.0
 
+NOT_ZENOH = "nothing there speaks Zenoh"
+
 DECLARED_AT_ONCE = 32
 """Things declared in one turn of the event loop, where there are many."""
 
@@ -578,4 +580,4 @@ def _reason(error: Exception) -> str:
     system = re.search(r": ([^:]+) \(os error \d+\)", text)
     if system is not None:
         return system[1]
-    return "nothing there speaks Zenoh" if "Unable to connect" in text else text
+    return NOT_ZENOH if "Unable to connect" in text else text

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.terminal import tinted
 from smartcam.models import Connected, Disconnected, Reconnected
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ async def serve(file: str | None, schema: bool, options: Options) -> None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
     async with smartcam.fleet.serve(file) as server:
         await server.wait_tried()
+        if server.warning:
+            click.echo(f"{tinted('error', 'warning:')} {server.warning}", err=True)
         events = server.events()
         for name in server.hosts:
             value = _camera(server, name)

@@ -6,6 +6,7 @@ import contextlib
 import ipaddress
 import json
 import os
+import re
 import socket
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -40,6 +41,8 @@ BEFORE = timedelta(days=1)
 
 HERE = ("localhost", "127.0.0.1", "::1")
 """Hosts that every agent's certificate is for."""
+
+HOST = re.compile(r"[\w.:-]+", re.ASCII)
 
 LISTENING = frozenset({AGENT, ROUTER})
 
@@ -94,6 +97,10 @@ def make_certificates(
         for name in several:
             if check_word(name, role) == AUTHORITY or names.setdefault(name, role) != role:
                 raise ConfigurationError(f"certificates: {name} is taken: expected another name")
+    said = [*dict.fromkeys(hosts)]
+    for host in said:
+        if not HOST.fullmatch(host):
+            raise ConfigurationError(f"certificates: {host!r:.80} is no host: expected plant-server")
     authority = _Authority.of(folder)
     known: dict[str, str] = {}
     for place in sorted(folder.iterdir()):
@@ -102,10 +109,9 @@ def make_certificates(
     for name, role in names.items():
         if known.setdefault(name, role) != role:
             raise ConfigurationError(
-                f"certificates: {name} is a {known[name]} already: expected another name for the "
-                f"{role}, or delete {folder / name}"
+                f"certificates: {name} has the role {known[name]} already: expected another name for "
+                f"the {role}, or delete {folder / name}"
             )
-    said = [*dict.fromkeys(hosts)]
     return [
         authority.make(role, name, said if name in names else [], lifetime)
         for name, role in known.items()
@@ -298,10 +304,7 @@ def _general(host: str) -> Any:
 
     with contextlib.suppress(ValueError):
         return x509.IPAddress(ipaddress.ip_address(host))
-    try:
-        return x509.DNSName(host)
-    except ValueError as exc:
-        raise ConfigurationError(f"certificates: {host!r:.80} is no host: {exc}") from exc
+    return x509.DNSName(host)
 
 
 def _hosts_of(certificate: Any) -> list[str]:

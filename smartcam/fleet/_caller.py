@@ -141,6 +141,9 @@ class Caller:
         if self.end is not None:
             raise self.end.with_traceback(None)
         if self.trouble is not None:
+            identity = self.program.bus.identity
+            if identity is not None and identity.expired:
+                raise ConnectionLostError(f"{self.trouble}; {identity.expired}") from self.trouble
             raise self.trouble.with_traceback(None)
         if self._task is not None:
             raise ConnectionLostError(f"{self.name}: no agent has answered yet")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import os
 import ssl
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -20,6 +21,8 @@ VIEWER, OPERATOR, AGENT, ROUTER = ROLES = ("viewer", "operator", "agent", "route
 
 WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
 """Before its end a certificate is warned of."""
+
+DAY = timedelta(days=1)
 
 LOOK = 1.0
 """Seconds for finding out why a handshake failed."""
@@ -49,6 +52,9 @@ ALERTS: dict[str, str] = {
     "RECORD_LAYER_FAILURE": "nothing there speaks TLS: is it fleet://, without +tls?",
 }
 """What the end of OpenSSL's reasons means."""
+
+
+SILENT = "nothing there answers a TLS handshake: is it fleet://, without +tls?"
 
 
 class Identity(NamedTuple):
@@ -85,24 +91,35 @@ class Identity(NamedTuple):
     @property
     def warning(self) -> str:
         """Say that it ends soon, or has; empty where it does not."""
-        if expired := self.expired:
-            return expired
-        left, what, ends = min((ends - datetime.now(UTC), w, ends) for w, ends in self._endings)
-        if left > WARN_BEFORE[0]:
-            return ""
-        return f"{what} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
+        return self.expired or ends_soon(*min(self._endings, key=lambda one: one[1]))
 
     @property
     def urgency(self) -> int:
         """How many of the times to warn are over; one more when it has expired."""
-        left = min(ends for _, ends in self._endings) - datetime.now(UTC)
-        return sum(left <= one for one in (*WARN_BEFORE, timedelta()))
+        return sum(self._left <= one for one in (*WARN_BEFORE, timedelta()))
+
+    @property
+    def look_after(self) -> float:
+        """Seconds until the next time to warn, a day at most: it may be another one by then."""
+        times = [self._left - one for one in (*WARN_BEFORE, timedelta()) if self._left > one]
+        return min([DAY, *times]).total_seconds() + 0.1
+
+    @property
+    def _left(self) -> timedelta:
+        return min(self.ends, self.authority_ends) - datetime.now(UTC)
 
     @property
     def _endings(self) -> tuple[tuple[str, datetime], ...]:
         mine = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
         theirs = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
         return (mine, self.ends), (theirs, self.authority_ends)
+
+
+def ends_soon(what: str, ends: datetime | None) -> str:
+    """Say that something ends soon; empty where it does not."""
+    if ends is None or (left := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
+        return ""
+    return f"{what} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
 
 
 def may_command(role: str) -> bool:
@@ -200,21 +217,21 @@ class Handshake(NamedTuple):
     ends: datetime | None
 
 
-async def shake_hands(host: str, port: int, folder: Path) -> Handshake:
-    """Try a handshake, and say what came of it; takes 1 s at most."""
+async def shake_hands(host: str, port: int, folder: Path, within: float = LOOK) -> Handshake:
+    """Try a handshake, and say what came of it ``within`` seconds."""
     loop = asyncio.get_running_loop()
     writer: asyncio.StreamWriter | None = None
     ends: datetime | None = None
     try:
-        async with asyncio.timeout(LOOK):
+        async with asyncio.timeout(within):
             made = await loop.run_in_executor(None, context, folder)
             reader, writer = await asyncio.open_connection(host, port, ssl=made)
             found: Any = writer.get_extra_info("peercert") or {}
             if "notAfter" in found:
                 ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(found["notAfter"]), UTC)
             await reader.read(1)  # who does not take our certificate says so now
-    except TimeoutError:
-        return Handshake("", ends)  # it waits for what we say next: all is well
+    except TimeoutError:  # who waits for what we say next has taken it
+        return Handshake(SILENT if writer is None else "", ends)
     except ssl.SSLCertVerificationError as exc:
         why = VERIFY.get(exc.verify_code, f"its certificate is not good: {exc.verify_message}")
         return Handshake(why.format(host=host), ends)
@@ -223,7 +240,7 @@ async def shake_hands(host: str, port: int, folder: Path) -> Handshake:
         known = (text for end, text in ALERTS.items() if reason.endswith(end))
         return Handshake(next(known, f"TLS: {reason}"), ends)
     except OSError as exc:
-        return Handshake(f"{exc.strerror or exc}", ends)
+        return Handshake(os.strerror(exc.errno) if exc.errno else str(exc), ends)
     finally:
         if writer is not None:
             writer.transport.abort()

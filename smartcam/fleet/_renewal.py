@@ -42,7 +42,6 @@ class CertificateWatch:
         listens: whether it listens.
         busy: whether there is something that should not be cut off.
         away: what goes round a new session: on entry all that cannot stay is closed.
-        look_every: seconds between two looks at the files.
     """
 
     def __init__(
@@ -52,20 +51,15 @@ class CertificateWatch:
         listens: bool,
         busy: Callable[[], bool],
         away: Callable[[], AbstractAsyncContextManager[None]] = contextlib.nullcontext,
-        look_every: float = LOOK_EVERY,
     ) -> None:
         self._end, self._listens, self._busy, self._away = end, listens, busy, away
-        self._every = look_every
-        self._urgency = 0
         self._trouble = ""
 
     async def run(self) -> None:
         """Look at the files now and then, for ever."""
         seen = self._end.identity
-        if seen is not None:
-            self._urgency = seen.urgency
         while True:
-            await asyncio.sleep(self._every)
+            await asyncio.sleep(LOOK_EVERY)
             try:
                 seen = await self._follow(seen)
             except Exception:
@@ -78,10 +72,7 @@ class CertificateWatch:
             if self._listens:
                 await self._reopen()
             logger.info("certificates ! those of %s were renewed: until %s", found, found.ends)
-        found = found or seen
-        if found is not None:
-            self._warn(found)
-        return found
+        return found or seen
 
     async def _look(self) -> Identity | None:
         """Return whose the certificates are; None where they cannot work, and told once."""
@@ -94,11 +85,6 @@ class CertificateWatch:
             return None
         self._trouble = ""
         return found
-
-    def _warn(self, identity: Identity) -> None:
-        if identity.urgency > self._urgency:
-            logger.warning("certificates ! %s", identity.warning)
-        self._urgency = identity.urgency
 
     async def _reopen(self) -> None:
         with contextlib.suppress(TimeoutError):

@@ -239,6 +239,16 @@ class FleetServer(Server):
             stream.offer(event, 0.0)
 
     @property
+    def busy(self) -> bool:
+        """Whether a command of a program is under way."""
+        return self._agent is not None and self._agent.busy
+
+    @property
+    def warning(self) -> str:
+        """What is to be done about its certificate, which ends soon; empty: nothing."""
+        return "" if self._bus.identity is None else self._bus.identity.warning
+
+    @property
     def name(self) -> str:
         """The agent's name."""
         return "" if self._agent is None else self._agent.name

@@ -18,15 +18,16 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._zenoh import (
     MOST_WAITING,
+    NOT_ZENOH,
     BusLink,
     ZenohDeclared,
     ZenohSession,
     direct,
     quietly,
 )
-from smartcam.exceptions import ConnectFailedError
+from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._bus import Bus, BusQuestion, Handle, Publisher
-from smartcam.fleet._certificates import read_identity, shake_hands
+from smartcam.fleet._certificates import LOOK, read_identity, shake_hands
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -59,6 +60,8 @@ class ZenohEnd(ZenohSession, Bus):
 
     def __init__(self, link: BusLink, more: Mapping[str, Any] | None = None) -> None:
         super().__init__(link, more)
+        self._warned: tuple[bytes, int] | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._sender: ThreadPoolExecutor | None = None
         self._sending = 0
         self._behind: collections.Counter[str] = collections.Counter()
@@ -94,21 +97,39 @@ class ZenohEnd(ZenohSession, Bus):
         """
         folder = self._link.certificates
         if folder is None:
-            return await super().open(timeout)
+            return await self._open_plain(timeout)
         loop = asyncio.get_running_loop()
         end = loop.time() + timeout
         await self.look_at_certificates()
         try:
-            return await super().open(timeout)
+            await super().open(timeout - min(LOOK, timeout / 3))  # to find out why not
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
             if why := await self._why_refused(Path(folder), end - loop.time()):
                 raise self._failed(why) from exc
             raise
+        self._looking = loop.create_task(self._look_now_and_then(), name="smartcam.fleet.look")
+        return self
+
+    async def _open_plain(self, timeout: float) -> Self:
+        try:
+            return await super().open(timeout)
+        except ConnectFailedError as exc:
+            if exc.attempts[0] != NOT_ZENOH:
+                raise
+            text = f"{exc}, or it wants TLS and a certificate: fleet+tls://"
+            raise ConnectFailedError(text, attempts=exc.attempts) from exc
+
+    async def close(self) -> None:
+        """Leave the bus; what was declared is gone with it. Idempotent."""
+        looking, self._looking = self._looking, None
+        if looking is not None:
+            looking.cancel()
+        await super().close()
 
     async def look_at_certificates(self) -> Identity:
-        """Read whose its certificates are, as they are now.
+        """Read whose its certificates are, as they are now; warn if they end soon, also later.
 
         Raises:
             ConnectFailedError: they have expired.
@@ -118,21 +139,31 @@ class ZenohEnd(ZenohSession, Bus):
         identity = await loop.run_in_executor(None, read_identity, folder)
         if identity.expired:
             raise self._failed(identity.expired)
-        if identity.warning and (self.identity is None or self.identity.digest != identity.digest):
+        said = identity.digest, identity.urgency
+        if identity.urgency and said != self._warned:
             logger.warning("%s ! %s", self._link.place, identity.warning)
-        self.identity = identity
+        self._warned, self.identity = said, identity
         return identity
 
+    async def _look_now_and_then(self) -> None:
+        """Warn of certificates that end soon, as long as it is open."""
+        while self.identity is not None:
+            await asyncio.sleep(self.identity.look_after)
+            try:
+                await self.look_at_certificates()
+            except SmartCamError as exc:
+                logger.error("%s ! %s", self._link.place, exc)  # noqa: TRY400 - the text says it
+
     async def _why_refused(self, folder: Path, left: float) -> str:
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(left):
-                for endpoint in self._link.connect:
-                    kind, _, place = endpoint.partition("/")
-                    host, _, port = place.rpartition(":")
-                    if kind == "tls":
-                        found = await shake_hands(host.strip("[]"), int(port), folder)
-                        if found.trouble:
-                            return found.trouble
+        """Return what one endpoint has against a handshake; empty where none has anything."""
+        each = max(0.0, min(LOOK, left / len(self._link.connect)))
+        for endpoint in self._link.connect:
+            kind, _, place = endpoint.partition("/")
+            host, _, port = place.rpartition(":")
+            if kind == "tls":
+                found = await shake_hands(host.strip("[]"), int(port), folder, each)
+                if found.trouble:
+                    return found.trouble
         return ""
 
     # ------------------------------------------------------------------ what is said
