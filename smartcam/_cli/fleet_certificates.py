@@ -77,7 +77,9 @@ async def certificates(
 
 
 def _row(made: Made) -> tuple[str, ...]:
-    until = f"{made.ends:%Y-%m-%d}" if made.ends - datetime.now(UTC) > timedelta(days=2) else (
-        f"{made.ends:%Y-%m-%d %H:%M} UTC"
+    until = (
+        f"{made.ends:%Y-%m-%d}"
+        if made.ends - datetime.now(UTC) > timedelta(days=2)
+        else (f"{made.ends:%Y-%m-%d %H:%M} UTC")
     )
     return made.name, made.role, made.done, until, f"{made.folder}/how-to-use.txt"

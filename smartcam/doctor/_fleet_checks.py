@@ -38,7 +38,7 @@ MOST_LISTED = 20
 SERVE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
 LISTENS = (
     "Without one it is tcp/127.0.0.1:7447, which only programs on the same computer reach; "
-    "tcp/0.0.0.0:7447 is for all."
+    "tls/0.0.0.0:7447 is for all that have a certificate."
 )
 
 

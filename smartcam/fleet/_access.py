@@ -66,9 +66,7 @@ RIGHTS: tuple[Right, ...] = (
     Right("ask what changes nothing", "say", (_ANY.call("*", "**", command=False),), _LOOKS),
     Right("get answers and frames", "hear", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
     Right("JSON: list the cameras", "ask", (_ANY.listing("**"),), _LOOKS),
-    Right(
-        "JSON: hear topics", "hear", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS
-    ),
+    Right("JSON: hear topics", "hear", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS),
     Right(
         "JSON: services that change nothing",
         "ask",
@@ -87,9 +85,7 @@ RIGHTS: tuple[Right, ...] = (
     ),
     Right("answer calls", "say", (_ANY.reply("*"), _ANY.frames("*")), _SHARES),
     Right("tell results and states", "say", (_ANY.results("**"), _ANY.states("**")), _SHARES),
-    Right(
-        "JSON: tell topics", "say", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES
-    ),
+    Right("JSON: tell topics", "say", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES),
     Right(
         "JSON: list, serve",
         "answer",

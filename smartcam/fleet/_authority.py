@@ -100,7 +100,9 @@ def make_certificates(
     said = [*dict.fromkeys(hosts)]
     for host in said:
         if not HOST.fullmatch(host):
-            raise ConfigurationError(f"certificates: {host!r:.80} is no host: expected plant-server")
+            raise ConfigurationError(
+                f"certificates: {host!r:.80} is no host: expected plant-server"
+            )
     authority = _Authority.of(folder)
     known: dict[str, str] = {}
     for place in sorted(folder.iterdir()):
@@ -114,7 +116,7 @@ def make_certificates(
             )
     return [
         authority.make(role, name, said if name in names else [], lifetime)
-        for name, role in known.items()
+        for name, role in sorted(known.items())
     ]
 
 

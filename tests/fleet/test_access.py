@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -147,9 +147,7 @@ async def test_ask(ends: Ends) -> None:
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.answer(pattern, answer)
     mark = KEYS.listing(MARK)
-    asking = {
-        key: asyncio.ensure_future(end.ask(key, b"", PATIENCE)) for key in keys_of("ask")
-    }
+    asking = {key: asyncio.ensure_future(end.ask(key, b"", PATIENCE)) for key in keys_of("ask")}
     await asyncio.sleep(0)  # they ask
     assert await end.ask(mark, b"", PATIENCE) == [(mark, b"yes")]
     assert await seen.mark(mark) == expected(role, "ask")
@@ -205,9 +203,7 @@ async def test_look_who_is_there(ends: Ends) -> None:
     mark = KEYS.agent(MARK)
     for key in [*keys_of("watch"), mark]:
         guard.be_present(key)
-    asking = {
-        key: asyncio.ensure_future(end.present(key, PATIENCE)) for key in keys_of("watch")
-    }
+    asking = {key: asyncio.ensure_future(end.present(key, PATIENCE)) for key in keys_of("watch")}
     await asyncio.sleep(0)  # they ask
     assert await end.present(mark, PATIENCE) == [mark]
     for key, one in asking.items():

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
 from smartcam.fleet._access_file import is_loopback
 from smartcam.fleet._authority import Made, make_certificates
 from smartcam.fleet._certificates import context, read_identity
 from smartcam.fleet._zenoh import ZenohEnd
-from smartcam._zenoh import BusLink
 
 YEAR = timedelta(days=365)
 
@@ -101,8 +101,9 @@ def test_wrong_names_change_nothing(
 ) -> None:
     make_certificates(tmp_path, {"agent": ["line1"]}, hosts=["plant"])
     before = content(tmp_path)
+    hosts = ["not a host"] if "not a host" in text else []
     with pytest.raises(ConfigurationError, match=text):
-        make_certificates(tmp_path, wanted, hosts=["not a host\u00fc"])
+        make_certificates(tmp_path, wanted, hosts=hosts)
     assert content(tmp_path) == before
 
 

@@ -145,7 +145,9 @@ async def refused(url: str, timeout: float = 5.0) -> str:
 
 async def test_plain_tcp(server: FleetServer) -> None:
     said = await refused(f"fleet://localhost:{server.address.port}/{CAMERA}")
-    assert said.endswith("nothing there speaks Zenoh, or it wants TLS and a certificate: fleet+tls://")
+    assert said.endswith(
+        "nothing there speaks Zenoh, or it wants TLS and a certificate: fleet+tls://"
+    )
 
 
 async def test_tls_where_there_is_none(folder: Path) -> None:
@@ -161,9 +163,7 @@ async def test_another_authority(server: FleetServer, folder: Path, tmp_path: Pa
     assert said.endswith("its certificate is of another authority than ca.pem")
     (tmp_path / "robot" / "ca.pem").write_bytes((folder / "robot" / "ca.pem").read_bytes())
     said = await refused(url(server, tmp_path / "robot"))
-    assert said.endswith(
-        "the certificate of this program is of an authority that it does not know"
-    )
+    assert said.endswith("the certificate of this program is of an authority that it does not know")
 
 
 async def test_other_host(folder: Path) -> None:
@@ -310,8 +310,9 @@ def test_warnings(tmp_path: Path) -> None:
         assert found.urgency == urgency
         assert bool(found.warning) == bool(urgency)
         assert bool(found.expired) == (days < 0)
-    assert ", in 6 days; smartcam fleet" in identity._replace(
-        ends=now + timedelta(days=6, hours=1)
-    ).warning
+    assert (
+        ", in 6 days; smartcam fleet"
+        in identity._replace(ends=now + timedelta(days=6, hours=1)).warning
+    )
     soon = identity._replace(authority_ends=now + timedelta(days=3))
     assert "its authority" in soon.warning
