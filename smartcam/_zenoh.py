@@ -266,7 +266,10 @@ class ZenohSession:
         if session is not None:
             self._reopening = True
             old = [one.lose() for one in tuple(self._declared)]
-            await self._loop.run_in_executor(None, _lose, session, old)
+            closing = self._loop.run_in_executor(None, _lose, session, old)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CLOSE_TIMEOUT):
+                    await asyncio.shield(closing)
         if not self._reopening:
             raise ConfigurationError(f"{self._what} is not open")
         await self._open(timeout)

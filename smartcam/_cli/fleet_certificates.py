@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -16,7 +16,10 @@ from smartcam._cli.texts import table_text
 if TYPE_CHECKING:
     from smartcam.fleet._authority import Made
 
-NAMES = {"multiple": True, "metavar": "NAME"}
+
+def _names(option: str, variable: str, text: str) -> Any:
+    """Return an option with any number of names."""
+    return click.option(option, variable, multiple=True, metavar="NAME", help=text)
 
 
 @click.command(
@@ -28,10 +31,10 @@ NAMES = {"multiple": True, "metavar": "NAME"}
     'Needs the extra "fleet".',
 )
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
-@click.option("--agent", "agents", help="An agent, by its name in fleet.yaml.", **NAMES)
-@click.option("--viewer", "viewers", help="A program that may look.", **NAMES)
-@click.option("--operator", "operators", help="A program that may command, too.", **NAMES)
-@click.option("--router", "routers", help="A router of Zenoh's, zenohd.", **NAMES)
+@_names("--agent", "agents", "An agent, by its name in fleet.yaml.")
+@_names("--viewer", "viewers", "A program that may look.")
+@_names("--operator", "operators", "A program that may command, too.")
+@_names("--router", "routers", "A router of Zenoh's, zenohd.")
 @click.option(
     "--host",
     "hosts",

@@ -264,9 +264,14 @@ class Agent:
 
     @property
     def busy(self) -> bool:
-        """Whether a command of a program is under way, or any call of one without smartcam."""
-        return self._plain.busy or any(
-            command for guest in self._programs.values() for command, _ in guest.tasks
+        """Whether a program has a camera reserved, or a command under way.
+
+        Of programs without smartcam every call counts.
+        """
+        return (
+            self._plain.busy
+            or any(command for guest in self._programs.values() for command, _ in guest.tasks)
+            or any(host.gate.holder is not None for host in self.hosts.values())
         )
 
     # ------------------------------------------------------------------ programs

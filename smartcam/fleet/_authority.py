@@ -100,9 +100,7 @@ def make_certificates(
     said = [*dict.fromkeys(hosts)]
     for host in said:
         if not HOST.fullmatch(host):
-            raise ConfigurationError(
-                f"certificates: {host!r:.80} is no host: expected plant-server"
-            )
+            raise ConfigurationError(f"certificates: {host!r:.80} is no name or address of a host")
     authority = _Authority.of(folder)
     known: dict[str, str] = {}
     for place in sorted(folder.iterdir()):

@@ -36,6 +36,9 @@ HELLO_TIMEOUT = 2.0
 """Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
 
 
+SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
+"""What a user calls these calls."""
+
 INSIST_AFTER = 1.0
 """Seconds until something is said again that the agent has to know: it may have been lost."""
 
@@ -449,8 +452,9 @@ class Caller:
         """
         identity = self.program.bus.identity
         if identity is not None and not self._allowed(do):
+            what = SWITCHES.get(do, do)
             raise NotAllowedError(
-                f"{self.name}: {do} is a command, and this program's certificate is that of "
+                f"{self.name}: {what} is a command, and this program's certificate is that of "
                 f"{identity}, who may look; nothing was sent",
                 role=identity.role,
                 certificate=identity.name,

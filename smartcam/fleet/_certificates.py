@@ -7,13 +7,14 @@ import hashlib
 import os
 import ssl
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 from smartcam.fleet._address import CERTIFICATE_FILES
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from cryptography import x509
 
 VIEWER, OPERATOR, AGENT, ROUTER = ROLES = ("viewer", "operator", "agent", "router")

@@ -21,10 +21,10 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 LOOK_EVERY = 10.0
 """Seconds between two looks at the files."""
 
-MOST_WAIT = 30.0
-"""Seconds that a moment without a command under way is waited for."""
+MOST_WAIT = 600.0
+"""Seconds that a moment is waited for in which nobody commands: a renewal is in no hurry."""
 
-LOOK_AGAIN = 0.02
+LOOK_AGAIN = 0.05
 
 REOPEN_TIMEOUT = 10.0
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from smartcam._server import Server
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.camera import DEFAULT_MAX_QUEUE
-from smartcam.exceptions import ConfigurationError
+from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.fleet._access import access_control
 from smartcam.fleet._access_file import access_mistakes, access_of
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
@@ -20,7 +21,7 @@ from smartcam.fleet._certificates import AGENT
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
-from smartcam.fleet._renewal import CertificateWatch
+from smartcam.fleet._renewal import RETRY_AFTER, CertificateWatch
 from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
     from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 OPEN_TIMEOUT = 10.0
 """Seconds for coming to the bus."""
@@ -174,7 +177,15 @@ class FleetServer(Server):
         """Have no nodes for a while: what is said once for all would be lost with the session."""
         await self._leave_ros()
         yield
-        await self._enter_ros()
+        while True:
+            try:
+                await self._enter_ros()
+            except SmartCamError as exc:
+                logger.error("ros2 ! %s; it is tried again", exc)  # noqa: TRY400 - the text says it
+                await self._leave_ros()
+                await asyncio.sleep(RETRY_AFTER)
+            else:
+                return
 
     def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
         from smartcam.fleet._ros import RosFleet

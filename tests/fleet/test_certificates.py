@@ -111,7 +111,7 @@ def test_authority_is_never_overwritten(tmp_path: Path) -> None:
     make_certificates(tmp_path, {"agent": ["line1"]})
     (tmp_path / "authority" / "key.pem").unlink()
     before = content(tmp_path)
-    with pytest.raises(ConfigurationError, match="key is not in .* and it is not overwritten"):
+    with pytest.raises(ConfigurationError, match=r"key is not in .* and it is not overwritten"):
         make_certificates(tmp_path, {"viewer": ["a"]})
     assert content(tmp_path) == before
     with pytest.raises(ConfigurationError, match="is not overwritten"):
@@ -205,7 +205,7 @@ def test_roles_want_tls_alone(tmp_path: Path) -> None:
         "certificates": str(tmp_path / "line1"),
         "cameras": {"a": {"emulated": {}}},
     }
-    with pytest.raises(ConfigurationError, match="tcp/127.0.0.1:0 asks for no certificate"):
+    with pytest.raises(ConfigurationError, match=r"tcp/127\.0\.0\.1:0 asks for no certificate"):
         FleetServer(FleetFile.model_validate(said))
     FleetServer(FleetFile.model_validate({**said, "access": "any-certificate"}))
 

@@ -6,9 +6,10 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -22,10 +23,11 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     TriggerTimeoutError,
 )
-from smartcam.fleet import FleetFile, FleetServer, _renewal
+from smartcam.fleet import FleetCamera, FleetFile, FleetServer, _renewal
 from smartcam.fleet._certificates import read_identity
+from smartcam.fleet._wire import encode
 from smartcam.models import Disconnected, Reconnected
-from tests.fleet.fleetkit import PATIENCE, Plant, until
+from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, until
 from tests.fleet.plantkit import CAMERA, certified, plant_file, short_lived, url_of
 
 pytestmark = pytest.mark.real_time
@@ -45,6 +47,11 @@ async def server(folder: Path) -> AsyncIterator[FleetServer]:
         yield server
 
 
+def program(url: str) -> FleetCamera[Any]:
+    """Return a camera of a fleet."""
+    return cast("FleetCamera[Any]", smartcam.connect(url))
+
+
 def url(server: FleetServer, certificates: Path, **more: str) -> str:
     return url_of(server.address.port, certificates, **more)
 
@@ -54,14 +61,14 @@ def url(server: FleetServer, certificates: Path, **more: str) -> str:
 
 async def test_operator_commands_and_viewer_looks(server: FleetServer, folder: Path) -> None:
     async with (
-        smartcam.connect(url(server, folder / "robot")) as robot,
-        smartcam.connect(url(server, folder / "dashboard")) as dashboard,
+        program(url(server, folder / "robot")) as robot,
+        program(url(server, folder / "dashboard")) as dashboard,
     ):
         seen = dashboard.results()
         result = await robot.trigger()
         assert (await anext(seen)).raw == result.raw
         assert await dashboard.get_clock() is not None
-        commands = [
+        commands: list[Callable[[], Awaitable[object]]] = [
             dashboard.trigger,
             dashboard.start,
             dashboard.stop,
@@ -81,8 +88,8 @@ async def test_operator_commands_and_viewer_looks(server: FleetServer, folder: P
 
 async def test_who_commands_all_the_same_is_not_heard(server: FleetServer, folder: Path) -> None:
     """One that does not look at its own certificate: the router drops it, and the call ends."""
-    async with smartcam.connect(url(server, folder / "dashboard")) as dashboard:
-        bus = dashboard._program.bus  # type: ignore[attr-defined]
+    async with program(url(server, folder / "dashboard")) as dashboard:
+        bus = dashboard._program.bus
         bus.identity = bus.identity._replace(role="another")
         with pytest.raises(TriggerTimeoutError, match=r"or trigger is not allowed for another "):
             await dashboard.trigger(timeout=0.2)
@@ -109,27 +116,41 @@ async def test_two_agents_and_a_router_between(folder: Path) -> None:
         await asyncio.gather(first.wait_tried(), second.wait_tried())
         for name in ("line2/cam1", CAMERA):
             async with (
-                smartcam.connect(url(first, folder / "robot", camera=name)) as robot,
-                smartcam.connect(url(first, folder / "dashboard", camera=name)) as dashboard,
+                program(url(first, folder / "robot", camera=name)) as robot,
+                program(url(first, folder / "dashboard", camera=name)) as dashboard,
             ):
                 seen = dashboard.results()
                 result = await robot.trigger()
                 assert (await anext(seen)).raw == result.raw
-        async with smartcam.connect(url(first, folder / "line2")) as agent:
+        async with program(url(first, folder / "line2")) as agent:
             with pytest.raises(NotAllowedError, match="that of agent line2, who may look"):
                 await agent.trigger()
 
 
-async def test_cancelling_under_the_name_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_cancelling_under_the_name_of_another() -> None:
     """Who may only ask cannot cancel another's command, or make it count as done already."""
-    async with Plant() as plant, plant.camera() as robot, plant.camera() as spy:
-        program = robot._program
-        number = program._calls + 1
-        key = program.keys.call("agent", "line1/cam1", command=False)
-        for cancelled in range(number, number + 10):
-            spy._program.send(key, {"program": program.name, "call": 1, "cancel": cancelled})
-        assert (await robot.trigger()).number == 1
-        assert plant.agent._programs[program.name].commands.last == number
+    async with Plant(NumberedCamera(time=0.2)) as plant, plant.camera() as robot:
+        async with plant.camera() as spy:
+            own = robot._program
+            number = own._calls + 1
+            key = own.keys.call("agent", NAME, command=False)
+
+            def cancel() -> None:
+                for one in range(1, number + 3):
+                    fields = {"program": own.name, "call": 1, "cancel": one}
+                    spy._program.bus.put(key, encode(fields, []))
+
+            cancel()  # before it comes
+            await spy.query_application()  # which came behind
+            triggering = asyncio.ensure_future(robot.trigger())
+            await until(lambda: (True, number) in plant.agent._programs[own.name].tasks)
+            cancel()  # while it is under way
+            assert (await triggering).number == 1
+            number = own._calls + 1
+            async with robot.reserve():
+                cancel()
+                await spy.query_application()
+                assert plant.agent.hosts[NAME].gate.holder == own.name
 
 
 # ---------------------------------------------------------------------- who does not come in
@@ -197,8 +218,8 @@ async def test_any_certificate(folder: Path) -> None:
     async with smartcam.fleet.serve(file) as server:
         await server.wait_tried()
         # what the roles of our own programs may is for them to know, whoever lets them in
-        async with smartcam.connect(url(server, folder / "dashboard")) as dashboard:
-            dashboard._program.bus.identity = None  # type: ignore[attr-defined]
+        async with program(url(server, folder / "dashboard")) as dashboard:
+            dashboard._program.bus.identity = None
             assert (await dashboard.trigger()).number == 1
 
 
@@ -212,8 +233,8 @@ async def test_renewed_while_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
         await server.wait_tried()
         session = server.hosts[CAMERA].camera
         async with (
-            smartcam.connect(url(server, folder / "robot")) as robot,
-            smartcam.connect(url(server, folder / "dashboard")) as dashboard,
+            program(url(server, folder / "robot")) as robot,
+            program(url(server, folder / "dashboard")) as dashboard,
         ):
             events, seen = robot.events(), dashboard.results()
             first = await robot.trigger()
@@ -248,7 +269,7 @@ async def test_command_under_way_is_not_cut_off(
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
         await server.wait_tried()
-        async with smartcam.connect(url(server, folder / "robot")) as robot:
+        async with program(url(server, folder / "robot")) as robot:
             async with robot.reserve():
                 waiting = asyncio.ensure_future(_trigger_of_another(server, folder))
                 await until(lambda: server.busy)
@@ -260,7 +281,7 @@ async def test_command_under_way_is_not_cut_off(
 
 
 async def _trigger_of_another(server: FleetServer, folder: Path) -> smartcam.Result:
-    async with smartcam.connect(url(server, folder / "robot")) as other:
+    async with program(url(server, folder / "robot")) as other:
         return await other.trigger(timeout=PATIENCE)
 
 
@@ -273,7 +294,7 @@ async def test_certificates_that_end_while_all_runs(
         await server.wait_tried()
         await short_lived(folder, "operator", "robot", 3.0)
         with caplog.at_level(logging.WARNING, "smartcam.fleet"):
-            async with smartcam.connect(url(server, folder / "robot")) as robot:
+            async with program(url(server, folder / "robot")) as robot:
                 assert "the certificate of operator robot" in caplog.text
                 assert ", in 0.000" in caplog.text
                 await until(lambda: "has expired" in caplog.text)
@@ -281,7 +302,7 @@ async def test_certificates_that_end_while_all_runs(
                 assert (await robot.trigger()).number == 1
                 assert "has expired" in await refused(url(server, folder / "robot"))
                 await certified(folder, {})
-                async with smartcam.connect(url(server, folder / "robot")) as other:
+                async with program(url(server, folder / "robot")) as other:
                     assert (await other.trigger()).number == 2
 
 
@@ -291,13 +312,11 @@ async def test_lost_with_a_certificate_that_has_expired(tmp_path: Path) -> None:
     ends = read_identity(folder / "dashboard").ends
     async with contextlib.AsyncExitStack() as stack:
         server = await stack.enter_async_context(smartcam.fleet.serve(plant_file(folder)))
-        dashboard = await stack.enter_async_context(
-            smartcam.connect(url(server, folder / "dashboard"))
-        )
+        dashboard = await stack.enter_async_context(program(url(server, folder / "dashboard")))
         await asyncio.sleep(max(0.0, (ends - datetime.now(UTC)).total_seconds()) + 0.01)
         await server.stop()
         await until(lambda: not dashboard.connected)
-        with pytest.raises(ConnectionLostError, match="viewer dashboard .* has expired on"):
+        with pytest.raises(ConnectionLostError, match=r"viewer dashboard .* has expired on"):
             await dashboard.get_clock()
 
 
