@@ -109,8 +109,8 @@ def make_certificates(
     for name, role in names.items():
         if known.setdefault(name, role) != role:
             raise ConfigurationError(
-                f"certificates: {name} has the role {known[name]} already: expected another name for "
-                f"the {role}, or delete {folder / name}"
+                f"certificates: {name} has the role {known[name]} already: expected another name "
+                f"for the {role}, or delete {folder / name}"
             )
     return [
         authority.make(role, name, said if name in names else [], lifetime)

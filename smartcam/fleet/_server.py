@@ -300,7 +300,9 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    certificates = file.certificates if scheme == "fleet+tls" else None
+    # where there are roles each program has a certificate of its own: the agent's commands nothing
+    own = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if own else None
     # a router that others stand around may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

@@ -129,28 +129,31 @@ async def test_two_agents_and_a_router_between(folder: Path) -> None:
 
 async def test_cancelling_under_the_name_of_another() -> None:
     """Who may only ask cannot cancel another's command, or make it count as done already."""
-    async with Plant(NumberedCamera(time=0.2)) as plant, plant.camera() as robot:
-        async with plant.camera() as spy:
-            own = robot._program
-            number = own._calls + 1
-            key = own.keys.call("agent", NAME, command=False)
+    async with (
+        Plant(NumberedCamera(time=0.2)) as plant,
+        plant.camera() as robot,
+        plant.camera() as spy,
+    ):
+        own = robot._program
+        number = own._calls + 1
+        key = own.keys.call("agent", NAME, command=False)
 
-            def cancel() -> None:
-                for one in range(1, number + 3):
-                    fields = {"program": own.name, "call": 1, "cancel": one}
-                    spy._program.bus.put(key, encode(fields, []))
+        def cancel() -> None:
+            for one in range(1, number + 3):
+                fields = {"program": own.name, "call": 1, "cancel": one}
+                spy._program.bus.put(key, encode(fields, []))
 
-            cancel()  # before it comes
-            await spy.query_application()  # which came behind
-            triggering = asyncio.ensure_future(robot.trigger())
-            await until(lambda: (True, number) in plant.agent._programs[own.name].tasks)
-            cancel()  # while it is under way
-            assert (await triggering).number == 1
-            number = own._calls + 1
-            async with robot.reserve():
-                cancel()
-                await spy.query_application()
-                assert plant.agent.hosts[NAME].gate.holder == own.name
+        cancel()  # before it comes
+        await spy.query_application()  # which came behind
+        triggering = asyncio.ensure_future(robot.trigger())
+        await until(lambda: (True, number) in plant.agent._programs[own.name].tasks)
+        cancel()  # while it is under way
+        assert (await triggering).number == 1
+        number = own._calls + 1
+        async with robot.reserve():
+            cancel()
+            await spy.query_application()
+            assert plant.agent.hosts[NAME].gate.holder == own.name
 
 
 # ---------------------------------------------------------------------- who does not come in
