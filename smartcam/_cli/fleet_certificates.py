@@ -14,7 +14,7 @@ from smartcam._cli.running import JsonErrors
 from smartcam._cli.texts import table_text
 
 if TYPE_CHECKING:
-    from smartcam.fleet._authority import Made
+    from smartcam.fleet._authority import MadeCertificate
 
 
 def _names(option: str, variable: str, text: str) -> Any:
@@ -79,7 +79,7 @@ async def certificates(
     click.echo(table_text(head, [_row(one) for one in made]))
 
 
-def _row(made: Made) -> tuple[str, ...]:
+def _row(made: MadeCertificate) -> tuple[str, ...]:
     until = (
         f"{made.ends:%Y-%m-%d}"
         if made.ends - datetime.now(UTC) > timedelta(days=2)

@@ -56,7 +56,7 @@ MOST_CALLS = 256
 """Calls of one program that may be under way at a time, for each camera of the agent."""
 
 KNOWN_CALLS = 4096
-"""Numbers of calls that are remembered for each program; older ones are not done any more."""
+"""CallNumbers of calls that are remembered for each program; older ones are not done any more."""
 
 KNOWN_CAMERAS = 1000
 """Cameras shared no more whose numbers go on where they ended, should they come back."""
@@ -65,8 +65,8 @@ FIRST_TRY = 30.0
 """Seconds that the first try to reach a camera is waited for at the start."""
 
 
-class Numbers:
-    """Numbers of calls that were seen.
+class CallNumbers:
+    """CallNumbers of calls that were seen.
 
     Args:
         floor: those up to this one count as seen.
@@ -109,8 +109,8 @@ class Guest:
     """
 
     number: int
-    questions: Numbers = field(default_factory=Numbers)
-    commands: Numbers = field(default_factory=Numbers)
+    questions: CallNumbers = field(default_factory=CallNumbers)
+    commands: CallNumbers = field(default_factory=CallNumbers)
     tasks: dict[tuple[bool, int], asyncio.Task[None]] = field(
         default_factory=dict[tuple[bool, int], "asyncio.Task[None]"]
     )
@@ -305,7 +305,7 @@ class Agent:
             if len(self._programs) >= MOST_PROGRAMS:
                 raise LocalProtocolError(f"{self.name}: {MOST_PROGRAMS} programs are here already")
             known = self._programs[program] = Guest(
-                self.next_program(), Numbers(left), Numbers(left)
+                self.next_program(), CallNumbers(left), CallNumbers(left)
             )
         return known
 

@@ -47,7 +47,7 @@ HOST = re.compile(r"[\w.:-]+", re.ASCII)
 LISTENING = frozenset({AGENT, ROUTER})
 
 
-class Made(NamedTuple):
+class MadeCertificate(NamedTuple):
     """What became of one certificate.
 
     Attributes:
@@ -73,7 +73,7 @@ def make_certificates(
     *,
     hosts: Iterable[str] = (),
     lifetime: timedelta = LIFETIME,
-) -> list[Made]:
+) -> list[MadeCertificate]:
     """Make the certificates that a plant lacks, and renew those that end soon; blocks.
 
     Each has a folder with ``ca.pem``, ``cert.pem``, ``key.pem`` (mode 0600) and a text how to use
@@ -177,7 +177,7 @@ class _Authority:
             )
         return found
 
-    def make(self, role: str, name: str, hosts: list[str], lifetime: timedelta) -> Made:
+    def make(self, role: str, name: str, hosts: list[str], lifetime: timedelta) -> MadeCertificate:
         """Return the certificate of a name; it is made, or renewed, if need be."""
         place = self._folder / name
         old = self._old(place)
@@ -196,7 +196,7 @@ class _Authority:
         if role == ROUTER:
             _write(place / ROUTER_FILE, _router(place))
         _write(place / HOW_TO_USE, use.encode())
-        return Made(role, name, str(place), done, old.not_valid_after_utc, use)
+        return MadeCertificate(role, name, str(place), done, old.not_valid_after_utc, use)
 
     def _old(self, place: Path) -> Any:
         from cryptography import x509

@@ -79,6 +79,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, str]
         agent.wait()
 
 
+@pytest.mark.long
 def test_commands_of_each_role(plant: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     keys, url = plant
     assert url.startswith("fleet+tls://127.0.0.1:")
@@ -92,6 +93,7 @@ def test_commands_of_each_role(plant: tuple[Path, str], monkeypatch: pytest.Monk
     run("trigger", f"{url}/{CAMERA}{robot}").done()
 
 
+@pytest.mark.long
 def test_warning_of_list_and_doctor(plant: tuple[Path, str], tmp_path: Path) -> None:
     keys, url = plant
     (tmp_path / "authority").symlink_to(keys / "authority")

@@ -20,7 +20,7 @@ pytest.importorskip("rosbags", reason="needs the extra ros2")
 from smartcam.ros2 import Node
 from smartcam.ros2._context import SETTINGS, RosContext
 
-pytestmark = pytest.mark.real_time
+pytestmark = [pytest.mark.real_time, pytest.mark.long]
 
 DOMAIN = 7
 STATUS = "/line1/cam3/status"

@@ -15,7 +15,7 @@ from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
 from smartcam.fleet._access_file import is_loopback
-from smartcam.fleet._authority import Made, make_certificates
+from smartcam.fleet._authority import MadeCertificate, make_certificates
 from smartcam.fleet._certificates import context, read_identity
 from smartcam.fleet._zenoh import ZenohEnd
 
@@ -30,7 +30,7 @@ def content(folder: Path) -> dict[str, bytes]:
     }
 
 
-def done(made: list[Made]) -> dict[str, str]:
+def done(made: list[MadeCertificate]) -> dict[str, str]:
     return {one.name: one.done for one in made}
 
 

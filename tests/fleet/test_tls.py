@@ -196,6 +196,7 @@ async def test_other_host(folder: Path) -> None:
     assert "its certificate is for other hosts than 127.0.0.2" in said
 
 
+@pytest.mark.long
 async def test_certificate_of_a_program_for_an_agent(folder: Path) -> None:
     """A program's certificate is none that another takes for an agent's."""
     with pytest.raises(ConfigurationError, match="wants a certificate whose common name is agent"):
@@ -216,6 +217,7 @@ async def test_expired(server: FleetServer, folder: Path, tmp_path: Path) -> Non
     assert time.monotonic() - begun < 20  # it did not wait for its timeout
 
 
+@pytest.mark.long
 async def test_any_certificate(folder: Path) -> None:
     file = plant_file(folder, access="any-certificate")
     async with smartcam.fleet.serve(file) as server:
@@ -309,6 +311,7 @@ async def test_certificates_that_end_while_all_runs(
                     assert (await other.trigger()).number == 2
 
 
+@pytest.mark.long
 async def test_lost_with_a_certificate_that_has_expired(tmp_path: Path) -> None:
     folder = await certified(tmp_path)
     await short_lived(folder, "viewer", "dashboard", 2.0)
