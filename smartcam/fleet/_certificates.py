@@ -202,7 +202,7 @@ def context(folder: Path) -> ssl.SSLContext:
     ca, cert, key = (folder / name for name in CERTIFICATE_FILES)
     made = ssl.create_default_context(cafile=str(ca))
     made.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine asks for no more either
-    made.load_cert_chain(cert, key)
+    made.load_cert_chain(cert, key, password="")  # else one with a password asks the terminal
     return made
 
 

@@ -60,7 +60,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(params=ROLES)
+@pytest.fixture(params=[*ROLES[:3], pytest.param("router", marks=pytest.mark.long)])
 async def ends(
     request: pytest.FixtureRequest, plant: Path
 ) -> AsyncIterator[tuple[str, ZenohEnd, ZenohEnd]]:

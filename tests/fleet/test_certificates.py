@@ -10,6 +10,7 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import serialization
 
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
@@ -142,6 +143,21 @@ def test_files_that_are_none(tmp_path: Path, name: str, body: bytes | None) -> N
 def test_key_of_another(tmp_path: Path) -> None:
     make_certificates(tmp_path, {"viewer": ["a", "b"]})
     (tmp_path / "b" / "key.pem").replace(tmp_path / "a" / "key.pem")
+    with pytest.raises(ConfigurationError, match=r"cert.pem and key.pem do not go together"):
+        read_identity(tmp_path / "a")
+
+
+def test_key_with_a_password_asks_nobody(tmp_path: Path) -> None:
+    make_certificates(tmp_path, {"viewer": ["a"]})
+    path = tmp_path / "a" / "key.pem"
+    key = serialization.load_pem_private_key(path.read_bytes(), None)
+    path.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.BestAvailableEncryption(b"secret"),
+        )
+    )
     with pytest.raises(ConfigurationError, match=r"cert.pem and key.pem do not go together"):
         read_identity(tmp_path / "a")
 
