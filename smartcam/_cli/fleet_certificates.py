@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -14,10 +14,13 @@ from smartcam._cli.running import JsonErrors
 from smartcam._cli.texts import table_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.fleet._authority import MadeCertificate
+F = TypeVar("F", bound="Callable[..., Any]")
 
 
-def _names(option: str, variable: str, text: str) -> Any:
+def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
     """Return an option with any number of names."""
     return click.option(option, variable, multiple=True, metavar="NAME", help=text)
 

@@ -43,8 +43,8 @@ def test_certificates_are_told(tmp_path: Path) -> None:
     assert "listen: tls/0.0.0.0:7447" in how["line1"]
     assert "plant-server" in how["line1"]
     assert f"fleet+tls://HOST:7447/CAMERA?certificates={folder}/robot" in how["robot"]
-    lines = run("fleet", "certificates", folder, "--viewer", "b", "--days", "0.5", "--json").lines
-    said = {one["name"]: one for one in lines}
+    told = run("fleet", "certificates", folder, "--viewer", "b", "--days", "0.5", "--json").lines
+    said = {one["name"]: one for one in told}
     assert {name: one["done"] for name, one in said.items()} == {
         "b": "made", "dashboard": "kept", "line1": "kept", "robot": "kept"
     }  # fmt: skip

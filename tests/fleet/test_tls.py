@@ -90,6 +90,7 @@ async def test_who_commands_all_the_same_is_not_heard(server: FleetServer, folde
     """One that does not look at its own certificate: the router drops it, and the call ends."""
     async with program(url(server, folder / "dashboard")) as dashboard:
         bus = dashboard._program.bus
+        assert bus.identity is not None
         bus.identity = bus.identity._replace(role="another")
         with pytest.raises(TriggerTimeoutError, match=r"or trigger is not allowed for another "):
             await dashboard.trigger(timeout=0.2)
