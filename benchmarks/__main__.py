@@ -30,6 +30,7 @@ BENCHMARKS = {
     "frames": "a frame to its readers and to a JPEG, and the delay of the loop",
     "pictures": "bytes of a picture at the same PSNR, and the CPU time of codecs",
     "transports": "pictures from stamp to stamp: bus, RTP, on request, GStreamer, rospy",
+    "ros2": "pictures, calls and detections without ROS, and what a camera's node adds to it",
     "scaling": "cost of a message over 10^3 to 10^6 of them",
 }
 """Modules of this package with a ``run(plan)``, and what they measure."""
@@ -44,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"no benchmark is called {', '.join(unknown)}")
     if options.rounds < 1:
         parser.error("--rounds: 1 or more")
-    plan = Plan(rounds=2, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
+    plan = Plan(rounds=1, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
     comparisons: list[Comparison] = []
     curves: list[Curve] = []
     for name in options.names or BENCHMARKS:

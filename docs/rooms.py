@@ -29,26 +29,31 @@ class Room(NamedTuple):
 
 
 VALUES = ("models", "exceptions", "settings", "registry", "streams", "observers", "backoff")
-HELPERS = ("_accepting", "_html", "_lazy", "_locks", "_loop_thread", "_server", "_suggestions")
+HELPERS = (
+    *("_accepting", "_html", "_lazy", "_locks", "_loop_thread", "_server", "_suggestions"),
+    "_zenoh",
+)
 ROOMS = (
     Room("_cli", "the two commands", 1, 0, ("_cli", "__main__")),
     Room("testing", "for others' tests", 3, 0, ("testing", "pytest_plugin")),
     Room("web", "pages in a browser", 0, 2),
     Room("recording", "files of what came", 2, 1, ("recording", "_dissector")),
     Room("conformance", "judges", 3, 1),
-    Room("calibration", "camera to robot", 0, 8),
+    Room("calibration", "camera to robot", 0, 9),
     Room("doctor", "what is wrong", 1, 2),
+    Room("ros1", "cameras in ROS 1", 3, 2),
     Room("connecting", "from a URL to a camera", 2, 3, ("connecting", "sync")),
     Room("fleet", "cameras, shared", 2, 4),
     Room("depth", "metres and clouds", 0.5, 4),
-    Room("frames", "pictures of any camera", 1, 5),
-    Room("client", "what a program uses", 1.5, 6, ("camera", "client")),
-    Room("emulator", "cameras without one", 3, 6),
-    Room("_client", "how a client works", 1.5, 7),
-    Room("interpreters", "payload to value", 1, 8),
-    Room("protocols", "bytes to messages", 3, 8),
-    Room("layout", "what a payload holds", 1.5, 9),
-    Room("values", "models, errors, settings", 2, 10, VALUES + HELPERS),
+    Room("ros2", "cameras in ROS 2", 2, 5),
+    Room("frames", "pictures of any camera", 1, 6),
+    Room("client", "what a program uses", 1.5, 7, ("camera", "client")),
+    Room("emulator", "cameras without one", 3, 7),
+    Room("_client", "how a client works", 1.5, 8),
+    Room("interpreters", "payload to value", 1, 9),
+    Room("protocols", "bytes to messages", 3, 9),
+    Room("layout", "what a payload holds", 1.5, 10),
+    Room("values", "models, errors, settings", 2, 11, VALUES + HELPERS),
 )
 STEP = (190, 84)
 SIZE = (150, 46)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
+import ctypes
 import functools
 import io
 import json
@@ -31,11 +32,15 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
-    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "(rx:(handover:app),acc:(handover:app),net:(worker_threads:2),tx:(worker_threads:1),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: one for everything, which halves the CPU time of a call; its callbacks here only
-put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
+"""Zenoh's threads: as few as can be, which halves the CPU time of a call; its callbacks here only
+put what comes into a queue. What sends has one of its own: the one for what comes waits for it
+where an answer is longer than a queue (128 KiB, which the tokens of 20 nodes of ROS are), and would
+wait for itself until the link is given up. Its inner tasks have two of their own: where a latched
+publisher is closed, the binding waits for such a task and lets no thread of Python run meanwhile,
+also not the one that is to call back. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
@@ -223,6 +228,8 @@ class ZenohSession:
         self._loop = asyncio.get_running_loop()
         await self._open(timeout)
         self._end_lingering()
+        self._waiting.clear()
+        self._bytes, self._woken = 0, False
         self._bell = _LoopBell.on(self._loop, self._drain)
         return self
 
@@ -266,7 +273,7 @@ class ZenohSession:
         if session is not None:
             self._reopening = True
             old = [one.lose() for one in tuple(self._declared)]
-            closing = self._loop.run_in_executor(None, _lose, session, old)
+            closing = self._loop.run_in_executor(None, _lose, session, old, bool(self._link.listen))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CLOSE_TIMEOUT):
                     await asyncio.shield(closing)
@@ -306,7 +313,9 @@ class ZenohSession:
             return
         for one in tuple(self._declared):
             one.close()
-        closing = self._loop.run_in_executor(None, _end, session, self._threads())
+        closing = self._loop.run_in_executor(
+            None, _end, session, self._threads(), bool(self._link.listen)
+        )
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 await asyncio.shield(closing)
@@ -461,7 +470,7 @@ class _LoopBell:
 
     def ring(self) -> None:
         """Have the loop call; once, however often it is rung before."""
-        with contextlib.suppress(ValueError):  # it is closed, and nobody hears any more
+        with contextlib.suppress(ValueError, OSError):  # closed: nobody hears any more
             self._file.write(_ONE)
 
     def _hear(self) -> None:
@@ -531,8 +540,8 @@ class ZenohDeclared:
                 quietly(it.undeclare)
 
 
-def _lose(session: Any, declared: list[Any]) -> None:
-    session.close()
+def _lose(session: Any, declared: list[Any], router: bool) -> None:
+    _end(session, [], router)
     declared.clear()  # which takes long before
 
 
@@ -551,10 +560,17 @@ def _refuse(query: Any, why: str) -> None:
     quietly(query.drop)
 
 
-def _end(session: Any, threads: list[ThreadPoolExecutor]) -> None:
-    """Say what is to be said yet, then end the session."""
+def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
+    """Say what is to be said yet, then end the session.
+
+    A router that is closed is never freed: its last reference would wait for an engine's thread,
+    and hold the interpreter, which that thread may wait for to tell another session of this process
+    something. It is 16 KiB.
+    """
     for one in threads:
         one.shutdown()
+    if router:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
     session.close()
 
 

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
+import gc
+import importlib
 import inspect
 import os
+import shutil
+import sys
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -15,10 +22,22 @@ from tests.timed_loop import TimedLoop
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
+settings.register_profile("few", deadline=None, max_examples=3, derandomize=True)
 settings.register_profile("quick", deadline=None, max_examples=10, derandomize=True)
 settings.register_profile("ci", deadline=None, max_examples=50, derandomize=True)
 settings.register_profile("nightly", deadline=None, max_examples=2000, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
+
+ROOT = Path(__file__).parent.parent
+
+if sys.dont_write_bytecode:
+    # Where nothing is to be written beside the sources, workers and the processes that tests start
+    # would compile all that they import, each for itself. They share it while the tests run.
+    compiled = tempfile.mkdtemp(prefix="smartcam-compiled-")
+    atexit.register(shutil.rmtree, compiled, ignore_errors=True)
+    sys.dont_write_bytecode, sys.pycache_prefix = False, compiled
+    os.environ["PYTHONPYCACHEPREFIX"] = compiled
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
 def pytest_asyncio_loop_factories(
@@ -43,6 +62,40 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     else:
         cores = os.cpu_count() or 1
     return 0 if few or cores == 1 else cores
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Have each worker import the tests from another place on: they read what another compiled.
+
+    Side by side from the first to the last, all would rewrite and compile each file at once.
+    """
+    worker = getattr(session.config, "workerinput", None)
+    if worker is None or worker["workercount"] == 1:
+        return
+    paths = [Path(one.split("::")[0]).absolute() for one in session.config.args]
+    files = sorted({file for path in paths for file in _test_files(path)})
+    number, count = int(worker["workerid"].removeprefix("gw")), worker["workercount"]
+    begin = len(files) * number // count
+    for file in files[begin:] + files[:begin]:
+        name = ".".join(file.relative_to(ROOT).with_suffix("").parts)
+        try:
+            importlib.import_module(name)
+        except (Exception, pytest.skip.Exception):  # noqa: BLE001, S112 - pytest tells of it
+            continue
+
+
+def _test_files(path: Path) -> list[Path]:
+    """Return the modules of tests at ``path`` that are imported as a part of this package."""
+    if not path.is_relative_to(ROOT / "tests"):
+        return []
+    return list(path.rglob("test_*.py")) if path.is_dir() else [path] if path.is_file() else []
+
+
+def pytest_collection_finish() -> None:
+    """Spare each garbage collection the tests themselves: what there is now stays to the end."""
+    gc.collect()
+    gc.freeze()
 
 
 GRACE_STEPS = 100

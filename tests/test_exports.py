@@ -34,7 +34,8 @@ PUBLIC = [
     "PluginError",
     "Pose", "Position", "ProtocolError", "Quaternion", "Reconnected", "RecordingError",
     "RemoteProtocolError",
-    "ResponseTimeoutError", "Result", "SmartCamError", "SmartCamera", "Statistics", "Status",
+    "ResponseTimeoutError", "Result", "RosError", "RosMessageError", "ServiceCallError",
+    "ServiceTimeoutError", "SmartCamError", "SmartCamera", "Statistics", "Status",
     "StatusChanged", "SubscriberOverflowError", "TriggerError", "TriggerTimeoutError",
     "UnsupportedError", "WrongApplicationError", "__version__", "connect", "emulator",
     "exceptions", "frames", "interpreters", "layout", "models", "protocols",
@@ -110,11 +111,11 @@ def test_reference_has_each_public_name_and_nothing_else() -> None:
     assert len(smartcam.__all__) <= MOST_AT_THE_TOP
 
 
-MOST_PUBLIC = 445
+MOST_PUBLIC = 470
 """Names in all, a name that stands in two places counted once. A third of them are words: messages,
 faults of a camera, rules of a link, errors."""
 
-MOST_AT_THE_TOP = 64
+MOST_AT_THE_TOP = 68
 
 
 def test_top_level_exports_are_pinned() -> None:

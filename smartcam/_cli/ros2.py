@@ -46,7 +46,7 @@ async def ros2(
 ) -> None:
     """Have cameras seen in ROS 2."""
     said = {"domain": domain, "namespace": namespace, "distribution": distribution}
-    given = {name: value for name, value in said.items() if value is not None}
+    given: dict[str, object] = {name: value for name, value in said.items() if value is not None}
     if is_fleet(place):
         await _of_fleet(place, given, options)
     else:

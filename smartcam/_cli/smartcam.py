@@ -25,6 +25,7 @@ from smartcam._cli.options import CAMERA, CONNECTS, OUTPUT, RESULTS, Options, ap
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.probe import probe
 from smartcam._cli.record import bag, pcap, record, replay
+from smartcam._cli.ros1 import ros1
 from smartcam._cli.ros2 import ros2
 from smartcam._cli.running import JsonErrors
 from smartcam._cli.serve import serve
@@ -61,7 +62,7 @@ EPILOG = (
 
 TOPICS: Mapping[str, Sequence[str]] = {
     "A camera": ("trigger", "watch", "live", "image", "status", "start", "stop", "switch"),
-    "A fleet": ("serve", "fleet", "ros2"),
+    "A fleet": ("serve", "fleet", "ros2", "ros1"),
     "Pictures": ("frames", "depth"),
     "Finding out": ("doctor", "probe", "protocols", "interpreters", "decode"),
     "A robot": ("calibrate", "sheet"),
@@ -322,7 +323,7 @@ async def demo_command(
 
 for _one in (
     *(live, probe, doctor, image, decode, calibrate, sheet),
-    *(record, replay, pcap, bag, dissector, serve, fleet, ros2, frames, depth),
+    *(record, replay, pcap, bag, dissector, serve, fleet, ros2, ros1, frames, depth),
 ):
     command.add_command(_one)
 

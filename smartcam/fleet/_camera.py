@@ -465,6 +465,11 @@ class FleetCamera(Camera[ValueT]):
         return self._closed is not None
 
     @property
+    def met(self) -> bool:
+        """Whether its agent has answered, and is there."""
+        return self._caller.met is not None
+
+    @property
     def connected(self) -> bool:
         return self._linked and self._caller.met is not None
 

@@ -31,6 +31,10 @@ TIMEOUT = 10.0
 """Seconds for coming to the fleet."""
 
 
+MEET = 2.0
+"""Seconds that a camera's agent is waited for before its node comes."""
+
+
 class _Cameras(Fleet):
     """A fleet whose cameras have calibrations of their own."""
 
@@ -57,6 +61,8 @@ class RosFleet(Server):
         address: where it is.
         section: how the cameras are seen.
         cameras: what is said of single cameras, by name.
+        settings: what the agent tells their sessions, by name, where that is known.
+        frames: where their frames come from, by name, as parameters of v4l2_camera.
         calibrations: of cameras whose results are to be the robot's.
         wanted: whether a camera, of an agent, is to be seen.
 
@@ -73,10 +79,13 @@ class RosFleet(Server):
         section: RosSection,
         *,
         cameras: Mapping[str, RosCamera] | None = None,
+        settings: Mapping[str, CameraSettings] | None = None,
+        frames: Mapping[str, Mapping[str, Any]] | None = None,
         calibrations: Mapping[str, Calibration] | None = None,
         wanted: Callable[[str, str], bool] = lambda _agent, _camera: True,
     ) -> None:
         self._section, self._said, self._wanted = section, dict(cameras or {}), wanted
+        self._settings, self._frames = dict(settings or {}), dict(frames or {})
         self.context: RosContext = RosContext(
             bus, domain=section.domain, distribution=section.distribution
         )
@@ -115,17 +124,26 @@ class RosFleet(Server):
         agents = self._fleet.agents(name)
         if not any(self._wanted(agent, name) for agent in agents):
             return
+        await self._meet(camera)
         old = self.nodes.pop(name, None)
         if old is not None:
             await old.stop()
         try:
             node = self._node(name)
-            made = CameraNode(camera, node, options=self._options(name))
+            made = CameraNode(camera, node, options=self._options(name, camera))
             await made.start()
         except SmartCamError as exc:
             logger.warning("%s ! it is not seen in ROS: %s", name, exc)
             return
         self._of[name], self.nodes[name] = camera, made
+
+    @staticmethod
+    async def _meet(camera: FleetCamera[Any]) -> None:
+        """Wait a moment for what its agent says of it: whether it has frames."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(MEET):
+                while not camera.met:  # noqa: ASYNC110 - nothing tells of it
+                    await asyncio.sleep(0.01)
 
     def _node(self, name: str) -> Node:
         try:
@@ -136,12 +154,15 @@ class RosFleet(Server):
         above = self._section.namespace.rstrip("/")
         return Node(own, namespace=f"{above}/{namespace}", context=self.context)
 
-    def _options(self, name: str) -> CameraNodeOptions:
-        said = self._said.get(name, RosCamera())
+    def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
+        said = self._said.get(name, RosCamera.model_validate({}))
         return CameraNodeOptions(
             frame_id=said.frame_id or as_name(name).replace("/", "_"),
             parent_frame=said.parent_frame or "",
             autostart=self._section.autostart,
+            settings=self._settings.get(name),
+            heard=lambda: camera.met,
+            frames=self._frames.get(name, {}),
         )
 
     @property

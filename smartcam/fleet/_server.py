@@ -26,6 +26,7 @@ from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
+from smartcam.settings import masked
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._wire_camera import WireCamera
     from smartcam.fleet._access_file import Access
     from smartcam.fleet._bus import Bus
-    from smartcam.fleet._file import Planned
+    from smartcam.fleet._file import FramesEntry, Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
     from smartcam.settings import CameraSettings
@@ -75,6 +76,7 @@ class FleetServer(Server):
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
         self._ros: RosFleet | None = None
         self._agent: Agent | None = None
+        self._settings: dict[str, CameraSettings] = {}
         self._events: Subscribers[CameraEvent] = Subscribers()
         self._stack = contextlib.AsyncExitStack()
 
@@ -115,6 +117,7 @@ class FleetServer(Server):
             await agent.open(OPEN_TIMEOUT)
             self._check_role()
             stack.push_async_callback(self._leave_ros)
+            self._settings = cameras
             await self._enter_ros()
             if self.file.certificates is not None and isinstance(self._bus, ZenohEnd):
                 watching = self._watch_certificates(self._bus, agent)
@@ -164,7 +167,7 @@ class FleetServer(Server):
 
     async def _enter_ros(self) -> None:
         if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-            self._ros = self._seen_in_ros(self._bus)
+            self._ros = self._seen_in_ros(self._bus, self._settings)
             await self._ros.start()
 
     async def _leave_ros(self) -> None:
@@ -187,7 +190,13 @@ class FleetServer(Server):
             else:
                 return
 
-    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
+    def _ros_frames(self, entry: FramesEntry) -> dict[str, Any]:
+        found: dict[str, Any] = {"video_device": masked(entry.url)}
+        if entry.camera_info is not None:
+            found["camera_info_url"] = (self._folder / entry.camera_info).absolute().as_uri()
+        return found
+
+    def _seen_in_ros(self, bus: ZenohEnd, cameras: dict[str, CameraSettings]) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
 
         file, own = self.file, self.file.agent_name
@@ -197,8 +206,14 @@ class FleetServer(Server):
             bus,
             file.fleet,
             self.address,
-            file.ros2 or RosSection(),
+            file.ros2 or RosSection.model_validate({}),
             cameras=said,
+            settings=cameras,
+            frames={
+                planned.name: self._ros_frames(planned.entry.frames)
+                for planned in self._plan
+                if planned.entry.frames is not None
+            },
             calibrations={name: one for name, one in found.items() if one is not None},
             wanted=lambda agent, _camera: agent == own,
         )

@@ -200,7 +200,7 @@ class ZenohEnd(ZenohSession, Bus):
                 said, key = head.to_bytes(), str(sample.key_expr)
                 self.in_loop(declared.call, len(data), hear, key, said, data)
 
-        declared = _ZenohDeclared(self)
+        declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
 
     def _hand_over(
@@ -243,14 +243,14 @@ class ZenohEnd(ZenohSession, Bus):
                 said = key or str(sample.key_expr)
                 in_loop(declared.call, len(payload), hear, said, payload)
 
-        declared = _ZenohDeclared(self)
+        declared = _OnBus(self)
         return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
 
     def answer(self, pattern: str, answer: Callable[[BusQuestion], None]) -> Handle:
         def on_query(query: Any) -> None:
             self.in_loop(declared.call, 0, answer, _ZenohQuestion(self, query))
 
-        declared = _ZenohDeclared(self)
+        declared = _OnBus(self)
         return declared.of(
             lambda session: session.declare_queryable(pattern, direct(on_query), complete=False)
         )
@@ -301,7 +301,7 @@ class ZenohEnd(ZenohSession, Bus):
     # ------------------------------------------------------------------ who is there
 
     def be_present(self, key: str) -> Handle:
-        return _ZenohDeclared(self).of(lambda session: session.liveliness().declare_token(key))
+        return _OnBus(self).of(lambda session: session.liveliness().declare_token(key))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
         found = await self._answers(
@@ -328,7 +328,7 @@ class ZenohEnd(ZenohSession, Bus):
         def on_sample(sample: Any) -> None:
             self.in_loop(declared.call, 0, on_presence, str(sample.key_expr), sample.kind == put)
 
-        declared = _ZenohDeclared(self).when_lost(lost)
+        declared = _OnBus(self).when_lost(lost)
         return declared.of(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, direct(on_sample), history=True
@@ -343,7 +343,7 @@ class ZenohEnd(ZenohSession, Bus):
             quietly(publisher.put, payload)
 
 
-class _ZenohDeclared(ZenohDeclared, Handle):
+class _OnBus(ZenohDeclared, Handle):
     pass
 
 
@@ -367,7 +367,7 @@ class _ZenohPublisher(Publisher):
         def on_matching(status: Any) -> None:
             end.later(self._declared.call, self._on_heard, status.matching)
 
-        self._declared = _ZenohDeclared(end)
+        self._declared = _OnBus(end)
         self._publisher: Any = None
         self._declared.of(lambda session: self._declare(declare(session), on_matching))
 

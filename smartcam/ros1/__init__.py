@@ -1,5 +1,19 @@
-"""Cameras in ROS 1, over a rosbridge."""
+"""ROS 1 in asyncio, without a ROS installation: over a rosbridge.
+
+:class:`RosbridgeNode` publishes topics and serves services; programs of ROS 1 see those of the
+bridge's own node.
+"""
 
 from __future__ import annotations
 
-__all__: list[str] = []
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.ros1._rosbridge import RosbridgeNode
+
+__all__ = ["RosbridgeNode"]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(__name__, {"_rosbridge": "RosbridgeNode"})

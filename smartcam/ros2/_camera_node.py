@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import inspect
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -13,12 +14,15 @@ from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.ros2._camera_lifecycle import CameraLifecycle
 from smartcam.ros2._camera_parameters import CameraParameters
+from smartcam.ros2._camera_pictures import CameraPictures
 from smartcam.ros2._camera_results import CameraResults
 from smartcam.ros2._camera_services import CameraServices
 from smartcam.ros2._camera_status import CameraStatus
+from smartcam.ros2._rosout import RosOut
+from smartcam.ros2._transforms import StaticTransforms, camera_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Awaitable, Callable
 
     from smartcam.camera import Camera
     from smartcam.settings import CameraSettings
@@ -84,6 +88,11 @@ PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
     lambda one: one.status,
     lambda one: one.results,
     lambda one: one.services,
+    lambda one: one.rosout(),
+    lambda one: CameraPictures(
+        one.camera, one.node, camera_info_url=str(one.options.frames.get("camera_info_url", ""))
+    ),
+    lambda one: StaticTransforms(one.node, one.transforms()),
     lambda one: one.lifecycle,
 )
 """What a node is made of, in the order in which it starts; the life cycle is the last, so that what
@@ -104,33 +113,60 @@ class CameraNode(Server):
     Attributes:
         lifecycle: whether it publishes results.
         status: what it says of the camera.
+        results: its results.
+        services: what others can have it do.
     """
 
     def __init__(
         self, camera: Camera[Any], node: Any, *, options: CameraNodeOptions | None = None
     ) -> None:
-        self.camera, self.node = camera, node
+        self.camera: Camera[Any] = camera
+        self.node: Any = node
         self.options: CameraNodeOptions = options or CameraNodeOptions()
-        self.lifecycle: CameraLifecycle = CameraLifecycle(
-            camera,
-            node,
-            application=self.options.application,
-            autostart=self.options.autostart,
-        )
-        self.status: CameraStatus = CameraStatus(
-            camera, node, self.options, lambda: self.lifecycle.state.label
-        )
-        self.results: CameraResults = CameraResults(camera, node, frame_id=self.frame_id)
-        self.results.active = False
-        self.services: CameraServices = CameraServices(camera, node, self.results, self.lifecycle)
-        self.lifecycle.listen(self._on_transition)
+        self.lifecycle: CameraLifecycle
+        self.status: CameraStatus
+        self.results: CameraResults
+        self.services: CameraServices
+        self._renew()
         self._stack: contextlib.AsyncExitStack | None = None
         self._turn = asyncio.Lock()
+
+    def _renew(self) -> None:
+        camera, node, options = self.camera, self.node, self.options
+        self.lifecycle = CameraLifecycle(
+            camera, node, application=options.application, autostart=options.autostart
+        )
+        self.status = CameraStatus(camera, node, options, lambda: self.lifecycle.state.label)
+        self.results = CameraResults(camera, node, frame_id=self.frame_id)
+        self.results.active = False
+        settings = options.settings or camera.settings
+        self.services = CameraServices(
+            camera, node, self.results, self.lifecycle, address=settings.address
+        )
+        self.lifecycle.listen(self._on_transition)
 
     @property
     def frame_id(self) -> str:
         """The frame of what it sees."""
         return self.options.frame_id or self.camera.name
+
+    def rosout(self) -> RosOut | None:
+        """Return what has the camera's warnings in ``/rosout``; None in ROS 1."""
+        if self.node.parameters is None:
+            return None
+        begins = (f"{self.camera.name} ", f"{self.camera.name}:")
+
+        def wanted(record: logging.LogRecord) -> bool:
+            return record.getMessage().startswith(begins)
+
+        return RosOut(self.node, logging.getLogger("smartcam"), wanted=wanted)
+
+    def transforms(self) -> list[Any]:
+        """Return where the calibration puts the camera; none where it does not say, or is none."""
+        calibration = self.camera.settings.calibration
+        if calibration is None or isinstance(calibration, Mapping):  # of each application one
+            return []
+        return camera_transforms(calibration, self.frame_id, parent=self.options.parent_frame)
 
     def _on_transition(self, _: object) -> None:
         self.results.active = self.lifecycle.active
@@ -146,6 +182,8 @@ class CameraNode(Server):
         async with self._turn:
             if self._stack is not None:
                 return
+            if self.lifecycle.closed:
+                self._renew()
             async with contextlib.AsyncExitStack() as stack:
                 await stack.enter_async_context(self.node)
                 for make in PARTS:
@@ -155,6 +193,7 @@ class CameraNode(Server):
                         begun = part.start()
                         if inspect.isawaitable(begun):
                             await begun
+                        await asyncio.sleep(0)  # to declare takes the engine a while
                 self._stack = stack.pop_all()
 
     async def stop(self) -> None:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import logging
+import math
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.exceptions import RosError, SmartCamError
+from smartcam.exceptions import SmartCamError
 from smartcam.models import Connected, Disconnected, Reconnected, Statistics, Status
 from smartcam.ros2._qos import DEFAULT, LATCHED
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
     from smartcam.camera import Camera
     from smartcam.ros2._camera_node import CameraNodeOptions
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 STATUS_TYPE = "smartcam_msgs/msg/CameraStatus"
-DIAGNOSTICS = "/diagnostics"
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 MOST_EVENTS = 64
 """Events that wait; what counts is the state after them."""
@@ -31,17 +33,27 @@ LONGEST_TEXT = 1000
 """Characters of an error's text."""
 
 OK, WARN, ERROR, STALE = range(4)
-"""``diagnostic_msgs/msg/DiagnosticStatus``"""
+"""Levels, as ``diagnostic_msgs/msg/DiagnosticStatus`` has them."""
 
-TROUBLES = {
+TROUBLES: Mapping[Status, tuple[int, str]] = {
     Status.SYSTEM_ERROR: (ERROR, "System Error: the camera needs a reboot at least"),
     Status.OVERHEAT: (WARN, "Overheat: the camera is too hot, inspections may get worse"),
     Status.INPUT_CONTAINER: (WARN, "Input Container: input data and inspections are out of step"),
     Status.OVERTRIGGERED: (WARN, "Overtriggered: a trigger was dropped"),
 }
-"""Bits of the status that are errors: how bad, and in words."""
+"""Bits of the status that are errors, the worst first: how bad, and in words."""
+
+RISING: Mapping[str, str] = {
+    "dropped": "results were dropped: who reads them is too slow",
+    "uninterpretable": "results do not fit their layout",
+    "wrong_application": "results came from another application than expected",
+    "overtriggers": "triggers were dropped: they come too fast",
+    "late": "results came after their triggers had given up",
+}
+"""Counters that are a warning where they have risen since the last diagnostics."""
 
 COUNTERS = tuple(one.name for one in dataclasses.fields(Statistics) if one.type in {"int", int})
+MEANS = ("round_trip", "processing")
 
 
 class Health(NamedTuple):
@@ -52,7 +64,7 @@ class Health(NamedTuple):
     errors: tuple[str, ...] = ()
 
 
-def health(camera: Camera[Any], *, heard: bool) -> Health:
+def health(camera: Camera[Any], *, heard: bool = True) -> Health:
     """Return how a camera is.
 
     Args:
@@ -62,24 +74,32 @@ def health(camera: Camera[Any], *, heard: bool) -> Health:
     if not camera.connected:
         why = trouble(camera)
         if not heard:
-            return Health(STALE, why or "nothing has been heard of it yet")
+            return Health(STALE, why or "nothing has been heard of it")
         return Health(ERROR, why or "not connected")
-    status = camera.status
-    found = [(bit.name or "", *TROUBLES[bit]) for bit in TROUBLES if bit in status]
-    errors = tuple(name for name, _, _ in found)
+    status = status_of(camera)
+    found = [bit for bit in TROUBLES if bit in status]
     if found:
-        return Health(max(level for _, level, _ in found), found[0][2], errors)
-    if Status.BUSY in status and Status.RUNNING not in status:
+        errors = tuple(bit.name or "" for bit in found)
+        return Health(TROUBLES[found[0]][0], TROUBLES[found[0]][1], errors)
+    if status.loading:
         return Health(OK, "an application is being loaded")
     if Status.RUNNING not in status:
         return Health(WARN, "stopped: the camera is not in run mode")
     return Health(OK, "busy" if Status.BUSY in status else "ready")
 
 
+def status_of(camera: Camera[Any]) -> Status:
+    """Return the status of the present session; no bit where there is none, or none was told."""
+    try:
+        return camera.status if camera.connected else Status(0)
+    except SmartCamError:
+        return Status(0)
+
+
 def trouble(camera: Camera[Any]) -> str:
     """Return why there is no session; empty where nobody knows."""
     try:
-        camera._require_session()  # noqa: SLF001 - it is what knows the reason, of either kind
+        camera._require_session()  # noqa: SLF001 - it is what knows the reason, of every kind
     except SmartCamError as exc:
         return str(exc)[:LONGEST_TEXT]
     return ""
@@ -87,9 +107,7 @@ def trouble(camera: Camera[Any]) -> str:
 
 def status_fields(camera: Camera[Any]) -> dict[str, Any]:
     """Return the fields of ``smartcam_msgs/msg/CameraStatus`` but for its header."""
-    connected = camera.connected
-    status = camera.status if connected else Status(0)
-    how = health(camera, heard=True)
+    connected, status, how = camera.connected, status_of(camera), health(camera)
     bad = Status.BUSY in status or Status.SYSTEM_ERROR in status
     return {
         "camera_name": camera.name,
@@ -129,9 +147,11 @@ class CameraStatus:
         self._frame_id = options.frame_id or camera.name
         self._least = 1.0 / options.status_rate
         self._said: dict[str, Any] | None = None
-        self._said_at = -1e9  # loop time
+        self._due = -math.inf  # loop time of the next status
         self._since: datetime | None = None
-        self._dropped = 0
+        self._before: dict[str, int] = {}  # counters, when the last diagnostics were said
+        self._woken = asyncio.Event()
+        self._heard: list[Callable[[], None]] = []
         self._events: Any = None
         self._tasks: list[asyncio.Task[None]] = []
         self._ends: list[Any] = []
@@ -140,13 +160,12 @@ class CameraStatus:
         """Say how the camera is, and go on doing so."""
         self._status = self._node.publisher("~/status", STATUS_TYPE, qos=LATCHED)
         self._ends.append(self._status)
-        kind = "diagnostic_msgs/msg/DiagnosticArray"
-        self._diagnostics = self._node.publisher(DIAGNOSTICS, kind, qos=DEFAULT)
+        self._diagnostics = self._node.publisher("/diagnostics", DIAGNOSTICS, qos=DEFAULT)
         self._ends.append(self._diagnostics)
         self._events = self._camera.events(max_queue=MOST_EVENTS)
         if self._camera.connected:
             self._since = datetime.now(UTC)
-        self._say_if_new()
+        self._guarded(self._say_if_new)
         loop = asyncio.get_running_loop()
         self._tasks = [loop.create_task(self._follow()), loop.create_task(self._repeat())]
 
@@ -163,20 +182,41 @@ class CameraStatus:
         if tasks:
             await asyncio.wait(tasks)
 
+    def listen(self, heard: Callable[[], None]) -> Callable[[], None]:
+        """Have ``heard`` called when a status is said that differs; return what ends that."""
+        self._heard.append(heard)
+        return lambda: self._heard.remove(heard) if heard in self._heard else None
+
+    def set_period(self, seconds: float) -> None:
+        """Say diagnostics in this period from now on."""
+        self.period = seconds
+        self._woken.set()
+
+    def _guarded(self, say: Callable[[], None]) -> None:
+        """Say something; that it cannot be said now does not end what says it."""
+        try:
+            say()
+        except SmartCamError as exc:
+            logger.warning("%s ! it was not said: %s", self._node.full_name, exc)
+        except Exception:
+            logger.exception("%s ! it was not said", self._node.full_name)
+
+    def _header(self) -> dict[str, Any]:
+        seconds, rest = divmod(time.time_ns(), 10**9)
+        return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": self._frame_id}
+
     # ------------------------------------------------------------------ the status
 
     async def _follow(self) -> None:
-        """Say each change, those that come fast only as they have left it."""
+        """Say each change; of those that come too fast what they have left."""
         loop = asyncio.get_running_loop()
-        try:
+        with contextlib.suppress(SmartCamError):  # it ended for good, and the status says why
             async for event in self._events:
                 self._note(event)
-                await asyncio.sleep(self._said_at + self._least - loop.time())
-                self._say_if_new()
-        except SmartCamError:
-            pass  # it will not be connected again, and the status says why
-        await asyncio.sleep(self._said_at + self._least - loop.time())
-        self._say_if_new()
+                await asyncio.sleep(self._due - loop.time())
+                self._guarded(self._say_if_new)
+        await asyncio.sleep(self._due - loop.time())
+        self._guarded(self._say_if_new)
 
     def _note(self, event: object) -> None:
         if isinstance(event, (Connected, Reconnected)):
@@ -188,69 +228,73 @@ class CameraStatus:
         fields = status_fields(self._camera)
         if fields == self._said:
             return
-        self._said, self._said_at = fields, asyncio.get_running_loop().time()
-        try:
-            self._status.publish({"header": self._header(), **fields})
-        except RosError as exc:
-            logger.warning("%s ! its status was not said: %s", self._node.full_name, exc)
-
-    def _header(self) -> dict[str, Any]:
-        seconds, rest = divmod(time.time_ns(), 10**9)
-        return {"stamp": {"sec": seconds, "nanosec": rest}, "frame_id": self._frame_id}
+        self._due = asyncio.get_running_loop().time() + self._least
+        self._status.publish({"header": self._header(), **fields})
+        self._said = fields
+        for heard in tuple(self._heard):
+            self._guarded(heard)
 
     # ------------------------------------------------------------------ diagnostics
 
     async def _repeat(self) -> None:
+        """Say diagnostics in their period; what was missed is left out."""
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            self._diagnose()
-            if loop.time() >= self._said_at + self._least:
-                self._say_if_new()  # why it is not there changes without an event
-            due = max(due + self.period, loop.time())
-            await asyncio.sleep(due - loop.time())
+            if getattr(self._diagnostics, "heard", True):
+                self._guarded(self._diagnose)
+            if loop.time() >= self._due:
+                self._guarded(self._say_if_new)  # why it is away changes without an event
+            missed = max(0.0, loop.time() - due)
+            due += self.period * (1 + missed // self.period)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout_at(due):
+                    await self._woken.wait()
+                self._woken.clear()
+                due = loop.time()
 
     def _diagnose(self) -> None:
-        if not getattr(self._diagnostics, "heard", True):
-            return
-        try:
-            self._diagnostics.publish({"header": self._header(), "status": [self.diagnosis()]})
-        except RosError as exc:
-            logger.warning("%s ! its diagnostics were not said: %s", self._node.full_name, exc)
+        self._diagnostics.publish({"header": self._header(), "status": [self.diagnosis()]})
 
     def diagnosis(self) -> dict[str, Any]:
         """Return the fields of ``diagnostic_msgs/msg/DiagnosticStatus``."""
-        how = health(self._camera, heard=self._heard())
-        address = (self._options.settings or self._camera.settings).address
+        counted = self._camera.statistics()
+        counts = {name: int(getattr(counted, name)) for name in COUNTERS}
+        streams = [one for one in counted.subscribers if one.name == "results"]
+        counts["dropped"] = sum(one.dropped for one in streams)
+        how = health(self._camera, heard=self._is_heard(counted))
+        before, self._before = self._before, counts
+        rose = [name for name in RISING if counts[name] > before.get(name, counts[name])]
+        if how.level == OK and rose:
+            how = Health(WARN, RISING[rose[0]])
+        values = [*self._values(how, counted), *counts.items()]
         return {
             "level": how.level,
             "name": f"{self._node.full_name.lstrip('/')}: camera",
             "message": how.text,
-            "hardware_id": self._options.hardware_id or f"{address.host}:{address.port}",
-            "values": [{"key": key, "value": value} for key, value in self._values(how)],
+            "hardware_id": self._options.hardware_id or self._address(),
+            "values": [{"key": key.replace("_", " "), "value": str(one)} for key, one in values],
         }
 
-    def _heard(self) -> bool:
+    def _address(self) -> str:
+        address = (self._options.settings or self._camera.settings).address
+        path = f"/{address.path}" if address.path else ""
+        return f"{address.host}:{address.port}{path}"
+
+    def _is_heard(self, counted: Statistics) -> bool:
+        """Return whether there is, or was, any sign of who has the session with the camera."""
         if self._options.heard is not None:
             return self._options.heard()
-        counted = self._camera.statistics()
         return bool(counted.sessions or counted.last_error)
 
-    def _values(self, how: Health) -> Iterator[tuple[str, str]]:
-        camera = self._camera
-        connected = camera.connected
-        application = camera.active_application if connected else None
-        counted = camera.statistics()
-        yield "life cycle", self._state()
-        yield "connected since", self._since.isoformat() if self._since else ""
-        yield "status", " ".join(camera.status.names) if connected else ""
+    def _values(self, how: Health, counted: Statistics) -> Iterator[tuple[str, Any]]:
+        application = self._camera.active_application if self._camera.connected else None
+        yield "life_cycle", self._state()
+        yield "connected_since", self._since.isoformat() if self._since else ""
+        yield "status", " ".join(status_of(self._camera).names)
         yield "errors", " ".join(how.errors)
-        yield "application", "" if application is None else str(application)
-        for name in COUNTERS:
-            yield name.replace("_", " "), str(getattr(counted, name))
-        yield "dropped", str(sum(one.dropped for one in counted.subscribers))
-        yield "last error", counted.last_error or ""
-        for name in ("round_trip", "processing"):
+        yield "application", "" if application is None else application
+        yield "last_error", (counted.last_error or "")[:LONGEST_TEXT]
+        for name in MEANS:
             times = getattr(counted, name)
-            mean = f"{times.total / times.count:.6f}" if times.count else ""
-            yield f"{name.replace('_', ' ')} mean", mean
+            yield f"{name}_mean", f"{times.total / times.count:.6f}" if times.count else ""

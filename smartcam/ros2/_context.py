@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import collections
+import itertools
 import logging
 import os
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +37,37 @@ SETTINGS: Mapping[str, Any] = {
     "scouting/gossip/enabled": True,
 }
 """Of a session of Zenoh that ROS nodes stand on, as rmw_zenoh's own have them."""
+
+
+CALM, MOST_DIRECT = 0.01, 8
+"""Seconds, and messages in that time that the event loop hands to the engine itself: it would drop
+those beyond. A thread does the others, which waits for room."""
+
+PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
+"""Of long messages of which the newest counts. The engine has one of each priority and link under
+way; topics take turns, so that the two pictures of a pair do not meet in one."""
+
+PAUSE, RATE = 0.002, 5e8
+"""Seconds, and bytes a second, that a link which is well needs until the engine has taken one."""
+
+
+class NewestSlot:
+    """A thread, and a priority, for long messages of which the newest counts.
+
+    Attributes:
+        lane: the thread.
+        priority: the engine's.
+    """
+
+    def __init__(self, priority: str) -> None:
+        self.lane: str = f"newest-{priority.lower()}"
+        self.priority: str = priority
+        self._free = 0.0
+
+    def wait(self, size: int) -> None:
+        """Wait until the message before should be taken; ``size`` bytes come now."""
+        time.sleep(max(0.0, self._free - time.monotonic()))
+        self._free = time.monotonic() + PAUSE + size / RATE
 
 
 class RosContext:
@@ -74,9 +107,13 @@ class RosContext:
         self._users = 0
         self._numbers = 0
         self._ends: dict[tuple[str, str], list[Entity]] = {}
+        self._watchers: dict[tuple[str, str], list[Callable[[Entity, bool], None]]] = {}
         self._lock = threading.Lock()
         self._threads: dict[str, ThreadPoolExecutor] = {}
         self._long: collections.Counter[object] = collections.Counter()
+        self._in_lane: collections.Counter[str] = collections.Counter()
+        self._calm_since, self._said_directly, self._crowded = 0.0, 0, 0.0
+        self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
         self._stop_listening: Callable[[], None] = _nothing
 
     async def open(self, timeout: float) -> None:
@@ -133,7 +170,32 @@ class RosContext:
         if not ends:
             self._ends.pop((entity.name, entity.kind), None)
 
+    def watch(
+        self, name: str, kind: str, watcher: Callable[[Entity, bool], None]
+    ) -> Callable[[], None]:
+        """Have ``watcher(entity, present)`` called for ends that come and go from now on.
+
+        Args:
+            name: of their topic or service.
+            kind: of them.
+            watcher: is called in the event loop.
+
+        Returns:
+            What ends it.
+        """
+        found = self._watchers.setdefault((name, kind), [])
+        found.append(watcher)
+
+        def end() -> None:
+            found.remove(watcher)
+            if not found and self._watchers.get((name, kind)) is found:
+                del self._watchers[name, kind]
+
+        return end
+
     def _compare(self, other: Entity, present: bool) -> None:
+        for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
+            watcher(other, present)
         if present and other.kind in OTHER_END:
             for one in self._ends.get((other.name, OTHER_END[other.kind]), ()):
                 self._differ(one, other)
@@ -154,9 +216,25 @@ class RosContext:
 
     # ------------------------------------------------------------------ what may wait
 
+    def slot(self) -> NewestSlot:
+        """Return the slot of one more topic of which the newest counts."""
+        return next(self._slots)
+
     def waits(self, owner: object) -> bool:
         """Whether messages of an owner wait to be said."""
         return bool(self._long[owner])
+
+    def calm(self) -> bool:
+        """Whether the event loop may hand one more short message to the engine."""
+        now = time.monotonic()
+        if self._in_lane["short"] or now - self._crowded < CALM:
+            # the thread may wait in the engine, and would have the loop wait, too; and the engine
+            # has just been full
+            return False
+        if now - self._calm_since > CALM:
+            self._calm_since, self._said_directly = now, 0
+        self._said_directly += 1
+        return self._said_directly <= MOST_DIRECT
 
     def say_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
         """Have the thread of a lane call ``say``, which may wait for room; in order."""
@@ -165,10 +243,14 @@ class RosContext:
             thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")
         with self._lock:
             self._long[owner] += 1
-        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner))
+            self._in_lane[lane] += 1
+        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner, lane))
 
-    def _said(self, owner: object) -> None:
+    def _said(self, owner: object, lane: str) -> None:
         with self._lock:
+            self._in_lane[lane] -= 1
+            if lane == "short":
+                self._crowded = time.monotonic()
             self._long[owner] -= 1
             if not self._long[owner]:
                 del self._long[owner]

@@ -20,9 +20,9 @@ from smartcam.ros2._type_description import TypeDescriptions
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
-    from typing import Literal
 
     from smartcam.ros2._graph import RosGraph
+    from smartcam.ros2._tokens import Kind
     from smartcam.ros2._types import RosTypes
 
 OPEN_TIMEOUT = 10.0
@@ -254,7 +254,7 @@ class Node(Server):
 
     def _end(
         self,
-        kind: Literal["MP", "MS", "SS", "SC"],
+        kind: Kind,
         name: str,
         what: str,
         dds: str,
@@ -266,9 +266,7 @@ class Node(Server):
             raise RosError(f"{self.full_name}: the node is not open")
         return self._entity(kind, self.context.next_id(), full, dds, hashed, qos)
 
-    def _entity(
-        self, kind: Literal["NN", "MP", "MS", "SS", "SC"], number: int, *more: Any
-    ) -> Entity:
+    def _entity(self, kind: Kind, number: int, *more: Any) -> Entity:
         context = self.context
         return Entity(
             kind, context.domain, context.zid, self._id, number, self.namespace, self.name, *more

@@ -73,7 +73,7 @@ class _Declared:
         self.description.check_range(plain)
 
 
-class _Change(NamedTuple):
+class _ParameterChange(NamedTuple):
     declared: _Declared
     old: Typed
     new: Typed
@@ -286,8 +286,8 @@ class RosParameters:
         changes = []
         for name, value in values.items():
             declared = self._of(name)
-            changes.append(_Change(declared, declared.value, declared.fitting(value)))
-        done: list[_Change] = []
+            changes.append(_ParameterChange(declared, declared.value, declared.fitting(value)))
+        done: list[_ParameterChange] = []
         try:
             for change in changes:
                 await self._call(change.declared, change.new)
@@ -299,7 +299,7 @@ class RosParameters:
             change.declared.value = change.new
         self._tell(changed=[one for one in values if one in self._declared])
 
-    async def _take_back(self, done: list[_Change], why: BaseException) -> None:
+    async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
         """Undo what went well; what cannot be undone counts, and is told."""
         for change in reversed(done):
             name = change.declared.description.name

@@ -27,6 +27,9 @@ MOST_WAITING = 1000
 MOST_TEXT = 8000
 """Characters of a record's text."""
 
+CLOSE_TIMEOUT = 1.0
+LOOK_AGAIN = 0.005
+
 TURN = 64
 """Records that are published in one turn of the event loop."""
 
@@ -57,6 +60,8 @@ class RosOut:
         self.dropped: int = 0
         self._node, self._logger = node, logger
         self._waiting: collections.deque[dict[str, Any]] = collections.deque(maxlen=MOST_WAITING)
+        self._handed = 0  # to the publisher
+        self._lock = threading.Lock()
         self._woken = False
         self._loop: asyncio.AbstractEventLoop | None = None
         self._publisher: RosPublisher | None = None
@@ -73,24 +78,34 @@ class RosOut:
         """
         if self._publisher is None:
             self._loop = asyncio.get_running_loop()
+            self._handed = 0
             self._publisher = self._node.publisher("/rosout", "rcl_interfaces/msg/Log", qos=ROSOUT)
             self._logger.addHandler(self._handler)
 
     async def close(self) -> None:
-        """Publish what waits, and nothing more. Idempotent."""
+        """Publish what waits, within a second, and nothing more. Idempotent."""
         self._logger.removeHandler(self._handler)
         publisher = self._publisher
-        if publisher is not None:
-            while self._waiting:
-                self._publish()
-            self._publisher = None
+        if publisher is None:
+            return
+        while self._waiting:
+            self._publish()
+        self._publisher = None
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                while publisher.published + publisher.dropped < self._handed:  # noqa: ASYNC110
+                    await asyncio.sleep(LOOK_AGAIN)  # a thread says them
+        except TimeoutError:
+            pass  # the network does not take them
+        finally:
             publisher.close()
 
     def _take(self, record: logging.LogRecord) -> None:
         """Take a record in; in the thread that logs."""
-        if len(self._waiting) == MOST_WAITING:
-            self.dropped += 1
-        self._waiting.append(self._said(record))
+        said = self._said(record)
+        with self._lock:  # for no longer than this
+            self.dropped += len(self._waiting) == MOST_WAITING
+            self._waiting.append(said)
         if not self._woken and self._loop is not None:
             self._woken = True
             with contextlib.suppress(RuntimeError):  # the loop is closed, and so is all
@@ -119,6 +134,7 @@ class RosOut:
             for _ in range(min(TURN, len(self._waiting))):
                 with contextlib.suppress(RosError):  # which would be logged, and come here
                     publisher.publish(self._waiting.popleft())
+                    self._handed += 1
         if self._waiting and not self._woken and self._loop is not None:
             self._woken = True
             self._loop.call_soon(self._publish)

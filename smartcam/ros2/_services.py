@@ -77,7 +77,7 @@ class RosService(RosEnd):
             lambda session: session.declare_queryable(entity.key, direct(on_query), complete=True)
         )
         self._appear()
-        self._stop_listening = context.graph.listen(self._on_graph)
+        self._stop_listening = context.watch(self.name, CLIENT, self._on_graph)
 
     def _take(self, query: Any, data: bytes, extra: bytes | None) -> None:
         self.calls += 1
@@ -129,7 +129,7 @@ class RosService(RosEnd):
 
     def _on_graph(self, entity: Entity, present: bool) -> None:
         """Give up what was called by who is gone."""
-        if present or entity.kind != CLIENT or entity.name != self.name:
+        if present:
             return
         for task, gid in self._tasks.items():
             if gid == entity.gid:
@@ -167,6 +167,7 @@ class RosClient(RosEnd):
         self.type: ServiceType = kind
         self._number = 0
         self._waiting: set[asyncio.Future[Any]] = set()
+        self._querier: Any = None
 
         def declare(session: Any) -> Any:
             zenoh = context.zenoh.engine
@@ -194,6 +195,8 @@ class RosClient(RosEnd):
         Raises:
             ServiceTimeoutError: nobody does within ``timeout`` seconds.
         """
+        if self.served:
+            return
         try:
             async with asyncio.timeout(timeout):
                 while not self.served:
@@ -252,11 +255,10 @@ class RosClient(RosEnd):
     def _ask(self, data: bytes, attachment: Attachment, reply: asyncio.Future[bytes]) -> None:
         zenoh = self._context.zenoh
         refused: list[str] = []
+        came = False
 
-        def take(found: bytes | None, extra: bytes | None, error: str) -> None:
-            if found is None:
-                refused.append(error)
-            elif not reply.done() and self._is_for(attachment, extra):
+        def take(found: bytes) -> None:
+            if not reply.done():
                 reply.set_result(found)
 
         def end() -> None:
@@ -269,16 +271,19 @@ class RosClient(RosEnd):
                 reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
 
         def on_reply(answer: Any) -> None:
+            nonlocal came
             if answer.ok is None:
-                text = answer.err.payload.to_bytes().decode(errors="replace")
-                zenoh.in_loop(take, 0, None, None, text[:1000])
+                refused.append(answer.err.payload.to_bytes()[:1000].decode(errors="replace"))
                 return
             extra = None if answer.ok.attachment is None else answer.ok.attachment.to_bytes()
-            found = answer.ok.payload.to_bytes()
-            zenoh.in_loop(take, len(found), found, extra, "")
+            if self._is_for(attachment, extra):
+                came = True
+                found = answer.ok.payload.to_bytes()
+                zenoh.in_loop(take, len(found), found)
 
         def on_end() -> None:
-            zenoh.in_loop(end, 0)
+            if not came:  # else the loop is not woken again
+                zenoh.in_loop(end, 0)
 
         self._querier.get(
             zenoh.engine.handlers.Callback(on_reply, on_end, indirect=False),
@@ -287,6 +292,7 @@ class RosClient(RosEnd):
         )
 
     def _is_for(self, wanted: Attachment, extra: bytes | None) -> bool:
+        """Return whether a reply is one to this call; in a thread of the engine's."""
         try:
             got = Attachment.decode(extra)
         except RosMessageError as exc:

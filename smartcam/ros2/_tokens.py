@@ -9,17 +9,20 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Final, Literal
 
 from smartcam.ros2._names import full_name
 from smartcam.ros2._qos import QoS
 
-if TYPE_CHECKING:
-    from typing import Literal
-
 ADMIN = "@ros2_lv"
 
-NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT = KINDS = ("NN", "MP", "MS", "SS", "SC")
+Kind = Literal["NN", "MP", "MS", "SS", "SC"]
+NODE: Final = "NN"
+PUBLISHER: Final = "MP"
+SUBSCRIPTION: Final = "MS"
+SERVICE: Final = "SS"
+CLIENT: Final = "SC"
+KINDS: Final = (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT)
 
 _NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # newer ones may name backends of buffers, too
 
@@ -47,7 +50,7 @@ class Entity:
         enclave: for security, which is not used here.
     """
 
-    kind: Literal["NN", "MP", "MS", "SS", "SC"]
+    kind: Kind
     domain: int
     zid: str
     node_id: int

@@ -6,7 +6,9 @@ kept by an advanced publisher, and asked for by an advanced subscriber.
 
 from __future__ import annotations
 
+import asyncio
 import collections
+import concurrent.futures
 import logging
 import threading
 import time
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.models import SubscriberStatistics
-    from smartcam.ros2._context import RosContext
+    from smartcam.ros2._context import NewestSlot, RosContext
     from smartcam.ros2._tokens import Entity
     from smartcam.ros2._types import MessageType
 
@@ -41,6 +43,9 @@ def said(message: object, fields: dict[str, Any]) -> object:
         raise RosMessageError("expected a message or its fields, got both")
     return fields if message is None else message
 
+
+MOST_SHORT = 10_000
+"""Short messages of a topic that wait to be said; of long ones as many as its depth says."""
 
 HEARTBEAT = 0.5
 """Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
@@ -122,8 +127,10 @@ class RosPublisher(RosEnd):
         self._publisher: Any = None
         qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
         self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
-        self._patient: Any = None  # waits for room
-        self._lane = "latched" if qos.latched else "long"
+        self._patient: dict[str, Any] = {}  # by lane: what waits for room
+        self._hasty: Any = None  # leaves out to whom one is under way
+        self._slot: NewestSlot | None = None
+        self._lane = "latched" if qos.latched else "short"
         self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
         self._appear()
 
@@ -181,23 +188,88 @@ class RosPublisher(RosEnd):
         Raises:
             RosError: the publisher is closed.
         """
-        if self._closed:
-            raise RosError(f"{self.name}: this publisher is closed")
-        self._number += 1
-        attachment = Attachment(self._number, time.time_ns(), self.entity.gid).encode()
-        if self._direct and len(data) <= LONG and not self._context.waits(self):
+        self._check_open()
+        attachment = self._attachment()
+        waits = self._context.waits(self)
+        if len(data) > LONG and self._lane == "short" and not waits:
+            self._lane = "long"  # from now on: a short one would overtake it
+        if self._direct and self._lane == "short" and not waits and self._context.calm():
             quietly(self._publisher.put, data, attachment=attachment)
             self.published += 1
             return
+        most = MOST_SHORT if self._lane == "short" else self.entity.qos.kept
         with self._lock:
             self._waiting.append((data, attachment))
             self._bytes += len(data)
-            while len(self._waiting) > self.entity.qos.kept or self._bytes > MOST_WAITING:
+            while len(self._waiting) > most or self._bytes > MOST_WAITING:
                 if len(self._waiting) == 1:
                     break
                 self._bytes -= len(self._waiting.popleft()[0])
                 self.dropped += 1
         self._context.say_later(self, self._say_next, self._lane)
+
+    async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message; a long one except to whom one is under way already.
+
+        For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
+        that is old. It returns when the engine has copied the message; a thread encodes it.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+
+        Cancellation: the message is published or not.
+        """
+        self._check_open()
+        what = said(message, fields)
+        if self._slot is None:
+            self._slot = self._context.slot()
+            self._lane = self._slot.lane
+        done: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+        def say() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                self._say_newest(self.type.encode(what))
+            except BaseException as exc:  # noqa: BLE001 - told to who waits
+                done.set_exception(exc)
+            else:
+                done.set_result(None)
+
+        self._context.say_later(self, say, self._lane)
+        await asyncio.wrap_future(done)
+
+    def _say_newest(self, data: bytes) -> None:
+        """Say a message; in the thread for it.
+
+        A long one by a publisher of its own, whose messages the engine leaves out for each link
+        that has one of the same priority under way; so they have a little time between them.
+        """
+        slot, publisher = self._slot, self._publisher
+        if self._closed or slot is None:
+            return
+        attachment = self._attachment()
+        if len(data) > LONG:
+            if self._hasty is None:
+                zenoh = self._context.zenoh.engine
+                self._hasty = self._context.zenoh.session.declare_publisher(
+                    self.entity.key,
+                    congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+                    priority=getattr(zenoh.Priority, slot.priority),
+                )
+            publisher = self._hasty
+            slot.wait(len(data))
+        quietly(publisher.put, data, attachment=attachment)
+        self.published += 1
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RosError(f"{self.name}: this publisher is closed")
+
+    def _attachment(self) -> bytes:
+        self._number += 1
+        return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
 
     def _say_next(self) -> None:
         """Say the oldest that waits; in the thread for it."""
@@ -210,17 +282,17 @@ class RosPublisher(RosEnd):
         self.published += 1
 
     def _patiently(self) -> Any:
-        """Return what publishes long messages: it waits for room, behind all else."""
-        zenoh = self._context.zenoh.engine
+        """Return what waits for room: for long messages behind all else."""
+        zenoh, lane = self._context.zenoh.engine, self._lane
         if self.entity.qos.latched:
             return self._publisher  # which has to keep them
-        if self._patient is None:
-            self._patient = self._context.zenoh.session.declare_publisher(
+        if lane not in self._patient:
+            self._patient[lane] = self._context.zenoh.session.declare_publisher(
                 self.entity.key,
                 congestion_control=zenoh.CongestionControl.BLOCK,
-                priority=zenoh.Priority.DATA_LOW,
+                priority=zenoh.Priority.DATA if lane == "short" else zenoh.Priority.DATA_LOW,
             )
-        return self._patient
+        return self._patient[lane]
 
     def close(self) -> None:
         """Be gone; what waits to be said is not said any more. Idempotent."""
@@ -237,14 +309,15 @@ class RosPublisher(RosEnd):
             self._take_back()
 
     def _take_back(self) -> None:
-        patient, self._patient = self._patient, None
-        if patient is not None:
-            quietly(patient.undeclare)
+        for one in (*self._patient.values(), self._hasty):
+            if one is not None:
+                quietly(one.undeclare)
+        self._patient, self._hasty = {}, None
         self._publisher = None
         self._outlet.close()
 
 
-class _Heard(NamedTuple):
+class _FromTopic(NamedTuple):
     data: bytes
     attachment: Attachment
 
@@ -272,7 +345,7 @@ class RosSubscription(RosEnd):
         self.type: MessageType = kind
         self.attachment: Attachment | None = None
         self.rejected: int = 0
-        self._queue = Subscription[_Heard](
+        self._queue = Subscription[_FromTopic](
             entity.name,
             max_queue=entity.qos.kept,
             overflow="drop_oldest",
@@ -314,7 +387,7 @@ class RosSubscription(RosEnd):
         except RosMessageError as exc:
             self._reject(exc)
             return
-        self._queue.offer(_Heard(data, attachment), 0.0, len(data))
+        self._queue.offer(_FromTopic(data, attachment), 0.0, len(data))
 
     def _reject(self, why: RosMessageError) -> None:
         self.rejected += 1

@@ -11,7 +11,7 @@ from typing import Any, cast
 import pytest
 
 import smartcam
-from tests.client.kinds import AT_THE_WIRE, IN_TIME_OF_THEIR_OWN, MODULES
+from tests.client.kinds import AT_THE_WIRE, IN_TIME_OF_THEIR_OWN, MODULES, OVER_TCP_ON_A_BUS
 from tests.fleet.kinds import connect
 from tests.timed_loop import TimedLoop
 
@@ -62,8 +62,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if kind is not None:
             name, _, parameters = item.name.partition("[")
             others = "-".join(one for one in parameters.rstrip("]").split("-") if one != kind)
-            if _LEFT_OUT[kind] & {name, f"{name}[{others}]"} or (
-                kind == "zenoh" and _counts_steps(item)
+            if (
+                _LEFT_OUT[kind] & {name, f"{name}[{others}]"}
+                or (kind == "zenoh" and _counts_steps(item))
+                or (kind != "wire" and name in OVER_TCP_ON_A_BUS and others.endswith("udp"))
             ):
                 left_out.append(item)
                 continue

@@ -131,6 +131,9 @@ AT_THE_WIRE: dict[str, tuple[str, ...]] = {
 }
 """By reason, those that do not: names of tests, or with a parameter in brackets one of theirs."""
 
+OVER_TCP_ON_A_BUS = frozenset({"test_call_cancelled_at_any_step_leaves_a_camera_that_works"})
+"""Dear sweeps whose bus leads to a camera over TCP; over UDP the same ones run at the wire."""
+
 IN_TIME_OF_THEIR_OWN = frozenset(
     {
         "test_fence_that_was_cancelled_after_its_stop_is_finished_by_the_next",

@@ -22,6 +22,8 @@ from tests.ros2.roskit import PATIENCE, TRIGGER, free_place, soon, until
 
 pytestmark = pytest.mark.real_time
 
+ROOT = Path(__file__).parents[2]
+
 EMULATED = {"emulated": {}, "application": 7, "interpret_as": "localizations"}
 STATUS = "smartcam_msgs/msg/CameraStatus"
 POSES = "geometry_msgs/msg/PoseArray"
@@ -60,7 +62,7 @@ async def test_a_plant_is_seen_and_used_from_ros() -> None:
         others = viewer.subscribe("/line_1/cam1/localizations", POSES, qos=QoS(depth=5))
         publishers = {one.node.full_name: one for one in server._ros.nodes.values()}  # type: ignore[union-attr]
         await until(lambda: publishers["/line_1/cam2"].results._publishers["localizations"].heard)
-        direct = smartcam.connect(server.urls["line-1/cam2"])
+        direct: Any = smartcam.connect(server.urls["line-1/cam2"])
         async with direct as camera:
             result = await camera.trigger()
             message = await soon(anext(poses))
@@ -97,7 +99,8 @@ async def test_a_fleet_that_is_served_already_is_seen_by_its_url() -> None:
     async with smartcam.fleet.serve(file) as server:
         assert server.ros_nodes == []
         address = FleetAddress.parse(f"fleet://{place.partition('/')[2]}")
-        section = RosSection(domain=3, namespace="plant", autostart=False)
+        given = {"domain": 3, "namespace": "plant", "autostart": False}
+        section = RosSection.model_validate(given)
         async with (
             ros_of(address, section) as ros,
             Node("viewer", connect=place, domain=3) as viewer,
@@ -136,3 +139,38 @@ def test_a_wrong_file_is_told(text: str, file: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as told:
         load_fleet(path)
     assert text in str(told.value).replace(" > ", ".")
+
+
+def rows(page: str) -> dict[str, str]:
+    """Return what the page's tables say: a type by each name."""
+    found: dict[str, str] = {}
+    for line in page.splitlines():
+        cells = [cell.strip() for cell in line.split("|")]
+        if len(cells) == 5 and "`" in cells[1] and "`" in cells[2]:
+            names = cells[1].replace("`", "").split(", ")
+            types = cells[2].replace("`", "").split(", ")
+            for n, name in enumerate(names):
+                found[name] = types[min(n, len(types) - 1)]
+    return found
+
+
+async def test_the_page_has_what_a_node_has() -> None:
+    place = free_place()
+    frames = {**EMULATED, "frames": "synthetic://?size=320x240&fps=5"}
+    async with (
+        smartcam.fleet.serve(plant(place, {"line1/cam3": frames})),
+        Node("viewer", connect=place, parameters=False) as viewer,
+    ):
+        said = rows((ROOT / "docs" / "ros2.md").read_text(encoding="utf-8"))
+        own = "/line1/cam3/"
+
+        def there() -> dict[str, list[str]]:
+            both = {**viewer.graph.topics(), **viewer.graph.services()}
+            return {name.removeprefix(own): types for name, types in both.items()}
+
+        await until(lambda: len(there()) >= len(said) - 1)
+        found = there()
+        assert set(said) - set(found) == {"/tf_static"}
+        for name, (type,) in found.items():
+            package = said[name].removesuffix("...")
+            assert type.startswith(package) or type.endswith(f"/{package}"), (name, type)

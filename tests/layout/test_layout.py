@@ -848,7 +848,10 @@ def error_of(call: Callable[..., object], *args: object) -> Exception | None:
     return None
 
 
-@settings(max_examples=150, deadline=None)
+MANY = settings(max_examples=10 * settings().max_examples, deadline=None)
+
+
+@MANY
 @given(layouts())
 def test_canonical_text_gives_an_equal_layout(text: str) -> None:
     layout = Layout(text)
@@ -857,7 +860,7 @@ def test_canonical_text_gives_an_equal_layout(text: str) -> None:
     assert Layout.from_dict(layout.to_dict()) == layout
 
 
-@settings(max_examples=200, deadline=None)
+@MANY
 @given(containers(), ORDERS)
 def test_what_is_built_parses_to_the_same(case: tuple[Layout, bytes], order: ByteOrder) -> None:
     layout, payload = case
@@ -870,7 +873,7 @@ def test_what_is_built_parses_to_the_same(case: tuple[Layout, bytes], order: Byt
     assert layout.sequence(built, order) == layout.sequence(payload)
 
 
-@settings(max_examples=150, deadline=None)
+@MANY
 @given(containers())
 def test_table_agrees_with_parse(case: tuple[Layout, bytes]) -> None:
     layout, payload = case
@@ -882,7 +885,7 @@ def test_table_agrees_with_parse(case: tuple[Layout, bytes]) -> None:
         assert decoded == list(record)
 
 
-@settings(max_examples=200, deadline=None)
+@MANY
 @given(layouts(), st.binary(max_size=60), st.booleans(), ORDERS)
 def test_any_bytes_give_a_value_or_an_interpretation_error(
     text: str, payload: bytes, lenient: bool, order: ByteOrder
@@ -899,7 +902,7 @@ def test_any_bytes_give_a_value_or_an_interpretation_error(
         assert error.expected is not None
 
 
-@settings(max_examples=300, deadline=None)
+@MANY
 @example("a: string[" + "0" * 6000 + "1]")
 @example("٣: int8")
 @given(st.text() | st.text(alphabet="ab:,()[]*@# \nint8stringbool1mm_sequence", max_size=40))

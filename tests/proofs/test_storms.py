@@ -122,7 +122,7 @@ async def test_storm_of_an_adversary_counts_wrong_results_where_nothing_is_promi
 async def test_soak_under_chaos_has_no_wrong_result_and_loses_nothing_unseen(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    made = await chaos_soak.soak(4, 6.0, SEED, interval=0.2)
+    made = await chaos_soak.soak(4, 3.0, SEED, interval=0.1)
     with capsys.disabled():
         print(f"\nseed {SEED}\n{chaos_soak.report(made)}")  # noqa: T201
     assert made.watch.violations == []

@@ -463,8 +463,7 @@ async def test_another_node_calls_over_tcp_and_dies_in_the_middle() -> None:
             assert (await std.call()).success
             dying = asyncio.create_task(client.call())
             await until(lambda: box.runs == 3)
-        await asyncio.wait((dying,))
-        assert dying.exception() is not None
+        await asyncio.wait((dying,))  # with its reply, if that was quicker
         async with Node("viewer", connect=place) as viewer:
             client = viewer.client(name, "smartcam_msgs/srv/TriggerLocalization")
             reply = await client.call()

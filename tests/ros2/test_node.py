@@ -199,7 +199,7 @@ async def test_nobody_serves_it() -> None:
 async def test_a_call_ends_with_its_timeout_and_the_handler_with_its_own() -> None:
     ended = asyncio.Event()
 
-    async def never(_: object) -> object:
+    async def never(_: object) -> None:
         try:
             await asyncio.Event().wait()
         finally:
@@ -267,7 +267,7 @@ asyncio.run(main())
 async def test_a_call_ends_with_its_caller_which_is_killed(tmp_path: Path) -> None:
     began, ended = asyncio.Event(), asyncio.Event()
 
-    async def waits(_: object) -> object:
+    async def waits(_: object) -> None:
         began.set()
         try:
             await asyncio.Event().wait()
@@ -464,3 +464,16 @@ async def test_a_router_that_is_killed_and_comes_back(tmp_path: Path) -> None:
     finally:
         router.kill()
         await router.wait()
+
+
+async def test_a_burst_comes_whole() -> None:
+    async with two_nodes() as (here, there):
+        hears = there.subscribe("/line1/chatter", STRING, qos=QoS(depth=2000))
+        says = here.publisher("chatter", STRING, qos=QoS(depth=5))
+        await until(lambda: says.heard)
+        for _ in range(2):
+            for n in range(500):
+                says.publish(data=f"{n} {'x' * 4000}")
+            came = [(await soon(anext(hears))).data.partition(" ")[0] for _ in range(500)]
+            assert came == [str(n) for n in range(500)]
+        assert not says.dropped

@@ -227,7 +227,9 @@ async def test_text_with_nul(shared: tuple[Node, Node]) -> None:
     value = {"type": 4, "string_value": "sentinel"}
     data = kind.encode({"parameters": [{"name": "text", "value": value}]})
     async with there.client(f"{CAMERA}/set_parameters", SERVICES["set_parameters"]) as client:
-        client.type = _Patched(client.type, data.replace(b"sentinel", b"senti\0el"))
+        client.type = _Patched(  # type: ignore[assignment]
+            client.type, data.replace(b"sentinel", b"senti\0el")
+        )
         with pytest.raises(ServiceCallError, match="NUL"):
             await client.call(timeout=60)
     assert here.parameters.get("text") == "x"
@@ -298,7 +300,8 @@ async def test_a_caller_that_goes_away_does_not_stop_a_set(shared: tuple[Node, N
 
 
 async def test_a_node_that_is_closed_in_the_middle(no_leaks: None) -> None:
-    gate, undone = Gate(), []
+    gate = Gate()
+    undone: list[Any] = []
     async with two_nodes() as (here, there):
         here.parameters.declare("first", 0, on_set=undone.append)
         here.parameters.declare("slow", 0, on_set=gate)
@@ -349,7 +352,8 @@ async def test_the_client(shared: tuple[Node, Node]) -> None:
             await client.describe("nope")
         with pytest.raises(ServiceCallError, match="is double, it cannot be set to integer 1"):
             await client.set(gain=1)
-        for bad in ({}, {"words": []}, {"words": None}):
+        wrong: tuple[dict[str, Any], ...] = ({}, {"words": []}, {"words": None})
+        for bad in wrong:
             with pytest.raises(ConfigurationError):
                 await client.set(bad)
     assert not [one for one in there._ends if one.name.startswith(CAMERA)]

@@ -170,6 +170,7 @@ def run(
     command = shlex.join([sys.executable, "-X", "faulthandler", str(script), *arguments])
     (out / "job").write_text(
         f"cd {shlex.quote(str(ROOT))}\n"
+        "export PYTHONPYCACHEPREFIX=/none\n"  # its time is the same, whatever is compiled here
         f"export PYTHONPATH=$PWD PYTHONDONTWRITEBYTECODE=1 TMPDIR=/run HOME=/run\n{command}\n"
     )
     (out / "initial").write_bytes(initial_files())

@@ -1,0 +1,129 @@
+"""``smartcam ros1``: the cameras of a fleet as nodes of ROS 1."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam.exceptions import ConfigurationError
+from smartcam.settings import is_fleet
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam.ros1 import RosbridgeNode
+    from smartcam.ros1._fleet import RosbridgeFleet
+
+
+@click.command(
+    help="Have cameras seen in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics and "
+    'services that "smartcam ros2" has, without what ROS 1 has not. A fleet file is served as by '
+    '"smartcam serve", and a fleet\'s URL, fleet://HOST, means the cameras of a fleet that is '
+    "served already. Prints one line per camera, its node. A bridge that is not there, or is lost, "
+    "is tried on, which is told on stderr, with --json on stdout, by the same object again. Needs "
+    'the extras "ros2" and "web", and no ROS on this machine.'
+)
+@click.argument("place", metavar="FLEET")
+@click.option(
+    "--bridge",
+    required=True,
+    metavar="URL",
+    help="The rosbridge, such as ws://192.168.0.5:9090.",
+)
+@click.option("--namespace", help="In front of the cameras' names, such as /plant.")
+@runs(*OUTPUT, interrupted=0, terminated=0)
+async def ros1(place: str, bridge: str, namespace: str | None, options: Options) -> None:
+    """Have cameras seen in ROS 1."""
+    from smartcam.ros1._link import checked_url
+
+    checked_url(bridge)  # before cameras are taken
+    begun: set[str] = set()
+
+    def tell(node: RosbridgeNode) -> None:
+        if node.full_name in begun:
+            _tell(node, bridge, options)
+
+    has = _of_fleet if is_fleet(place) else _served
+    async with has(place, bridge, namespace, tell) as ros:
+        await ros.wait_tried()
+        for node in ros.bridged:
+            why = "" if node.connected else f"  no rosbridge: {node.failure}"
+            options.show(_node(node, bridge), f"{node.full_name}{why}")
+            begun.add(node.full_name)
+        await asyncio.Event().wait()
+
+
+@contextlib.asynccontextmanager
+async def _served(
+    path: str, bridge: str, namespace: str | None, tell: Any
+) -> AsyncIterator[RosbridgeFleet]:
+    from smartcam.fleet import load_fleet
+    from smartcam.fleet._ros_file import RosSection
+    from smartcam.fleet._server import FleetServer
+    from smartcam.ros1._fleet import bridged
+
+    file, folder = load_fleet(path), Path(path).parent
+    said = {one.name: one.entry.ros2 for one in file.plan()}
+    found = {name: one.load_calibration(folder) for name, one in said.items()}
+    section = file.ros2 or RosSection.model_validate({})
+    async with FleetServer(file, folder=folder) as server:
+        await server.wait_tried()
+        async with bridged(
+            bridge,
+            tell,
+            server.address,
+            _section(namespace or section.namespace, autostart=section.autostart),
+            cameras=said,
+            calibrations={name: one for name, one in found.items() if one is not None},
+            wanted=lambda agent, _camera: agent == file.agent_name,
+        ) as ros:
+            yield ros
+
+
+@contextlib.asynccontextmanager
+async def _of_fleet(
+    url: str, bridge: str, namespace: str | None, tell: Any
+) -> AsyncIterator[RosbridgeFleet]:
+    from smartcam.fleet._address import FleetAddress
+    from smartcam.ros1._fleet import bridged
+
+    address = FleetAddress.parse(url)
+    if address.camera:
+        raise ConfigurationError(
+            f"fleet address {url!r} is a camera's: expected that of the fleet, fleet://HOST[:PORT]"
+        )
+    async with bridged(bridge, tell, address, _section(namespace or "/")) as ros:
+        yield ros
+
+
+def _section(namespace: str, *, autostart: bool = True) -> Any:
+    from smartcam.fleet._ros_file import RosSection
+    from smartcam.ros2._names import check_namespace
+
+    given = {"namespace": check_namespace(namespace), "autostart": autostart}
+    return RosSection.model_validate(given)
+
+
+def _node(node: RosbridgeNode, bridge: str) -> dict[str, Any]:
+    return {
+        "node": node.full_name,
+        "bridge": bridge,
+        "connected": node.connected,
+        "reason": node.failure or None,
+    }
+
+
+def _tell(node: RosbridgeNode, bridge: str, options: Options) -> None:
+    """Say that a bridge has come, or is gone."""
+    at = datetime.now(UTC)
+    if options.as_json:
+        options.show({**_node(node, bridge), "at": at}, "")
+        return
+    text = "connected" if node.connected else f"no rosbridge: {node.failure}"
+    click.echo(f"{at.astimezone():%H:%M:%S} {node.full_name}: {text}", err=True)

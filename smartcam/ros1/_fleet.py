@@ -1,0 +1,92 @@
+"""The cameras of a fleet as nodes of ROS 1."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+from smartcam.fleet._ros import RosFleet
+from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.ros1._link import checked_url
+from smartcam.ros1._rosbridge import RosbridgeNode
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from smartcam.fleet._address import FleetAddress
+    from smartcam.fleet._ros_file import RosSection
+
+TIMEOUT = 10.0
+"""Seconds for coming to the fleet, and for the first answer of a bridge."""
+
+
+class RosbridgeFleet(RosFleet):
+    """A node of ROS 1 for each camera of a fleet, as they come and go.
+
+    Args:
+        bridge: the URL of the rosbridge.
+        on_change: is told which node's bridge has come or is gone.
+        *given: what :class:`RosFleet` takes.
+        **said: what :class:`RosFleet` takes.
+    """
+
+    def __init__(
+        self, bridge: str, on_change: Callable[[RosbridgeNode], None], *given: Any, **said: Any
+    ) -> None:
+        super().__init__(*given, **said)
+        self._bridge, self._on_change = bridge, on_change
+
+    def _node(self, name: str) -> Any:
+        alike = super()._node(name)
+        return RosbridgeNode(
+            alike.name,
+            namespace=alike.namespace,
+            bridge=self._bridge,
+            types=alike.types,
+            on_change=self._on_change,
+        )
+
+    @property
+    def bridged(self) -> list[RosbridgeNode]:
+        """The nodes by name."""
+        return sorted((one.node for one in self.nodes.values()), key=lambda one: one.full_name)
+
+    async def wait_tried(self) -> None:
+        """Wait until every node has its bridge, or knows why not; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(TIMEOUT):
+                for node in self.bridged:
+                    await node.wait_tried()
+
+
+@contextlib.asynccontextmanager
+async def bridged(
+    bridge: str,
+    on_change: Callable[[RosbridgeNode], None],
+    address: FleetAddress,
+    section: RosSection,
+    **said: Any,
+) -> AsyncIterator[RosbridgeFleet]:
+    """Have the cameras of a fleet that is there seen in ROS 1.
+
+    Args:
+        bridge: the URL of the rosbridge.
+        on_change: is told which node's bridge has come or is gone.
+        address: the fleet's.
+        section: how the cameras are seen.
+        **said: what :class:`RosFleet` takes of single cameras.
+
+    Raises:
+        ConfigurationError: the URL cannot be.
+        ConnectFailedError: no bus, or no agent with a camera, within the time.
+    """
+    checked_url(bridge)
+    bus = ZenohEnd(address.link)
+    await bus.open(TIMEOUT)
+    try:
+        given = (bus, address.fleet, address, section)
+        async with RosbridgeFleet(bridge, on_change, *given, **said) as ros:
+            yield ros
+    finally:
+        await bus.close()

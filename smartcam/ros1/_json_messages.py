@@ -1,0 +1,210 @@
+"""Messages as a rosbridge says them: JSON in the form that ROS 1 has of each type.
+
+The types are those of ROS 2. Where ROS 1 has other names the tables here say so; bytes are base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import secrets
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from smartcam.exceptions import RosMessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.ros2._type_definitions import MessageField
+    from smartcam.ros2._types import MessageType
+
+Part: TypeAlias = "str | Raw"
+
+RENAMED: Final[Mapping[str, Mapping[str, str]]] = {
+    "builtin_interfaces/msg/Time": {"sec": "secs", "nanosec": "nsecs"},
+    "builtin_interfaces/msg/Duration": {"sec": "secs", "nanosec": "nsecs"},
+    "sensor_msgs/msg/CameraInfo": {"d": "D", "k": "K", "r": "R", "p": "P"},
+}
+"""Fields that have another name in ROS 1, by type."""
+
+ONLY_ROS1: Final[Mapping[str, Mapping[str, Any]]] = {"std_msgs/msg/Header": {"seq": 0}}
+"""Fields that only ROS 1 has, and what is said there; rospy counts a header's itself."""
+
+ONLY_ROS2: Final = frozenset(
+    {"action_msgs", "composition_interfaces", "lifecycle_msgs", "rcl_interfaces", "rosgraph_msgs",
+     "service_msgs", "statistics_msgs", "type_description_interfaces", "vision_msgs"}
+)  # fmt: skip
+"""Packages that ROS 1 has not, or with other fields."""
+
+_ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
+    "bool": (bool,),
+    "string": (str,),
+    "float32": (int, float),
+    "float64": (int, float),
+}
+"""What a value of JSON may be; integers where nothing is said."""
+
+_BYTES: Final = ("uint8", "char")
+_MARK: Final = secrets.token_hex(12)
+_CHUNK: Final = 3 << 16  # a multiple of three: parts of base64 make a whole
+_DEEPEST = 32
+
+
+class Raw:
+    """Bytes that become base64 where they are sent: a picture that is dropped never does."""
+
+    __slots__ = ("data",)
+
+    def __init__(self, data: Any) -> None:
+        self.data: memoryview = memoryview(data).cast("B")
+
+    def __len__(self) -> int:
+        return (len(self.data) + 2) // 3 * 4
+
+    def chunks(self) -> list[memoryview]:
+        """Return it in parts that take a moment each."""
+        return [self.data[start : start + _CHUNK] for start in range(0, len(self.data), _CHUNK)]
+
+
+def ros1_name(name: str) -> str | None:
+    """Return a type's name in ROS 1 (``std_msgs/String``); None where ROS 1 has no such type."""
+    package, _, rest = name.partition("/")
+    return None if package in ONLY_ROS2 else f"{package}/{rest.rpartition('/')[2]}"
+
+
+def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
+    """Return a message, or the mapping of its fields, as JSON has it, with :class:`Raw` for bytes.
+
+    Raises:
+        RosMessageError: it is no message of this type.
+    """
+    # what comes back fits, and is ours: who publishes may use a buffer again
+    return _fields(kind, kind.decode(kind.encode(message)))
+
+
+def _fields(kind: MessageType, message: Any) -> dict[str, Any]:
+    names = RENAMED.get(kind.name, {})
+    said = dict(ONLY_ROS1.get(kind.name, {}))
+    for field in kind.fields:
+        value = getattr(message, field.attribute)
+        said[names.get(field.name, field.name)] = _value(kind, field, value)
+    if kind.name == "builtin_interfaces/msg/Time" and said["secs"] < 0:
+        raise RosMessageError(f"{kind.name}: sec: ROS 1 has no time before 1970, got {message!r}")
+    return said
+
+
+def _value(kind: MessageType, field: MessageField, value: Any) -> Any:
+    if field.nested:
+        inner = kind.nested[field.type]
+        return [_fields(inner, one) for one in value] if field.shape else _fields(inner, value)
+    if not field.shape:
+        return _signed(value) if field.type == "byte" else value
+    if field.type in _BYTES:
+        return Raw(value)
+    items = value.tolist() if hasattr(value, "tolist") else list(value)
+    return [_signed(one) for one in items] if field.type == "byte" else items
+
+
+def _signed(value: int) -> int:
+    """Return a byte as ROS 1 has it, whose ``byte`` is an int8."""
+    return value - 256 if value > 127 else int(value)
+
+
+def from_json(kind: MessageType, said: Any) -> Any:
+    """Return the message that JSON says; what is not said is zero.
+
+    Args:
+        kind: its type.
+        said: an object, or an array of its first fields' values in order.
+
+    Raises:
+        RosMessageError: a field that the type has not, or a value that does not fit.
+    """
+    if isinstance(said, list):
+        if len(said) > len(kind.fields):
+            raise RosMessageError(
+                f"{kind.name}: expected up to {len(kind.fields)} values, got {len(said)}"
+            )
+        names = RENAMED.get(kind.name, {})
+        ordered = [names.get(one.name, one.name) for one in kind.fields]
+        said = dict(zip(ordered, said, strict=False))
+    message = kind.new(**_said(kind, said, "", _DEEPEST))
+    return kind.decode(kind.encode(message))  # as ROS 2 has it: arrays of numpy, bytes
+
+
+def _said(kind: MessageType, said: Any, where: str, depth: int) -> dict[str, Any]:
+    """Return the fields of an object under our names; what they are is looked at afterwards."""
+    if not isinstance(said, dict):
+        raise RosMessageError(
+            f"{kind.name}: {where or 'the whole'}: expected an object, got {said!r:.80}"
+        )
+    if not depth:
+        raise RosMessageError(f"{kind.name}: {where}: nested too deep")
+    names, only = RENAMED.get(kind.name, {}), ONLY_ROS1.get(kind.name, {})
+    fields = {names.get(field.name, field.name): field for field in kind.fields}
+    found = dict[str, Any]()
+    for name, value in said.items():
+        if name in only:
+            continue
+        field = fields.get(name)
+        if field is None:
+            expected = ", ".join((*fields, *only)) or "none"
+            raise RosMessageError(f"{kind.name}: {where}{name}: no such field, expected {expected}")
+        found[field.attribute] = _heard(kind, field, value, f"{where}{name}", depth)
+    return found
+
+
+def _heard(kind: MessageType, field: MessageField, value: Any, where: str, depth: int) -> Any:
+    if field.shape and field.type in _BYTES and isinstance(value, str):
+        try:
+            return base64.b64decode(value, validate=True)
+        except (binascii.Error, ValueError) as exc:
+            raise RosMessageError(
+                f"{kind.name}: {where}: expected base64, got {value!r:.80} ({exc})"
+            ) from exc
+    if field.shape and not isinstance(value, list):
+        raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {value!r:.80}")
+    if not field.nested:
+        allowed = _ALLOWED.get(field.type, (int,))
+        values: list[Any] = value if field.shape else [value]
+        for one in values:
+            if type(one) not in allowed:
+                raise RosMessageError(f"{kind.name}: {where}: expected {field}, got {one!r:.80}")
+        if field.type == "byte":
+            values = [one + 256 if -128 <= one < 0 else one for one in values]
+        return values if field.shape else values[0]
+    inner = kind.nested[field.type]
+    if not field.shape:
+        return _said(inner, value, f"{where}.", depth - 1)
+    return [_said(inner, one, f"{where}[{n}].", depth - 1) for n, one in enumerate(value)]
+
+
+def encoded(operation: Mapping[str, Any]) -> tuple[Part, ...]:
+    """Return the parts of an operation's text.
+
+    Raises:
+        RosMessageError: a number that JSON has not.
+    """
+    raws: list[Raw] = []
+
+    def place(value: Any) -> str:
+        if not isinstance(value, Raw):
+            raise TypeError(f"no JSON: {value!r:.80}")
+        raws.append(value)
+        return _MARK
+
+    try:
+        text = json.dumps(operation, default=place, allow_nan=False, separators=(",", ":"))
+    except ValueError as exc:
+        raise RosMessageError(
+            f"{operation.get('topic') or operation.get('service')}: expected finite numbers, JSON "
+            "has no others"
+        ) from exc
+    if not raws:
+        return (text,)
+    first, *others = text.split(_MARK)  # its quotation marks stay
+    parts: list[Part] = [first]
+    for raw, after in zip(raws, others, strict=True):
+        parts += (raw, after)
+    return tuple(parts)

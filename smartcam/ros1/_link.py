@@ -1,0 +1,253 @@
+"""The WebSocket to a rosbridge, made again whenever it is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import json
+import logging
+import socket
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import urlsplit
+
+from smartcam.exceptions import ConfigurationError, MissingExtraError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import aiohttp
+
+    from smartcam.backoff import Backoff
+    from smartcam.ros1._json_messages import Part
+    from smartcam.ros1._outbox import Outbox
+
+logger: logging.Logger = logging.getLogger("smartcam.ros1")
+
+CONNECT_TIMEOUT = 10.0
+"""Seconds until a bridge has answered the handshake."""
+STALLED = 10.0
+"""Seconds that a bridge may take to read one message."""
+GOODBYE = 1.0
+"""Seconds that a bridge gets to answer a goodbye."""
+SEND_BUFFER = 1 << 17
+"""Bytes that the system keeps for a bridge that is slow: what waits there is not the newest."""
+HEARTBEAT = 10.0
+"""Seconds of silence after which it is asked whether it is there; half of them to answer."""
+LIVED = 5.0
+"""Seconds that a link must have lived for the next try to come at once."""
+LARGEST = 8 << 20
+"""Bytes of a message from a bridge; a longer one ends the link."""
+
+
+class LinkListener(Protocol):
+    """What hears of a link."""
+
+    def came(self) -> None:
+        """Hear that there is a bridge: say what is to be advertised."""
+
+    def heard(self, operation: dict[str, Any]) -> None:
+        """Hear an operation; never waits."""
+
+    async def lost(self, was: bool) -> None:
+        """Hear that there is no bridge, and whether there was one before."""
+
+
+def checked_url(url: str) -> str:
+    """Return a bridge's URL.
+
+    Raises:
+        ConfigurationError: there can be no bridge.
+    """
+    example = "ws://192.168.0.5:9090"
+    try:
+        parts = urlsplit(url)
+        usable = parts.scheme in {"ws", "wss"} and parts.hostname and parts.port != 0
+    except ValueError:
+        usable = False
+    if not usable:
+        raise ConfigurationError(f"no rosbridge: expected a URL such as {example}, got {url!r:.80}")
+    return url
+
+
+def _aiohttp() -> Any:
+    try:
+        import aiohttp
+    except ImportError as exc:
+        raise MissingExtraError(
+            'a rosbridge needs aiohttp: pip install "smartcam[web]"', extra="web"
+        ) from exc
+    return aiohttp
+
+
+def link_errors() -> tuple[type[Exception], ...]:
+    """Return what a link that cannot be had, or breaks, raises."""
+    return OSError, TimeoutError, _aiohttp().ClientError
+
+
+@contextlib.asynccontextmanager
+async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
+    """Have a WebSocket to a bridge; what it has not read at the end is thrown away.
+
+    Raises:
+        OSError, aiohttp.ClientError, TimeoutError: there is none.
+    """
+    aiohttp = _aiohttp()
+    timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE)
+    async with aiohttp.ClientSession() as session:
+        try:
+            async with asyncio.timeout(CONNECT_TIMEOUT):
+                web = await session.ws_connect(
+                    url, timeout=timeout, heartbeat=HEARTBEAT, max_msg_size=LARGEST
+                )
+        except TimeoutError:
+            raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s") from None
+        peer = web.get_extra_info("socket")
+        if peer is not None:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        try:
+            yield web
+        finally:
+            try:
+                async with asyncio.timeout(GOODBYE):
+                    await web.close()
+            except link_errors():
+                pass  # it does not read, or is gone
+            finally:
+                if peer is not None:
+                    with contextlib.suppress(OSError):
+                        peer.shutdown(socket.SHUT_RDWR)  # or what waits would be kept for it
+
+
+async def text_of(parts: tuple[Part, ...]) -> str:
+    """Return the text of an operation; the loop has its turns with a long one."""
+    pieces: list[str] = []
+    for part in parts:
+        if isinstance(part, str):
+            pieces.append(part)
+            continue
+        for number, chunk in enumerate(part.chunks()):
+            if number:
+                await asyncio.sleep(0)
+            pieces.append(base64.b64encode(chunk).decode("ascii"))
+    return "".join(pieces)
+
+
+class BridgeLink:
+    """A link that :meth:`run` keeps.
+
+    Attributes:
+        url: the bridge's.
+        outbox: what is sent.
+        connected: whether there is a bridge now.
+        failure: why there is none; "" where nothing has been tried.
+        changed: is notified of each change of these.
+    """
+
+    def __init__(self, url: str, outbox: Outbox, listener: LinkListener, backoff: Backoff) -> None:
+        self.url = checked_url(url)
+        self.failure = ""
+        self.changed = asyncio.Condition()
+        self.connected = False
+        self.outbox = outbox
+        self._listener, self._backoff = listener, backoff
+
+    async def run(self) -> None:
+        """Keep a link until this is cancelled, or the tries are over."""
+        clock, short_lived = asyncio.get_running_loop().time, 0
+        while True:
+            for delay in self._backoff.delays(short_lived=short_lived):
+                began = clock()
+                reason = await self._try()
+                if await self._tell_lost(reason):
+                    short_lived = 0 if clock() - began > LIVED else short_lived + 1
+                    await asyncio.sleep(delay)
+                    break
+                await asyncio.sleep(delay)
+            else:
+                return
+
+    async def _try(self) -> str:
+        """Have one link until it is lost; return why."""
+        try:
+            async with web_socket(self.url) as web:
+                logger.info("%s: connected", self.url)
+                await self._set(connected=True)
+                self._listener.came()
+                await self._carry(web)
+        except link_errors() as exc:
+            return str(getattr(exc, "os_error", exc)) or type(exc).__name__
+        except Exception as exc:  # a fault of ours: the next link may do without
+            logger.exception("%s ! the link", self.url)
+            return f"{type(exc).__name__}: {exc}"
+        return "it closed the link"
+
+    async def _carry(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        """Read and write until one of them ends."""
+        tasks = [asyncio.create_task(self._read(web)), asyncio.create_task(self._write(web))]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
+        for task in done:
+            task.result()
+
+    async def _set(self, *, connected: bool, failure: str = "") -> None:
+        async with self.changed:
+            self.connected, self.failure = connected, failure
+            self.changed.notify_all()
+
+    async def _tell_lost(self, reason: str) -> bool:
+        """Say that there is no link; return whether there was one."""
+        told_before = self.failure
+        was = await self.end(f"{self.url}: {reason}")
+        level = logging.DEBUG if told_before == self.failure else logging.WARNING
+        logger.log(level, "%s: no rosbridge: %s", self.url, reason)
+        return was
+
+    async def end(self, failure: str = "") -> bool:
+        """Have no link, and nothing left that was for it; return whether there was one."""
+        was = self.connected
+        await self._set(connected=False, failure=failure)
+        self.outbox.clear()
+        await self._listener.lost(was)
+        return was
+
+    async def _write(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        while True:
+            text = await text_of(await self.outbox.take())
+            try:
+                async with asyncio.timeout(STALLED):
+                    await web.send_str(text)
+            except TimeoutError:
+                raise TimeoutError(f"it did not read a message within {STALLED:g} s") from None
+
+    async def _read(self, web: aiohttp.ClientWebSocketResponse) -> None:
+        kinds = _aiohttp().WSMsgType
+        while True:
+            message = await web.receive()
+            if message.type is kinds.TEXT:
+                self._hear(message.data)
+                await asyncio.sleep(0)  # many may have come at once
+                await self.outbox.room()
+            elif message.type is kinds.ERROR:
+                raise ConnectionError(str(web.exception() or message.data))
+            elif message.type in {kinds.CLOSE, kinds.CLOSING, kinds.CLOSED}:
+                return
+            else:
+                logger.warning("%s: expected text, got binary: is it in BSON mode?", self.url)
+
+    def _hear(self, text: str) -> None:
+        try:
+            operation = json.loads(text)
+        except (ValueError, RecursionError):
+            operation = None
+        if isinstance(operation, dict) and isinstance(operation.get("op"), str):
+            try:
+                self._listener.heard(operation)
+            except Exception:
+                logger.exception("%s ! %.200r", self.url, operation)  # the link goes on
+        else:
+            logger.warning("%s: expected an operation of rosbridge, got %.80r", self.url, text)

@@ -1,0 +1,138 @@
+"""What waits to be sent to a rosbridge: bounded, and where there is no room the newest wins."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from smartcam.ros1._json_messages import Part
+
+MOST_OPERATIONS = 256
+"""That wait before nothing more is read of the bridge."""
+MOST_BYTES = 32 << 20
+"""That the messages of a topic may have together while they wait."""
+
+
+class Lane:
+    """The messages of one topic that wait.
+
+    Attributes:
+        dropped: messages that were not sent: no bridge, or newer ones came.
+        sent: messages that were handed to the WebSocket.
+        waiting_bytes: of those that wait.
+    """
+
+    def __init__(self, depth: int, *, latched: bool) -> None:
+        self.latched = latched
+        self.dropped = self.sent = 0
+        self._depth = depth
+        self._waiting: collections.deque[tuple[Part, ...]] = collections.deque()
+        self.waiting_bytes = 0
+        self._last: tuple[Part, ...] | None = None  # of a latched topic, for a bridge to come
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def put(self, parts: tuple[Part, ...], *, connected: bool) -> None:
+        """Have a message wait; without a bridge only a latched topic's last one does."""
+        if self.latched:
+            self._last = parts
+        elif not connected:
+            self.dropped += 1
+        if not connected:
+            return
+        self._waiting.append(parts)
+        self.waiting_bytes += sum(map(len, parts))
+        while len(self._waiting) > self._depth or (
+            self.waiting_bytes > MOST_BYTES and len(self._waiting) > 1
+        ):
+            self.take()
+            self.dropped += 1
+
+    def take(self) -> tuple[Part, ...]:
+        """Return the oldest."""
+        parts = self._waiting.popleft()
+        self.waiting_bytes -= sum(map(len, parts))
+        return parts
+
+    def clear(self) -> None:
+        """Forget what waits: the bridge is gone."""
+        self.dropped += 0 if self.latched else len(self._waiting)
+        self._waiting.clear()
+        self.waiting_bytes = 0
+
+    def say_again(self) -> None:
+        """Have a latched topic's last message wait: the bridge is new."""
+        if self._last is not None and not self._waiting:
+            self.put(self._last, connected=True)
+
+
+class Outbox:
+    """Operations first, in order; then the topics in turn."""
+
+    def __init__(self) -> None:
+        self._operations: collections.deque[tuple[Part, ...]] = collections.deque()
+        self._lanes: collections.deque[Lane] = collections.deque()
+        self._ready = asyncio.Event()
+        self._room = asyncio.Event()
+        self._room.set()
+        self._flushed = asyncio.Event()
+
+    def say(self, parts: tuple[Part, ...]) -> None:
+        """Have an operation wait."""
+        self._operations.append(parts)
+        self.wake()
+        if len(self._operations) >= MOST_OPERATIONS:
+            self._room.clear()
+
+    def add(self, lane: Lane) -> None:
+        """Send what waits there, too."""
+        self._lanes.append(lane)
+
+    def remove(self, lane: Lane) -> None:
+        """Send no more of it."""
+        self._lanes.remove(lane)
+
+    def wake(self) -> None:
+        """Say that something waits."""
+        self._ready.set()
+        self._flushed.clear()
+
+    def clear(self) -> None:
+        """Forget all that waits."""
+        self._operations.clear()
+        for lane in self._lanes:
+            lane.clear()
+        self._ready.clear()
+        self._room.set()
+
+    @property
+    def full(self) -> bool:
+        """Whether more operations wait than should."""
+        return not self._room.is_set()
+
+    async def room(self) -> None:
+        """Wait while more operations wait than should."""
+        await self._room.wait()
+
+    async def flushed(self) -> None:
+        """Wait until everything was taken, and who took it came back for more."""
+        await self._flushed.wait()
+
+    async def take(self) -> tuple[Part, ...]:
+        """Return what is next, wait for it."""
+        while True:
+            if self._operations:
+                self._room.set()
+                return self._operations.popleft()
+            for _ in range(len(self._lanes)):
+                lane = self._lanes[0]
+                self._lanes.rotate(-1)
+                if lane:
+                    lane.sent += 1
+                    return lane.take()
+            self._ready.clear()
+            self._flushed.set()
+            await self._ready.wait()

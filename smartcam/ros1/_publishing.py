@@ -1,0 +1,102 @@
+"""Topics that are published through a rosbridge."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import RosError, RosMessageError
+from smartcam.ros1._json_messages import encoded, ros1_name, to_json
+from smartcam.ros1._outbox import Lane
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from smartcam.ros1._rosbridge import RosbridgeNode
+    from smartcam.ros2._qos import QoS
+    from smartcam.ros2._types import MessageType
+
+
+class RosbridgePublisher:
+    """Publishes on a topic; made by :meth:`RosbridgeNode.publisher`.
+
+    Attributes:
+        name: the topic's absolute name.
+        type: of the messages.
+        lane: what waits to be sent.
+        exists: whether ROS 1 has the type.
+        subscribed: whether anybody hears it, as far as is known.
+    """
+
+    def __init__(self, node: RosbridgeNode, name: str, kind: MessageType, qos: QoS) -> None:
+        self.name, self.type = name, kind
+        self.lane = Lane(qos.kept, latched=qos.latched)
+        self.exists = ros1_name(kind.name) is not None
+        self.subscribed = True  # or it is not known
+        self._node = node
+
+    @property
+    def published(self) -> int:
+        """Messages that were sent; the bridge does not say what became of them."""
+        return self.lane.sent
+
+    @property
+    def dropped(self) -> int:
+        """Messages that were not sent: there was no bridge, or newer ones came."""
+        return self.lane.dropped
+
+    @property
+    def heard(self) -> bool:
+        """Whether a message goes anywhere: the bridge is there, and nothing says that nobody hears.
+
+        Of a topic with long messages it is asked every two seconds, where rosapi answers, as it
+        does beside most bridges.
+        """
+        if not self.exists or self.lane.latched:
+            return self.exists
+        return self._node.connected and self.subscribed
+
+    def publish(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message; never waits.
+
+        Args:
+            message: one of the type's own, or a mapping of its fields.
+            **fields: the fields, where no message is given.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+        """
+        if message is not None and fields:
+            raise RosMessageError("expected a message or its fields, got both")
+        said: dict[str, Any] = {"op": "publish", "topic": self.name}
+        if self.lane.latched:
+            said["latch"] = True  # or the bridge takes it for another publisher
+        said["msg"] = to_json(self.type, fields if message is None else message)
+        if not self._node.has(self):
+            raise RosError(f"{self.name}: this publisher is closed")
+        if self.exists:
+            self.lane.put(encoded(said), connected=self._node.connected)
+            self._node.wake()
+
+    def publish_encoded(self, data: bytes) -> None:
+        """Publish what is a message in CDR; never waits.
+
+        Raises:
+            RosMessageError, RosError: as of :meth:`publish`.
+        """
+        self.publish(self.type.decode(data))
+
+    def close(self) -> None:
+        """Be gone; what waits is not sent any more. Idempotent."""
+        self._node.forget(self)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    def advertisement(self) -> dict[str, Any]:
+        """Return how a bridge is told."""
+        told = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
+        return {**told, "latch": self.lane.latched}

@@ -1,0 +1,390 @@
+"""A node of ROS 1 behind a rosbridge: it publishes topics and serves services."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any
+
+from smartcam._server import Server
+from smartcam.backoff import Backoff
+from smartcam.exceptions import ConfigurationError, RosError
+from smartcam.ros1._json_messages import encoded
+from smartcam.ros1._link import BridgeLink
+from smartcam.ros1._outbox import Outbox
+from smartcam.ros1._publishing import RosbridgePublisher
+from smartcam.ros1._retiring import KNOWN, question, retire
+from smartcam.ros1._serving import CLOSE_TIMEOUT, RosbridgeService
+from smartcam.ros1._subscribers import listen_for_subscribers
+from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
+from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
+from smartcam.ros2._types import RosTypes
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine
+
+    from smartcam.ros1._json_messages import Part
+
+logger: logging.Logger = logging.getLogger("smartcam.ros1")
+
+HANDLER_TIMEOUT = 600.0
+"""Seconds that a service's handler may take."""
+FLUSH = 1.0
+"""Seconds at the end for what waits to be sent."""
+ASK_TIMEOUT = 5.0
+"""Seconds for the answer to a call of ours."""
+REPEAT = 10.0
+"""Seconds between two sayings of what is latched on a topic that nodes share, such as
+``/tf_static``: a bridge keeps one message for all of its clients."""
+_LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.INFO}
+
+
+class RosbridgeNode(Server):
+    """A node of ROS 1 in asyncio, over a rosbridge; ``async with`` opens and closes it.
+
+    Opening it does not wait for the bridge: it is tried until it is there, and again when it is
+    lost. Everything is advertised again then, and the last message of a latched topic published
+    again; other messages without a bridge are dropped and counted. A call that is under way when
+    the bridge goes is cancelled.
+
+    The protocol has no answer to an advertisement: that a bridge does not know a type, because its
+    machine has not the package, is in the bridge's log alone.
+
+    Args:
+        name: letters, digits and ``_``.
+        namespace: such as ``/line1``.
+        bridge: the bridge's URL, ``ws://host:9090``.
+        types: the messages and services that are known; None for those of Jazzy. What ROS 1 has not
+            is left out where it is published or served, and told in the log.
+        backoff: when a bridge is tried again; None for :class:`smartcam.Backoff` as it is.
+        on_change: is told that the bridge has come or is gone; it is called in the loop.
+
+    Raises:
+        ConfigurationError: a name or the URL cannot be.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    parameters: None = None  # which ROS 1 has elsewhere
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        namespace: str = "/",
+        bridge: str,
+        types: RosTypes | None = None,
+        backoff: Backoff | None = None,
+        on_change: Callable[[RosbridgeNode], None] = lambda _node: None,
+    ) -> None:
+        self.name: str = check_node(name)
+        self.namespace: str = check_namespace(namespace)
+        self.types: RosTypes = types or RosTypes()
+        self._on_change = on_change
+        self._outbox = Outbox()
+        self._link = BridgeLink(bridge, self._outbox, self, backoff or Backoff())
+        self._publishers: dict[str, RosbridgePublisher] = {}
+        self._services: dict[str, RosbridgeService] = {}
+        self._running: asyncio.Task[None] | None = None
+        self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
+        self._new: list[RosbridgeService] = []  # that are to be advertised
+        self._leaving: list[RosbridgeService] = []  # that are to be withdrawn
+        self._changing: asyncio.Task[None] | None = None
+        self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
+        self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
+            "call_service": self._called,
+            "status": self._told,
+            "service_response": self._answered,
+        }
+
+    @property
+    def full_name(self) -> str:
+        """Such as ``/line1/cam3``."""
+        return full_name(self.namespace, self.name)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the bridge is there."""
+        return self._link.connected
+
+    @property
+    def failure(self) -> str:
+        """Why the bridge is not there; "" where it is, or has not been tried."""
+        return self._link.failure
+
+    async def wait_connected(self, timeout: float | None = None) -> None:
+        """Wait until the bridge is there.
+
+        Raises:
+            TimeoutError: it was not within ``timeout`` seconds.
+        """
+        await self._wait(timeout, lambda: self._link.connected)
+
+    async def wait_tried(self) -> None:
+        """Wait until the bridge is there, or it is known why not."""
+        await self._wait(None, lambda: self._link.connected or bool(self._link.failure))
+
+    async def _wait(self, timeout: float | None, met: Callable[[], bool]) -> None:
+        async with asyncio.timeout(timeout), self._link.changed:
+            await self._link.changed.wait_for(met)
+
+    # ------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open it."""
+        if self._running is None:
+            self._running = asyncio.create_task(self._link.run())
+
+    async def stop(self) -> None:
+        """Close it: withdraw everything from the bridge, which takes some seconds. Idempotent."""
+        running, self._running = self._running, None
+        if running is None:
+            return
+        try:
+            if self.connected:
+                await self._withdraw_all()
+        finally:
+            running.cancel()
+            await asyncio.wait((running,))
+            await self._link.end()
+            self._publishers.clear()
+            self._services.clear()
+            self._leaving.clear()
+            self._outbox = self._link.outbox = Outbox()
+
+    async def _withdraw_all(self) -> None:
+        with contextlib.suppress(TimeoutError):  # it does not read
+            async with asyncio.timeout(FLUSH):
+                await self._outbox.flushed()
+        for service in tuple(self._services.values()):
+            self.forget(service)
+        while self._changing is not None:
+            await asyncio.wait((self._changing,))
+
+    # ------------------------------------------------------------------ what it has
+
+    def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgePublisher:
+        """Publish on a topic.
+
+        Args:
+            topic: absolute, relative to the namespace, or private (``~/it``).
+            type: such as ``std_msgs/msg/String``.
+            qos: of it, ``depth`` counts, for messages that wait for the bridge, and ``latched``.
+
+        Raises:
+            ConfigurationError: the topic cannot be, is there already, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind, name = self.types.message(type), self._resolved(topic, "topic", self._publishers)
+        publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
+        if self._told_absent(publisher.exists, name, kind.name):
+            self._outbox.add(publisher.lane)
+            self.say(encoded(publisher.advertisement()))
+        return publisher
+
+    def serve(
+        self,
+        service: str,
+        type: str,
+        handler: Callable[[Any], Awaitable[Any]],
+        *,
+        qos: QoS = SERVICES,
+        timeout: float = HANDLER_TIMEOUT,
+    ) -> RosbridgeService:
+        """Serve.
+
+        Args:
+            service: its name, as of a topic.
+            type: such as ``std_srvs/srv/Trigger``.
+            handler: is awaited with each request, and returns the response, or a mapping of its
+                fields. The text of an error becomes the response's field ``error``, ``message`` or
+                ``status_message``; where it has none of these the call fails at its caller.
+            qos: has no meaning in ROS 1.
+            timeout: seconds that the handler may take.
+
+        Raises:
+            ConfigurationError: the name cannot be, is there already, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind, name = self.types.service(type), self._resolved(service, "service", self._services)
+        served = RosbridgeService(self, name, kind, handler, timeout)
+        self._services[name] = served
+        if self._told_absent(served.exists, name, kind.name):
+            self._new.append(served)
+            self._change()
+        return served
+
+    def _resolved(self, name: str, what: str, there: dict[str, Any]) -> str:
+        full = resolve(name, self.namespace, self.name, what)
+        if self._running is None:
+            raise RosError(f"{self.full_name}: the node is not open")
+        if full in there:
+            raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
+        return full
+
+    def _told_absent(self, exists: bool, name: str, kind: str) -> bool:
+        if not exists:
+            logger.info("%s: left out, ROS 1 has no %s", name, kind)
+        return exists
+
+    # ------------------------------------------------------------------ for its parts
+
+    def has(self, end: RosbridgePublisher | RosbridgeService) -> bool:
+        """Whether it is not closed."""
+        return end in (self._publishers.get(end.name), self._services.get(end.name))
+
+    def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
+        """Have no more of it."""
+        if not self.has(end):
+            return
+        if isinstance(end, RosbridgePublisher):
+            del self._publishers[end.name]
+            if end.exists:
+                self._outbox.remove(end.lane)
+                self.say(encoded({"op": "unadvertise", "topic": end.name}))
+            return
+        del self._services[end.name]
+        end.end_turn()
+        if end.exists:
+            self._leaving.append(end)
+            self._change()
+
+    def renew(self, service: RosbridgeService) -> None:
+        """Withdraw a service and advertise it again: its calls fail at their callers."""
+        service.end_turn()
+        self._leaving.append(service)
+        self._new.append(service)
+        self._change()
+
+    def say(self, parts: tuple[Part, ...]) -> None:
+        """Say something to the bridge that is there; the next one hears all it needs by itself."""
+        if self.connected:
+            self._outbox.say(parts)
+
+    def wake(self) -> None:
+        """A message waits to be sent."""
+        self._outbox.wake()
+
+    def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Have something done as long as this bridge is there."""
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    # ------------------------------------------------------------------ what the link tells
+
+    def came(self) -> None:
+        """Advertise everything to a new bridge."""
+        self._tell_change()
+        for publisher in self._publishers.values():
+            if publisher.exists:
+                self.say(encoded(publisher.advertisement()))
+                publisher.lane.say_again()
+        self.begin(self._repeat_shared())
+        self.begin(listen_for_subscribers(self, self._publishers))
+        self._new = [one for one in self._services.values() if one.exists]
+        self._change()
+
+    def _tell_change(self) -> None:
+        try:
+            self._on_change(self)
+        except Exception:
+            logger.exception("%s ! who was to be told of the bridge", self.full_name)
+
+    async def _repeat_shared(self) -> None:
+        within = f"{self.full_name}/"
+        while True:
+            await asyncio.sleep(REPEAT)
+            for publisher in self._publishers.values():
+                if publisher.exists and not publisher.name.startswith(within):
+                    publisher.lane.say_again()
+                    self._outbox.wake()
+
+    def _change(self) -> None:
+        """Have services withdrawn and advertised: one after another, those of this turn at once."""
+        if self.connected and self._changing is None and (self._new or self._leaving):
+            self._changing = self.begin(self._change_services())
+            self._changing.add_done_callback(self._changed)
+
+    def _changed(self, task: asyncio.Task[None]) -> None:
+        if self._changing is task:
+            self._changing = None
+            self._change()
+
+    async def _change_services(self) -> None:
+        await asyncio.sleep(0)
+        new, leaving = self._new, [*self._leaving]
+        self._new = []
+        await asyncio.gather(*(one.still() for one in leaving))
+        await retire(self._link.url, list(dict.fromkeys(one.name for one in (*leaving, *new))))
+        if leaving:  # what the bridge has said before: calls that it has aborted
+            await self.ask(KNOWN, {})
+        self._leaving = self._leaving[len(leaving) :]
+        for service in new:
+            service.advertise()
+
+    async def ask(self, service: str, arguments: dict[str, Any]) -> dict[str, Any] | None:
+        """Call a service of ROS 1: what the bridge says then, None where it says nothing in time.
+
+        All that it said before was heard by then.
+        """
+        asked = question(service, arguments)
+        answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._asked[asked["id"]] = answer
+        try:
+            async with asyncio.timeout(ASK_TIMEOUT):
+                self.say(encoded(asked))
+                return await answer
+        except TimeoutError:
+            logger.warning("%s: the bridge does not answer a call of %s", self.full_name, service)
+            return None
+        finally:
+            del self._asked[asked["id"]]
+
+    def _answered(self, operation: dict[str, Any]) -> None:
+        answer = self._asked.get(str(operation.get("id")))
+        if answer is not None and not answer.done():
+            answer.set_result(operation)
+
+    def heard(self, operation: dict[str, Any]) -> None:
+        """Do what the bridge says."""
+        hear = self._hears.get(operation["op"])
+        if hear is None:
+            logger.debug("%s: from the bridge: %.200r", self.full_name, operation)
+        else:
+            hear(operation)
+
+    async def lost(self, was: bool) -> None:
+        """End what was under way for a bridge that is gone."""
+        if self._running is not None and was:
+            self._tell_change()
+        for service in self._services.values():
+            service.end_turn()
+        self._new, self._changing = [], None
+        tasks = [*self._tasks]
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks, timeout=CLOSE_TIMEOUT)
+
+    def _called(self, operation: dict[str, Any]) -> None:
+        name, identity = operation.get("service"), operation.get("id")
+        if not isinstance(name, str) or not isinstance(identity, str | int | None):
+            logger.warning("%s: no call: %.200r", self.full_name, operation)
+            return
+        service = self._services.get(name)
+        if any(one.name == name for one in self._leaving):
+            return  # it fails at its caller
+        if service is None:
+            logger.warning("%s ! called %.80r, which it does not serve", self.full_name, name)
+            refusal = {"op": "service_response", "service": name, "id": identity, "result": False}
+            self.say(encoded(refusal))
+        elif service.ready:  # or it is a call that the bridge aborts
+            service.call(identity, operation.get("args"))
+
+    def _told(self, operation: dict[str, Any]) -> None:
+        level = _LEVELS.get(str(operation.get("level")), logging.DEBUG)
+        about = f" ({operation['id']})" if operation.get("id") else ""
+        said = operation.get("msg")
+        logger.log(level, "%s: the bridge says%s: %.500s", self.full_name, about, said)

@@ -1,0 +1,166 @@
+"""Services that are called through a rosbridge."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import RosError, SmartCamError
+from smartcam.ros1._json_messages import encoded, from_json, ros1_name, to_json
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+    from typing import Self
+
+    from smartcam.ros1._json_messages import Part
+    from smartcam.ros1._rosbridge import RosbridgeNode
+    from smartcam.ros2._types import MessageType, ServiceType
+
+logger: logging.Logger = logging.getLogger("smartcam.ros1")
+
+MOST_CALLS = 64
+"""Calls of a service that are carried out at the same time; one beyond is refused."""
+SETTLE = 0.5
+"""Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
+has not handed over stays, and is then the response to a later call."""
+CLOSE_TIMEOUT = 5.0
+"""Seconds for handlers that were cancelled; one that goes on is its author's."""
+ERROR_FIELDS = ("error", "message", "status_message")
+"""The fields of a response that say what went wrong, the first that it has."""
+
+
+class RosbridgeService:
+    """Serves; made by :meth:`RosbridgeNode.serve`.
+
+    Attributes:
+        name: its absolute name.
+        type: of requests and responses.
+        ready: whether it is advertised to the bridge that is there.
+        calls: calls that came.
+        failed: those that were refused, or failed.
+    """
+
+    def __init__(
+        self,
+        node: RosbridgeNode,
+        name: str,
+        kind: ServiceType,
+        handler: Callable[[Any], Awaitable[Any]],
+        timeout: float,
+    ) -> None:
+        self.name, self.type = name, kind
+        self.ready = False
+        self.exists = ros1_name(kind.name) is not None
+        self.calls = self.failed = 0
+        self._node, self._handler, self._timeout = node, handler, timeout
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._responded = float("-inf")
+        self._turn = 0  # of being advertised: what was called in another one is not answered
+        self._text_field = error_field(kind.response)
+
+    def close(self) -> None:
+        """Serve no more; calls under way fail at their callers. Idempotent."""
+        self._node.forget(self)
+
+    async def wait_closed(self) -> None:
+        """Wait until the calls that were given up have ended."""
+        if self._tasks:
+            await asyncio.wait(tuple(self._tasks))
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------ for the node
+
+    def advertise(self) -> None:
+        """Advertise it, where it is not closed."""
+        if self._node.has(self):
+            self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
+            self.ready = True
+
+    def end_turn(self) -> None:
+        """Answer no call that came up to now: the bridge counts them from one again."""
+        self.ready = False
+        self._turn += 1
+
+    async def still(self) -> None:
+        """End the calls under way, and let the bridge hand over the responses that it has."""
+        self.end_turn()
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(tuple(self._tasks), timeout=CLOSE_TIMEOUT)
+        left = self._responded + SETTLE - asyncio.get_running_loop().time()
+        if left > 0:
+            await asyncio.sleep(left)
+
+    def call(self, identity: object, said: object) -> None:
+        """Carry out a call. What it waits for ends where the bridge goes."""
+        self.calls += 1
+        busy = len(self._tasks) >= MOST_CALLS
+        task = self._node.begin(self._carry_out(identity, said, busy=busy))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # ------------------------------------------------------------------ inside
+
+    async def _carry_out(self, identity: object, said: object, *, busy: bool) -> None:
+        turn = self._turn
+        try:
+            parts = await self._response(identity, said, busy=busy)
+        except SmartCamError as exc:
+            self._refuse(turn, identity, str(exc))
+        except TimeoutError:
+            self._refuse(turn, identity, f"no answer in {self._timeout:g} s")
+        except Exception as exc:
+            logger.exception("%s ! its handler failed", self.name)
+            self._refuse(turn, identity, f"{type(exc).__name__}: {exc}")
+        else:
+            self._respond(turn, parts)
+
+    async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
+        if busy:
+            raise RosError(f"{MOST_CALLS} calls of it are under way, which is the most")
+        request = from_json(self.type.request, {} if said is None else said)
+        async with asyncio.timeout(self._timeout):
+            response = await self._handler(request)
+        return self._encoded(identity, to_json(self.type.response, response), result=True)
+
+    def _refuse(self, turn: int, identity: object, text: str) -> None:
+        self.failed += 1
+        logger.warning("%s ! %s", self.name, text)
+        kind = self.type.response
+        if self._text_field:
+            values = to_json(kind, {self._text_field: text})
+            self._respond(turn, self._encoded(identity, values, result=False))
+        elif turn == self._turn:
+            # A bridge takes no notice of the result and would hand over zeros: the service goes for
+            # a moment, which is an error for its callers.
+            self._respond(turn, self._encoded(identity, None, result=False))
+            self._node.renew(self)
+
+    def _encoded(self, identity: object, values: object, *, result: bool) -> tuple[Part, ...]:
+        said = {"op": "service_response", "service": self.name, "result": result}
+        if identity is not None:
+            said["id"] = identity
+        if values is not None:
+            said["values"] = values
+        return encoded(said)
+
+    def _respond(self, turn: int, parts: tuple[Part, ...]) -> None:
+        if turn == self._turn:
+            self._responded = asyncio.get_running_loop().time()
+            self._node.say(parts)
+
+    def _say(self, operation: dict[str, Any]) -> None:
+        self._node.say(encoded({**operation, "service": self.name}))
+
+
+def error_field(kind: MessageType) -> str:
+    """Return the field of a response that says what went wrong, "" where it has none."""
+    texts = {one.name for one in kind.fields if one.type == "string" and not one.shape}
+    return next((one for one in ERROR_FIELDS if one in texts), "")

@@ -1,0 +1,40 @@
+"""Who hears a topic with long messages: the bridge sends on what comes, whether anybody does."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.ros1._publishing import RosbridgePublisher
+    from smartcam.ros1._rosbridge import RosbridgeNode
+
+SERVICE: Final = "/rosapi/subscribers"
+"""Of the node that rosbridge's launch file starts beside the bridge."""
+PERIOD = 2.0
+"""Seconds between two questions."""
+LONG: Final = frozenset(
+    {"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2"}
+)
+"""Types whose messages are worth a question."""
+
+
+async def listen_for_subscribers(
+    node: RosbridgeNode, publishers: Mapping[str, RosbridgePublisher]
+) -> None:
+    """Keep ``subscribed`` of the publishers as it is, as long as rosapi answers."""
+    for publisher in publishers.values():
+        publisher.subscribed = True
+    while True:
+        for publisher in [one for one in publishers.values() if one.type.name in LONG]:
+            answer = await node.ask(SERVICE, {"topic": publisher.name})
+            values = answer.get("values") if answer else None
+            found = values.get("subscribers") if isinstance(values, dict) else None
+            if not isinstance(found, list):
+                for one in publishers.values():
+                    one.subscribed = True
+                return
+            publisher.subscribed = bool(found)
+        await asyncio.sleep(PERIOD)
