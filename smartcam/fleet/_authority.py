@@ -193,9 +193,10 @@ class _Authority:
             done = "made" if old is None else "renewed"
             old = self._sign(role, name, hosts, lifetime, place)
         use = _use(role, name, place, hosts)
-        if role == ROUTER:
+        if role == ROUTER and not (place / ROUTER_FILE).exists():
             _write(place / ROUTER_FILE, _router(place))
-        _write(place / HOW_TO_USE, use.encode())
+        if not (place / HOW_TO_USE).exists():
+            _write(place / HOW_TO_USE, use.encode())
         return MadeCertificate(role, name, str(place), done, old.not_valid_after_utc, use)
 
     def _old(self, place: Path) -> Any:

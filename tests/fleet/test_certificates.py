@@ -64,6 +64,7 @@ def test_what_ends_soon_is_renewed_with_its_key(tmp_path: Path) -> None:
     make_certificates(tmp_path, {"agent": ["line1"]}, hosts=["plant"], lifetime=timedelta(days=90))
     made = make_certificates(tmp_path, {"viewer": ["a"]}, lifetime=timedelta(seconds=0))
     assert done(made) == {"a": "made", "line1": "kept"}
+    (tmp_path / "line1" / "how-to-use.txt").write_text("a note of somebody's")
     before = content(tmp_path)
     made = make_certificates(tmp_path, {})
     assert done(made) == {"a": "renewed", "line1": "kept"}
