@@ -42,6 +42,7 @@ SMALL = "synthetic://?size=640x480&fps=30"
 PATIENCE = 60.0
 FLEET = """\
 listen: tcp/10.78.0.1:{port}
+access: anyone-may-command
 cameras:
   large: {{emulated: {{}}, frames: "{raw}"}}
   small: {{emulated: {{}}, frames: {{url: "{small}", linger: 60}}}}

@@ -30,6 +30,8 @@ import smartcam
 from smartcam._client.handshake import load_protocol
 from smartcam.calibration._files.storage import Stored
 from smartcam.emulator import Quirks
+from smartcam.fleet._access import RIGHTS
+from smartcam.fleet._certificates import ROLES
 from smartcam.fleet._file import (
     CameraEntry,
     Emulated,
@@ -69,6 +71,16 @@ napoleon_use_ivar = True
 napoleon_custom_sections = ["Cancellation", "Source"]
 
 ROOT = Path(__file__).parents[1]
+
+DOES = {
+    "say": "puts",
+    "hear": "subscribes",
+    "ask": "queries",
+    "answer": "answers queries",
+    "appear": "has tokens",
+    "watch": "looks for tokens",
+}
+"""What a right of a role is, in the engine's words."""
 
 WORDS = {"I": "UINT32", "H": "UINT16"}
 """A dialect's ordinary integers."""
@@ -459,6 +471,20 @@ def fleet_history() -> str:
     return _fields(History)
 
 
+def access_rights() -> str:
+    """Return who may what in a fleet, and with which keys."""
+    rows = [
+        (
+            right.what,
+            DOES[right.does],
+            " ".join(f"`{key.removeprefix('smartcam/*/')}`" for key in right.keys),
+            *("yes" if role in right.roles else "" for role in ROLES[:3]),
+        )
+        for right in RIGHTS
+    ]
+    return _table(("may", "how", "keys behind `smartcam/FLEET/`", *ROLES[:3]), rows)
+
+
 def _fields(kind: type[BaseModel]) -> str:
     rows = [
         (f"`{name}`", field.description, _default(field))
@@ -556,6 +582,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, settings, transitions, policies, layers, limits),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
+        access_rights,
     )
 }
 """What ``{generated}`` knows."""

@@ -62,6 +62,11 @@ TURN = 64
 
 CLOSE_TIMEOUT = 5.0
 
+NOT_ZENOH = "nothing there speaks Zenoh"
+
+DECLARED_AT_ONCE = 32
+"""Things declared in one turn of the event loop, where there are many."""
+
 _ONE = (1).to_bytes(8, sys.byteorder)
 
 
@@ -198,7 +203,7 @@ class ZenohSession:
         self._link, self._more, self._what = link, dict(more or {}), what
         self._zenoh = engine()
         self._session: Any = None
-        self._declared: set[ZenohDeclared] = set()
+        self._declared: dict[ZenohDeclared, None] = {}  # in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._bytes = 0
@@ -208,6 +213,7 @@ class ZenohSession:
         self._told_dropped = False
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
+        self._reopening = False
         self._look: asyncio.TimerHandle | None = None  # for connections that linger
 
     # ------------------------------------------------------------------ life
@@ -219,10 +225,19 @@ class ZenohSession:
             ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
             ConfigurationError: the engine refuses a setting.
         """
-        self._loop = loop = asyncio.get_running_loop()
-        zenoh = self._zenoh
+        self._loop = asyncio.get_running_loop()
+        await self._open(timeout)
+        self._end_lingering()
+        self._waiting.clear()
+        self._bytes, self._woken = 0, False
+        self._bell = _LoopBell.on(self._loop, self._drain)
+        return self
+
+    async def _open(self, timeout: float) -> None:
+        loop, zenoh = self._loop, self._zenoh
         config = zenoh.Config()
-        for path, value in {**self._link.settings(timeout), **self._more}.items():
+        settings = {**self._link.settings(timeout), **self._more}
+        for path, value in settings.items():
             try:
                 config.insert_json5(path, json.dumps(value))
             except zenoh.ZError as exc:
@@ -241,11 +256,35 @@ class ZenohSession:
         except asyncio.CancelledError:
             opening.add_done_callback(_close_late)
             raise
-        self._end_lingering()
-        self._waiting.clear()
-        self._bytes, self._woken = 0, False
-        self._bell = _LoopBell.on(loop, self._drain)
-        return self
+
+    async def reopen(self, timeout: float) -> None:
+        """Have a new session in the place of this one, with all that is declared.
+
+        Those at the other ends of its connections see it go and come; nothing is said or heard in
+        between. What is declared meanwhile is declared with all else.
+
+        Raises:
+            ConnectFailedError: it cannot listen again within ``timeout`` seconds; it is away until
+                it is tried again.
+
+        Cancellation: as an error.
+        """
+        session, self._session = self._session, None
+        if session is not None:
+            self._reopening = True
+            old = [one.lose() for one in tuple(self._declared)]
+            closing = self._loop.run_in_executor(None, _lose, session, old, bool(self._link.listen))
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CLOSE_TIMEOUT):
+                    await asyncio.shield(closing)
+        if not self._reopening:
+            raise ConfigurationError(f"{self._what} is not open")
+        await self._open(timeout)
+        for number, one in enumerate(tuple(self._declared)):
+            if number % DECLARED_AT_ONCE == 0:
+                await asyncio.sleep(0)
+            one.again()
+        self._reopening = False
 
     def _end_lingering(self) -> None:
         """Look at the connections now, and again before a new one can be cut off for its lease."""
@@ -262,6 +301,7 @@ class ZenohSession:
     async def close(self) -> None:
         """Close it; what was declared is gone with it. Idempotent."""
         session, self._session = self._session, None
+        self._reopening = False
         if self._look is not None:
             self._look.cancel()
         self._waiting.clear()
@@ -371,13 +411,13 @@ class ZenohSession:
 
     def declare(self, one: ZenohDeclared, how: Callable[[Any], Any]) -> Any:
         """Declare something at the engine; it is closed with this end."""
-        made = how(self.session)
-        self._declared.add(one)
+        made = None if self._reopening else how(self.session)
+        self._declared[one] = None
         return made
 
     def forget(self, one: ZenohDeclared) -> None:
         """It is closed."""
-        self._declared.discard(one)
+        self._declared.pop(one, None)
 
     @property
     def session(self) -> Any:
@@ -459,11 +499,31 @@ class ZenohDeclared:
         self._end = end
         self._closed = False
         self._it: Any = None
+        self._how: Callable[[Any], Any] = _nothing
+        self._on_lost: Callable[[], None] | None = None
 
     def of(self, how: Callable[[Any], Any]) -> Self:
         """Declare what ``how`` makes of the engine's session."""
+        self._how = how
         self._it = self._end.declare(self, how)
         return self
+
+    def when_lost(self, call: Callable[[], None]) -> Self:
+        """Have something called in the event loop when its session is lost to a new one."""
+        self._on_lost = call
+        return self
+
+    def lose(self) -> Any:
+        """Its session is about to end; return what is to be kept until it has."""
+        it, self._it = self._it, None
+        if self._on_lost is not None:
+            self._end.later(self.call, self._on_lost)
+        return None if self._by_dropping else it
+
+    def again(self) -> None:
+        """Declare it at the session that is there now."""
+        if not self._closed and self._it is None:
+            self._it = self._how(self._end.session)
 
     def call(self, call: Callable[..., None], *arguments: Any) -> None:
         """Call back, unless it was closed meanwhile."""
@@ -476,8 +536,17 @@ class ZenohDeclared:
             self._closed = True
             self._end.forget(self)
             it, self._it = self._it, None
-            if not self._by_dropping:
+            if not self._by_dropping and it is not None:
                 quietly(it.undeclare)
+
+
+def _lose(session: Any, declared: list[Any], router: bool) -> None:
+    _end(session, [], router)
+    declared.clear()  # which takes long before
+
+
+def _nothing(_: Any) -> None:
+    pass
 
 
 def _reply(query: Any, replies: list[tuple[str, bytes]], how: dict[str, Any]) -> None:
@@ -530,4 +599,4 @@ def _reason(error: Exception) -> str:
     system = re.search(r": ([^:]+) \(os error \d+\)", text)
     if system is not None:
         return system[1]
-    return "nothing there speaks Zenoh" if "Unable to connect" in text else text
+    return NOT_ZENOH if "Unable to connect" in text else text

@@ -15,6 +15,7 @@
     ├── ResponseTimeoutError (TimeoutError)    a wait in a session ran out
     ├── CommandRejectedError                   the camera said no; what is active now
     ├── UnsupportedError                       this dialect or device cannot do it
+    ├── NotAllowedError (PermissionError)      the role of this program's certificate forbids it
     ├── CameraFaultError                       the camera reports System Error
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
     ├── FrameSourceError (OSError)             a source of pictures: gone, in use, stuck
@@ -67,6 +68,7 @@ __all__ = [
     "LocalProtocolError",
     "MessageError",
     "MissingExtraError",
+    "NotAllowedError",
     "NotRunningError",
     "OvertriggeredError",
     "PluginError",
@@ -225,6 +227,20 @@ class CommandRejectedError(SmartCamError):
 
 class UnsupportedError(SmartCamError):
     """This dialect or device cannot do it."""
+
+
+class NotAllowedError(SmartCamError, PermissionError):
+    """The role of this program's certificate forbids it; nothing was sent.
+
+    Attributes:
+        role: of the certificate, such as ``viewer``.
+        certificate: whose it is, such as ``dashboard``.
+    """
+
+    def __init__(self, message: str, *, role: str = "", certificate: str = "") -> None:
+        super().__init__(message)
+        self.role = role
+        self.certificate = certificate
 
 
 class CameraFaultError(SmartCamError):

@@ -28,6 +28,7 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
     e.ResponseTimeoutError: (ROOT, TimeoutError),
     e.CommandRejectedError: (ROOT,),
     e.UnsupportedError: (ROOT,),
+    e.NotAllowedError: (ROOT, PermissionError),
     e.CameraFaultError: (ROOT,),
     e.CalibrationError: (ROOT, ValueError),
     e.FrameSourceError: (ROOT, OSError),
@@ -70,6 +71,7 @@ ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
     e.ConnectionClosedError: LINK,
     e.ResponseTimeoutError: {"message_id": 0x30, "waited": 2.5},
     e.CommandRejectedError: {"message_id": 0x31, "code": 1, "active_application": 3},
+    e.NotAllowedError: {"role": "viewer", "certificate": "dashboard"},
     e.TriggerTimeoutError: {"waited": 5.0},
     e.CalibrationError: {"code": "TOO_FEW", "expected": 3, "got": 2},
     e.FrameSourceError: SOURCE,
@@ -86,6 +88,7 @@ DEFAULTS: dict[str, Any] = {
     "text": "", "position": 0, "name": "", "extra": "", "host": "", "port": 0, "attempts": (),
     "message_id": None, "waited": 0.0, "code": 0, "active_application": None, "offset": 0,
     "data": b"", "field": "", "expected": None, "got": None, "source": "", "available": (),
+    "role": "", "certificate": "",
 }  # fmt: skip
 
 SPECIAL: dict[tuple[type[Exception], str], Any] = {

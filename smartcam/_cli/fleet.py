@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.decode import from_hex
+from smartcam._cli.fleet_certificates import certificates
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.running import JsonErrors, error_json, exit_code, first
 from smartcam._cli.terminal import tinted
@@ -47,6 +48,9 @@ def fleet() -> None:
     """Have the commands of a fleet."""
 
 
+fleet.add_command(certificates)
+
+
 def _opened(url: str, options: Options) -> Fleet:
     from smartcam.fleet import open
 
@@ -69,6 +73,9 @@ async def list_(url: str, pattern: str, options: Options) -> None:
     async with _opened(url, options) as opened:
         _require_cameras(opened)
         found = [_camera(opened, one) for one in opened.cameras(pattern)]
+        warning = opened.warning
+    if warning:
+        click.echo(f"{tinted('error', 'warning:')} {warning}", err=True)
     if options.as_json:
         for value in found:
             options.show(value, "")

@@ -27,6 +27,7 @@ from smartcam.exceptions import (
     InterpretationError,
     LayoutError,
     LinkError,
+    NotAllowedError,
     ProtocolError,
     SmartCamError,
     TriggerError,
@@ -48,6 +49,7 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (FrameSourceError, 3),
     (CommandRejectedError, 5),
     (UnsupportedError, 5),
+    (NotAllowedError, 5),
     (CameraFaultError, 5),
     (TriggerError, 5),
 )

@@ -17,6 +17,7 @@ from smartcam._cli.log_lines import json_log
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.running import exit_code
 from smartcam._cli.systemd import Notifier
+from smartcam._cli.terminal import tinted
 from smartcam.exceptions import SmartCamError
 from smartcam.models import Connected, Disconnected, Reconnected
 
@@ -126,6 +127,8 @@ class Serving:
             await server.wait_tried()
             self._ready = True
             notifier.ready(self._status())
+            if server.warning:
+                self._warn(server.warning)
             events = server.events()
             self._show()
             async for event in events:
@@ -133,6 +136,12 @@ class Serving:
                     self._log(event)
                 if self._options.as_json or not self._as_lines:
                     tell(server, event, self._options)
+
+    def _warn(self, text: str) -> None:
+        if self._as_lines:
+            logger.warning("%s", text)
+        else:
+            click.echo(f"{tinted('error', 'warning:')} {text}", err=True)
 
     def _show_cameras(self) -> None:
         server = self._server

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from smartcam._suggestions import did_you_mean
@@ -12,9 +13,11 @@ from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
     ConnectionLostError,
+    NotAllowedError,
     ResponseTimeoutError,
 )
 from smartcam.fleet._address import FleetAddress
+from smartcam.fleet._certificates import ends_soon, may_command, read_identity, shake_hands
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._zenoh import ZenohEnd
 
@@ -35,7 +38,7 @@ MOST_LISTED = 20
 SERVE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
 LISTENS = (
     "Without one it is tcp/127.0.0.1:7447, which only programs on the same computer reach; "
-    "tcp/0.0.0.0:7447 is for all."
+    "tls/0.0.0.0:7447 is for all that have a certificate."
 )
 
 
@@ -75,6 +78,8 @@ async def reach(exam: Examination) -> None:
         exam.fail(f"nothing takes a connection at {place}: {why}", cure)
         return
     writer.transport.abort()
+    if not await _certificates(exam, address):
+        return
     end = ZenohEnd(address.link)
     begin = asyncio.get_running_loop().time()
     try:
@@ -97,6 +102,41 @@ async def reach(exam: Examination) -> None:
         f"the bus at {place} answers, after {taken:.1f} ms",
         url=address._replace(camera="").url,
     )
+
+
+async def _certificates(exam: Examination, address: FleetAddress) -> bool:
+    """Look at the certificates of both sides, if there are any; return whether they will do."""
+    if address.certificates is None:
+        return True
+    folder, loop = Path(address.certificates), asyncio.get_running_loop()
+    try:
+        own = await loop.run_in_executor(None, read_identity, folder)
+    except ConfigurationError as exc:
+        exam.fail(str(exc), f"smartcam fleet certificates makes what belongs into {folder}.")
+        return False
+    if own.expired:
+        exam.fail(own.expired, "Until then nothing there takes this program.")
+        return False
+    theirs = await shake_hands(address.host, address.port, folder)
+    if theirs.trouble:
+        exam.fail(
+            f"no handshake as {own}: {theirs.trouble}",
+            "Both sides have to show a certificate of one authority (ca.pem), and the agent's has "
+            "to name the host of the URL: smartcam fleet certificates --host.",
+        )
+        return False
+    warning = own.warning or ends_soon("the agent's certificate", theirs.ends)
+    exam.say(
+        "hint" if warning else "ok",
+        f"this program is {own}: it may look" + (", and command" if may_command(own.role) else ""),
+        warning,
+        check="certificates",
+        role=own.role,
+        certificate=own.name,
+        ends=own.ends,
+        agent_ends=theirs.ends,
+    )
+    return True
 
 
 # ---------------------------------------------------------------------- the agent
@@ -204,6 +244,13 @@ async def reserve(exam: Examination) -> None:
             f"no triggers are sent: {exc}",
             "Wait for the program that has it, or leave out --trigger.",
             exit_code=Exit.RAN_OUT,
+        )
+        return
+    except NotAllowedError as exc:
+        exam.fail(
+            f"no triggers are sent: {exc}",
+            "Take the certificate of an operator, or leave out --trigger.",
+            exit_code=Exit.REFUSED,
         )
         return
     exam.wants_trigger = True

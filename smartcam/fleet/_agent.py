@@ -58,7 +58,7 @@ MOST_CALLS = 256
 """Calls of one program that may be under way at a time, for each camera of the agent."""
 
 KNOWN_CALLS = 4096
-"""Numbers of calls that are remembered for each program; older ones are not done any more."""
+"""CallNumbers of calls that are remembered for each program; older ones are not done any more."""
 
 KNOWN_CAMERAS = 1000
 """Cameras shared no more whose numbers go on where they ended, should they come back."""
@@ -67,28 +67,20 @@ FIRST_TRY = 30.0
 """Seconds that the first try to reach a camera is waited for at the start."""
 
 
-@dataclass(eq=False)
-class Guest:
-    """A program that calls.
+class CallNumbers:
+    """CallNumbers of calls that were seen.
 
-    Attributes:
-        number: by which results say whose they are.
-        tasks: its calls under way.
-        floor: calls up to this one are not done, or not again.
-        entered: what its temporary switches go back to.
-        told: the number up to which it has heard of states with its replies, by camera.
+    Args:
+        floor: those up to this one count as seen.
     """
 
-    number: int
-    floor: int = 0
-    tasks: dict[int, asyncio.Task[None]] = field(default_factory=dict[int, "asyncio.Task[None]"])
-    entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
-    told: dict[str, int] = field(default_factory=dict[str, int])
-    _known: set[int] = field(default_factory=set[int])
+    def __init__(self, floor: int = 0) -> None:
+        self.floor = floor
+        self._known: set[int] = set()
 
     @property
     def last(self) -> int:
-        """The highest number of a call that was seen."""
+        """The highest that was seen."""
         return max(self._known, default=self.floor)
 
     def is_new(self, call: int) -> bool:
@@ -101,6 +93,40 @@ class Guest:
             self.floor = kept[0] - 1
             self._known = set(kept)
         return True
+
+
+@dataclass(eq=False)
+class Guest:
+    """A program that calls.
+
+    Questions and commands are kept apart: who may only ask can say another program's name, and must
+    not keep its commands from being done, or cancel them.
+
+    Attributes:
+        number: by which results say whose they are.
+        questions, commands: numbers of its calls of each kind.
+        tasks: its calls under way, by kind (whether a command) and number.
+        entered: what its temporary switches go back to.
+        told: the number up to which it has heard of states with its replies, by camera.
+    """
+
+    number: int
+    questions: CallNumbers = field(default_factory=CallNumbers)
+    commands: CallNumbers = field(default_factory=CallNumbers)
+    tasks: dict[tuple[bool, int], asyncio.Task[None]] = field(
+        default_factory=dict[tuple[bool, int], "asyncio.Task[None]"]
+    )
+    entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
+    told: dict[str, int] = field(default_factory=dict[str, int])
+
+    @property
+    def last(self) -> int:
+        """The highest number of a call that was seen."""
+        return max(self.questions.last, self.commands.last)
+
+    def is_new(self, call: int, command: bool) -> bool:
+        """Whether a call has not been seen; it is known from now on."""
+        return (self.commands if command else self.questions).is_new(call)
 
 
 class Agent:
@@ -274,6 +300,18 @@ class Agent:
         self._own(call)
         call.cancel()
 
+    @property
+    def busy(self) -> bool:
+        """Whether a program has a camera reserved, or a command under way.
+
+        Of programs without smartcam every call counts.
+        """
+        return (
+            self._plain.busy
+            or any(command for guest in self._programs.values() for command, _ in guest.tasks)
+            or any(host.gate.holder is not None for host in self.hosts.values())
+        )
+
     # ------------------------------------------------------------------ programs
 
     def _on_program(self, key: str, present: bool) -> None:
@@ -304,7 +342,9 @@ class Agent:
         if known is None and call > left:
             if len(self._programs) >= MOST_PROGRAMS:
                 raise LocalProtocolError(f"{self.name}: {MOST_PROGRAMS} programs are here already")
-            known = self._programs[program] = Guest(self.next_program(), left)
+            known = self._programs[program] = Guest(
+                self.next_program(), CallNumbers(left), CallNumbers(left)
+            )
         return known
 
     def next_program(self) -> int:
@@ -338,7 +378,7 @@ class Agent:
             self._sender.come(program, number, fields["come"])
             return
         if "cancel" in fields:
-            self._cancel(host, program, int(fields["cancel"]))
+            self._cancel(host, program, int(fields["cancel"]), command)
             self._reply(program, number, {"answer": {}})
             return
         said, timeout = str(fields["do"]), float(fields.get("timeout", 1.0))
@@ -349,7 +389,7 @@ class Agent:
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
             call = ProgramCall(host, program, owner, arguments, message.blobs, left, guest.entered)
-            self._start(said, call, guest)
+            self._start(said, call, guest, command)
 
     def _on_order(self, host: Host, program: str, order: TriggerOrder, command: bool) -> None:
         number, guest, said = order.call, self._programs.get(program), "trigger"
@@ -357,9 +397,8 @@ class Agent:
         left = self._admit(host, guest, program, number, epoch, said, deadline, timeout, command)
         if guest is not None and left is not None:
             owner = Owner(guest.number, number)
-            self._start(
-                said, ProgramCall(host, program, owner, {}, [], left, guest.entered, order), guest
-            )
+            call = ProgramCall(host, program, owner, {}, [], left, guest.entered, order)
+            self._start(said, call, guest, command)
 
     def _admit(
         self,
@@ -381,7 +420,7 @@ class Agent:
             )
             self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
             return None
-        if not guest.is_new(number):
+        if not guest.is_new(number, command):
             return None  # it is done, or under way: a double
         left = 1.0 if deadline is None else deadline + grace(timeout) / 2 - now()
         error: SmartCamError | None = None
@@ -400,27 +439,29 @@ class Agent:
             return None
         return min(timeout, left)
 
-    def _start(self, said: str, call: ProgramCall, guest: Guest) -> None:
-        guest.tasks[call.owner.call] = asyncio.get_running_loop().create_task(
-            self._do(said, call, guest), name=f"smartcam.fleet.{call.host.name}.{said}"
+    def _start(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
+        guest.tasks[command, call.owner.call] = asyncio.get_running_loop().create_task(
+            self._do(said, call, guest, command), name=f"smartcam.fleet.{call.host.name}.{said}"
         )
 
-    def _cancel(self, host: Host, program: str, number: int) -> None:
+    def _cancel(self, host: Host, program: str, number: int, command: bool) -> None:
         guest = self._programs.get(program)
         if guest is None:
             return
-        guest.is_new(number)  # if it comes yet, it comes too late
-        task = guest.tasks.pop(number, None)
+        guest.is_new(number, command)  # if it comes yet, it comes too late
+        task = guest.tasks.pop((command, number), None)
         if task is not None:
             self._end(task)
-        self._sender.come(program, number, None)
+        if not command:
+            self._sender.come(program, number, None)
+            return
         host.gate.release((program, number))
         entered = guest.entered.pop((host.name, number), None)
         if entered is not None:  # it was done, and its program does not know
             camera, before = entered
             camera.leave(before)
 
-    async def _do(self, said: str, call: ProgramCall, guest: Guest) -> None:
+    async def _do(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
         """Do a call, and reply; a program that has cancelled gets none."""
         host = call.host
         inside, outcome = False, "cancelled"
@@ -444,7 +485,7 @@ class Agent:
                 host.triggers[outcome] += 1
             if inside:
                 host.gate.leave(call.program)
-            guest.tasks.pop(call.owner.call, None)
+            guest.tasks.pop((command, call.owner.call), None)
         if said == "trigger" and blobs:
             self._reply_to_trigger(call, guest, blobs[0])
             return

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
+    from smartcam.fleet._certificates import Identity
+
 Data = bytes | bytearray | memoryview
 
 
@@ -51,9 +53,11 @@ class Bus(abc.ABC):
     Attributes:
         local: all ends are in this event loop: what is said in parts is handed on as it is, and the
             clocks of all are one.
+        identity: whose certificate it shows; None without one.
     """
 
     local: bool = False
+    identity: Identity | None = None
 
     @property
     def waiting_bytes(self) -> int:

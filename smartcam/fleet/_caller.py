@@ -10,11 +10,13 @@ from smartcam.exceptions import (
     ConnectionClosedError,
     ConnectionLostError,
     LinkError,
+    NotAllowedError,
     RemoteProtocolError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
 )
+from smartcam.fleet._certificates import may_command
 from smartcam.fleet._errors import from_fields
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._wire import BusMessage, TriggerOrder, TriggerReply, encode, encode_order, grace
@@ -33,6 +35,9 @@ DRIFT = 1e-4
 HELLO_TIMEOUT = 2.0
 """Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
 
+
+SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
+"""What a user calls these calls."""
 
 INSIST_AFTER = 1.0
 """Seconds until something is said again that the agent has to know: it may have been lost."""
@@ -139,6 +144,9 @@ class Caller:
         if self.end is not None:
             raise self.end.with_traceback(None)
         if self.trouble is not None:
+            identity = self.program.bus.identity
+            if identity is not None and identity.expired:
+                raise ConnectionLostError(f"{self.trouble}; {identity.expired}") from self.trouble
             raise self.trouble.with_traceback(None)
         if self._task is not None:
             raise ConnectionLostError(f"{self.name}: no agent has answered yet")
@@ -357,6 +365,7 @@ class Caller:
         met: Met | None,
     ) -> Reply:
         """Say a call, and return the reply to it; ``deadline`` is this side's."""
+        self._check_allowed(do)
         program, key = self.program, self._key(agent, do)
         waiting = program.expect(number, self)
         timer = asyncio.get_running_loop().call_at(deadline, _expire, waiting)
@@ -384,7 +393,7 @@ class Caller:
 
     def tell(self, do: str, arguments: dict[str, Any]) -> None:
         """Have something done without waiting for it, if there is an agent."""
-        if self.met is not None:
+        if self.met is not None and self._allowed(do):
             fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
             self._insist(self._key(self.met.agent, do), fields)
 
@@ -431,6 +440,33 @@ class Caller:
         self._insisting.add(task)
         task.add_done_callback(self._insisting.discard)
 
+    def _allowed(self, do: str) -> bool:
+        identity = self.program.bus.identity
+        return do not in COMMANDS or identity is None or may_command(identity.role)
+
+    def _check_allowed(self, do: str) -> None:
+        """Refuse what the bus would swallow.
+
+        Raises:
+            NotAllowedError: the role of this program's certificate forbids it.
+        """
+        identity = self.program.bus.identity
+        if identity is not None and not self._allowed(do):
+            what = SWITCHES.get(do, do)
+            raise NotAllowedError(
+                f"{self.name}: {what} is a command, and this program's certificate is that of "
+                f"{identity}, who may look; nothing was sent",
+                role=identity.role,
+                certificate=identity.name,
+            )
+
+    def _perhaps(self, do: str) -> str:
+        """Return what else silence may mean."""
+        identity = self.program.bus.identity
+        if identity is None:
+            return ""
+        return f"; nobody is there, or {do} is not allowed for {identity}"
+
     def _key(self, agent: str, do: str) -> str:
         return self.program.keys.call(agent, self.camera, command=do in COMMANDS)
 
@@ -439,12 +475,12 @@ class Caller:
         if do == "trigger":
             return TriggerTimeoutError(
                 f"{self.name}: the {agent} said nothing within {waited:.3g} s; whether the camera "
-                "was triggered is unknown",
+                f"was triggered is unknown{self._perhaps(do)}",
                 waited=waited,
             )
         return ResponseTimeoutError(
             f"{self.name}: the {agent} said nothing to {do} within {waited:.3g} s; whether it was "
-            "done is unknown",
+            f"done is unknown{self._perhaps(do)}",
             waited=waited,
         )
 

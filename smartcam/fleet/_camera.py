@@ -19,6 +19,7 @@ from smartcam.exceptions import (
     ConnectionLostError,
     LinkError,
     LocalProtocolError,
+    NotAllowedError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
@@ -560,7 +561,7 @@ class FleetCamera(Camera[ValueT]):
         self._switch_in_doubt = self._expected is not None
         try:
             reply = await self._do("switch_application", limit, application=application)
-        except CommandRejectedError:
+        except (CommandRejectedError, NotAllowedError):
             self._switch_in_doubt = False
             raise
         self._expected, self._switch_in_doubt = reply.fields["answer"]["application"], False

@@ -21,6 +21,7 @@ from pydantic import (
 from smartcam._client.interpretation import Interpretation
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.fleet._access_file import Access, access_mistakes
 from smartcam.fleet._address import (
     CHUNK,
     MOST_CHUNKS,
@@ -318,6 +319,12 @@ class FleetFile(Fields):
         None,
         description="folder with ca.pem, cert.pem and key.pem, beside this file; for tls endpoints",
     )
+    access: Access | None = Field(
+        None,
+        description="who may use what listens: roles (of certificates), any-certificate, or "
+        "anyone-may-command, which takes everybody who reaches it; default: roles with tls, else "
+        "whoever is on this computer",
+    )
     history: History = Field(
         History.model_validate({}), description="what is kept of each camera's last results"
     )
@@ -427,6 +434,7 @@ Mistake = tuple["Sequence[int | str]", str]
 
 def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
     """Give what cannot work of a file, and where."""
+    yield from access_mistakes(file.access, file.endpoints[0])
     yield from _of_certificates(file, folder)
     if file.record is not None:
         yield from mistakes_of(file.record, folder)

@@ -319,6 +319,12 @@ class Fleet:
         """Its URL; that of one in this process names no host."""
         return "fleet://" if self._address is None else self._address.url
 
+    @property
+    def warning(self) -> str:
+        """What is to be done about this program's certificate, which ends soon; empty: nothing."""
+        identity = self._program.bus.identity
+        return "" if identity is None else identity.warning
+
     def cameras(self, pattern: str = "**") -> list[FleetCamera[Any]]:
         """Return the cameras that an agent shares now, by name.
 

@@ -159,6 +159,11 @@ class Plain:
             handle.close()
         self.topics.close()
 
+    @property
+    def busy(self) -> bool:
+        """Whether a call is under way."""
+        return bool(self._under_way)
+
     # ------------------------------------------------------------------ questions
 
     def _on_listing(self, question: BusQuestion) -> None:

@@ -115,7 +115,9 @@ class Program:
             keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK)
             meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
             what = f"camera {self._camera}"
-        why = f"no agent there has a {what}: none came within {timeout:g} s{meant}"
+        whose = self.bus.identity
+        seen = "" if whose is None else f"; or {whose} may not see it"
+        why = f"no agent there has a {what}: none came within {timeout:g} s{meant}{seen}"
         raise ConnectFailedError(why, attempts=(why,))
 
     async def close(self) -> None:

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from smartcam._server import Server
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.camera import DEFAULT_MAX_QUEUE
-from smartcam.exceptions import ConfigurationError, ConnectionClosedError
+from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
+from smartcam.fleet._access import access_control
+from smartcam.fleet._access_file import access_mistakes, access_of
 from smartcam.fleet._address import DEFAULT_PORT, FleetAddress
 from smartcam.fleet._agent import Agent
+from smartcam.fleet._certificates import AGENT
 from smartcam.fleet._file import FleetFile, load_fleet
 from smartcam.fleet._frames import FramesOf
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._reload import CameraSource, FleetChanges, Reloader, loaded
 from smartcam.fleet._reload_service import ReloadService
+from smartcam.fleet._renewal import RETRY_AFTER, CertificateWatch
 from smartcam.fleet._ros_file import RosSection
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameAddress
@@ -26,15 +32,19 @@ from smartcam.settings import masked
 from smartcam.streams import Subscribers, Subscription
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from typing import Literal
 
     from smartcam.emulator._wire_camera import WireCamera
+    from smartcam.fleet._access_file import Access
     from smartcam.fleet._bus import Bus
     from smartcam.fleet._file import FramesEntry, Planned
     from smartcam.fleet._host import Host
     from smartcam.fleet._ros import RosFleet
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 OPEN_TIMEOUT = 10.0
 """Seconds for coming to the bus."""
@@ -71,6 +81,8 @@ class FleetServer(Server):
             raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
         self.reloads: Reloader = Reloader(self.folder, now, self._source)
         listen, connect = self.file.endpoints
+        for _, mistake in access_mistakes(self.file.access, listen):
+            raise ConfigurationError(f"fleet {self.file.fleet}: {mistake}")
         self._listen, self._connect = listen, connect = with_ports(listen), connect
         self._bus = bus or ZenohEnd(BusLink(listen, connect, self.file.certificates), self._more())
         self._ros: RosFleet | None = None
@@ -116,11 +128,15 @@ class FleetServer(Server):
             stack.callback(self._forget_hosts)
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
+            self._check_role()
             service = ReloadService(agent, self._bus, Keys(file.fleet), self.reload)
             stack.push_async_callback(self.reloads.close)
             stack.callback(service.close)
-            if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
-                self._ros = await stack.enter_async_context(self._seen_in_ros(self._bus))
+            stack.push_async_callback(self._leave_ros)
+            await self._enter_ros()
+            if self.file.certificates is not None and isinstance(self._bus, ZenohEnd):
+                watching = self._watch_certificates(self._bus, agent)
+                stack.push_async_callback(_end, watching)
             self._agent, self._stack = agent, stack.pop_all()
 
     def _forget_hosts(self) -> None:
@@ -128,11 +144,69 @@ class FleetServer(Server):
 
     def _more(self) -> dict[str, Any]:
         """Return further settings of the engine."""
-        if self.file.ros2 is None:
-            return {}
-        from smartcam.ros2._context import SETTINGS
+        found: dict[str, Any] = {}
+        domain: int | None = None
+        if self.file.ros2 is not None:
+            from smartcam.ros2._context import SETTINGS, RosContext
 
-        return dict(SETTINGS)
+            found |= SETTINGS
+            domain = RosContext(domain=self.file.ros2.domain).domain
+        if self._access == "roles":
+            found["access_control"] = access_control(domain)
+        return found
+
+    @property
+    def _access(self) -> Access | None:
+        return access_of(self.file.access, self._listen)
+
+    def _check_role(self) -> None:
+        """Refuse to guard by roles with a certificate that has none: nobody could use it.
+
+        Raises:
+            ConfigurationError: the certificate has another role, or none.
+        """
+        identity = self._bus.identity
+        if self._access == "roles" and identity is not None and identity.role != AGENT:
+            raise ConfigurationError(
+                f"fleet {self.file.fleet}: access: roles wants a certificate whose common name is "
+                f"{AGENT}, as smartcam fleet certificates makes them; that of "
+                f"{identity.folder} has {identity.role!r:.60}. access: any-certificate takes every "
+                "certificate of its authority"
+            )
+
+    def _watch_certificates(self, bus: ZenohEnd, agent: Agent) -> asyncio.Task[None]:
+        """Take renewed certificates from now on."""
+        watch = CertificateWatch(
+            bus, listens=bool(self._listen), busy=lambda: agent.busy, away=self._away_from_ros
+        )
+        return asyncio.get_running_loop().create_task(
+            watch.run(), name="smartcam.fleet.certificates"
+        )
+
+    async def _enter_ros(self) -> None:
+        if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
+            self._ros = self._seen_in_ros(self._bus)
+            await self._ros.start()
+
+    async def _leave_ros(self) -> None:
+        ros, self._ros = self._ros, None
+        if ros is not None:
+            await ros.stop()
+
+    @contextlib.asynccontextmanager
+    async def _away_from_ros(self) -> AsyncIterator[None]:
+        """Have no nodes for a while: what is said once for all would be lost with the session."""
+        await self._leave_ros()
+        yield
+        while True:
+            try:
+                await self._enter_ros()
+            except SmartCamError as exc:
+                logger.error("ros2 ! %s; it is tried again", exc)  # noqa: TRY400 - the text says it
+                await self._leave_ros()
+                await asyncio.sleep(RETRY_AFTER)
+            else:
+                return
 
     def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
         from smartcam.fleet._ros import RosFleet
@@ -154,7 +228,7 @@ class FleetServer(Server):
 
     async def stop(self) -> None:
         """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
-        self._agent = self._ros = None
+        self._agent = None
         await self._stack.aclose()
         for stream in self._events:
             stream.end(None)
@@ -257,6 +331,16 @@ class FleetServer(Server):
         return self._bus.waiting_bytes
 
     @property
+    def busy(self) -> bool:
+        """Whether a command of a program is under way."""
+        return self._agent is not None and self._agent.busy
+
+    @property
+    def warning(self) -> str:
+        """What is to be done about its certificate, which ends soon; empty: nothing."""
+        return "" if self._bus.identity is None else self._bus.identity.warning
+
+    @property
     def name(self) -> str:
         """The agent's name."""
         return "" if self._agent is None else self._agent.name
@@ -298,6 +382,11 @@ async def _end_emulators(sources: dict[str, CameraSource]) -> None:
         await source.emulator.aclose()
 
 
+async def _end(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.wait({task})
+
+
 def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
     """Return the address of a fleet by an endpoint such as ``tcp/127.0.0.1:7447``."""
     kind, _, place = endpoint.partition("/")
@@ -307,7 +396,9 @@ def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
         host = "127.0.0.1"
     scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
     number = int(port) if port.isdecimal() else DEFAULT_PORT
-    certificates = file.certificates if scheme == "fleet+tls" else None
+    # where there are roles each program has a certificate of its own: the agent's commands nothing
+    own = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if own else None
     # a router that others stand around may have several fleets
     name = None if file.endpoints[0] else file.fleet
     return FleetAddress(scheme, host, number, name, "", certificates)

@@ -13,22 +13,28 @@ import contextlib
 import functools
 import logging
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from smartcam._zenoh import (
     MOST_WAITING,
+    NOT_ZENOH,
     BusLink,
     ZenohDeclared,
     ZenohSession,
     direct,
     quietly,
 )
+from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._bus import Bus, BusQuestion, Handle, Publisher
+from smartcam.fleet._certificates import LOOK, read_identity, shake_hands
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from typing import Self
 
     from smartcam.fleet._bus import Data
+    from smartcam.fleet._certificates import Identity
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
@@ -54,6 +60,8 @@ class ZenohEnd(ZenohSession, Bus):
 
     def __init__(self, link: BusLink, more: Mapping[str, Any] | None = None) -> None:
         super().__init__(link, more)
+        self._warned: tuple[bytes, int] | None = None
+        self._looking: asyncio.Task[None] | None = None
         self._sender: ThreadPoolExecutor | None = None
         self._sending = 0
         self._behind: collections.Counter[str] = collections.Counter()
@@ -76,6 +84,87 @@ class ZenohEnd(ZenohSession, Bus):
     def _threads(self) -> list[ThreadPoolExecutor]:
         sender, self._sender = self._sender, None
         return super()._threads() + ([] if sender is None else [sender])
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus.
+
+        Raises:
+            ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds; the
+                text says what is wrong with a certificate.
+            ConfigurationError: the certificates cannot work.
+        """
+        folder = self._link.certificates
+        if folder is None:
+            return await self._open_plain(timeout)
+        loop = asyncio.get_running_loop()
+        end = loop.time() + timeout
+        await self.look_at_certificates()
+        try:
+            await super().open(timeout - min(LOOK, timeout / 3))  # to find out why not
+        except ConnectFailedError as exc:
+            if self._link.listen:
+                raise
+            if why := await self._why_refused(Path(folder), end - loop.time()):
+                raise self._failed(why) from exc
+            raise
+        self._looking = loop.create_task(self._look_now_and_then(), name="smartcam.fleet.look")
+        return self
+
+    async def _open_plain(self, timeout: float) -> Self:
+        try:
+            return await super().open(timeout)
+        except ConnectFailedError as exc:
+            if exc.attempts[0] != NOT_ZENOH:
+                raise
+            text = f"{exc}, or it wants TLS and a certificate: fleet+tls://"
+            raise ConnectFailedError(text, attempts=exc.attempts) from exc
+
+    async def close(self) -> None:
+        """Leave the bus; what was declared is gone with it. Idempotent."""
+        looking, self._looking = self._looking, None
+        if looking is not None:
+            looking.cancel()
+        await super().close()
+
+    async def look_at_certificates(self) -> Identity:
+        """Read whose its certificates are, as they are now; warn if they end soon, also later.
+
+        Raises:
+            ConnectFailedError: they have expired.
+            ConfigurationError: they cannot work.
+        """
+        folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
+        identity = await loop.run_in_executor(None, read_identity, folder)
+        if identity.expired:
+            raise self._failed(identity.expired)
+        said = identity.digest, identity.urgency
+        if identity.urgency and said != self._warned:
+            logger.warning("%s ! %s", self._link.place, identity.warning)
+        self._warned, self.identity = said, identity
+        return identity
+
+    async def _look_now_and_then(self) -> None:
+        """Warn of certificates that end soon, as long as it is open."""
+        while self.identity is not None:
+            await asyncio.sleep(self.identity.look_after)
+            try:
+                await self.look_at_certificates()
+            except SmartCamError as exc:
+                logger.error("%s ! %s", self._link.place, exc)  # noqa: TRY400 - the text says it
+
+    async def _why_refused(self, folder: Path, left: float) -> str:
+        """Return what one endpoint has against a handshake; empty where none has anything."""
+        each = max(0.0, min(LOOK, left / len(self._link.connect)))
+        for endpoint in self._link.connect:
+            kind, _, place = endpoint.partition("/")
+            host, _, port = place.rpartition(":")
+            if kind == "tls":
+                found = await shake_hands(host.strip("[]"), int(port), folder, each)
+                if found.trouble:
+                    return found.trouble
+        return ""
 
     # ------------------------------------------------------------------ what is said
 
@@ -227,10 +316,23 @@ class ZenohEnd(ZenohSession, Bus):
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         put = self._zenoh.SampleKind.PUT
 
-        def on_sample(sample: Any) -> None:
-            self.in_loop(declared.call, 0, see, str(sample.key_expr), sample.kind == put)
+        there: dict[str, None] = {}
 
-        declared = _OnBus(self)
+        def on_presence(key: str, present: bool) -> None:
+            if present:
+                there[key] = None
+            else:
+                there.pop(key, None)
+            see(key, present)
+
+        def lost() -> None:  # who has gone when there is a new session is not told of then
+            for key in [*there]:
+                on_presence(key, False)
+
+        def on_sample(sample: Any) -> None:
+            self.in_loop(declared.call, 0, on_presence, str(sample.key_expr), sample.kind == put)
+
+        declared = _OnBus(self).when_lost(lost)
         return declared.of(
             lambda session: session.liveliness().declare_subscriber(
                 pattern, direct(on_sample), history=True
@@ -241,7 +343,8 @@ class ZenohEnd(ZenohSession, Bus):
 
     def publish(self, publisher: Any, payload: bytes) -> None:
         """Have a publisher say something."""
-        quietly(publisher.put, payload)
+        if publisher is not None:  # else its session is about to be there
+            quietly(publisher.put, payload)
 
 
 class _OnBus(ZenohDeclared, Handle):
@@ -273,9 +376,13 @@ class _ZenohPublisher(Publisher):
         self._declared.of(lambda session: self._declare(declare(session), on_matching))
 
     def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
-        self._publisher = publisher
+        again, self._publisher = self._publisher is not None, publisher
         publisher.declare_matching_listener(direct(on_matching))
-        self._heard = publisher.matching_status.matching
+        heard = bool(publisher.matching_status.matching)
+        if again:
+            self._end.later(self._declared.call, self._on_heard, heard)
+        else:
+            self._heard = heard
         return publisher
 
     def _on_heard(self, heard: bool) -> None:

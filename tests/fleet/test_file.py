@@ -100,8 +100,8 @@ CAMERAS = "cameras: {a: {emulated: {}}}\n"
 @pytest.mark.parametrize(
     ("text", "listen", "connect"),
     [
-        ("listen: tcp/0.0.0.0:7447", ("tcp/0.0.0.0:7447",), ()),
-        ("listen: ['tcp/[::1]:0', tcp/plant-server:1]", ("tcp/[::1]:0", "tcp/plant-server:1"), ()),
+        ("listen: tcp/0.0.0.0:7447\naccess: anyone-may-command", ("tcp/0.0.0.0:7447",), ()),
+        ("listen: ['tcp/[::1]:0', tcp/localhost:1]", ("tcp/[::1]:0", "tcp/localhost:1"), ()),
         ("connect: tcp/plant-server.example:7447", (), ("tcp/plant-server.example:7447",)),
         ("listen: []", ("tcp/127.0.0.1:7447",), ()),
     ],

@@ -37,6 +37,7 @@ MOST_PACKETS = 10_000
 
 FLEET = f"""\
 listen: tcp/{AGENT}:{PORT}
+access: anyone-may-command
 history: {{{{results: {{results}}}}}}
 cameras:
   fast: {{{{emulated: {{{{}}}}, application: 7}}}}

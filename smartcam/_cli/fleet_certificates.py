@@ -1,0 +1,91 @@
+"""``smartcam fleet certificates``: who may what in a fleet."""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.running import JsonErrors
+from smartcam._cli.texts import table_text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.fleet._authority import MadeCertificate
+F = TypeVar("F", bound="Callable[..., Any]")
+
+
+def _names(option: str, variable: str, text: str) -> Callable[[F], F]:
+    """Return an option with any number of names."""
+    return click.option(option, variable, multiple=True, metavar="NAME", help=text)
+
+
+@click.command(
+    cls=JsonErrors,
+    help="Make certificates for a fleet over TLS, each with a role: agents share cameras, viewers "
+    "look, operators command, too, and a router of Zenoh's passes on. DIR gets an authority the "
+    "first time, whose key stays there, and a folder for each name, with a text how to use it. "
+    "Run it again to add names, and to renew what ends within 30 days; all else stays as it is. "
+    'Needs the extra "fleet".',
+)
+@click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
+@_names("--agent", "agents", "An agent, by its name in fleet.yaml.")
+@_names("--viewer", "viewers", "A program that may look.")
+@_names("--operator", "operators", "A program that may command, too.")
+@_names("--router", "routers", "A router of Zenoh's, zenohd.")
+@click.option(
+    "--host",
+    "hosts",
+    multiple=True,
+    metavar="HOST",
+    help="Name or address by which programs reach the agents and routers named here; default: this "
+    "computer's name. localhost is always one.",
+)
+@click.option(
+    "--days",
+    type=click.FloatRange(min=0, min_open=True, max=36_500),
+    default=365.0,
+    show_default=True,
+    help="How long new certificates are good for.",
+)
+@runs(*OUTPUT)
+async def certificates(
+    folder: Path,
+    agents: tuple[str, ...],
+    viewers: tuple[str, ...],
+    operators: tuple[str, ...],
+    routers: tuple[str, ...],
+    hosts: tuple[str, ...],
+    days: float,
+    options: Options,
+) -> None:
+    """Make certificates."""
+    from smartcam.fleet._authority import make_certificates
+
+    wanted = {"agent": agents, "viewer": viewers, "operator": operators, "router": routers}
+    made = await asyncio.to_thread(
+        make_certificates, folder, wanted, hosts=hosts, lifetime=timedelta(days=days)
+    )
+    if options.as_json:
+        for one in made:
+            options.show(one._asdict(), "")
+        return
+    if not made:
+        click.echo(f"{folder} has an authority, and no certificates yet: --agent, --viewer, ...")
+        return
+    head = ("name", "role", "", "until", "how to use it")
+    click.echo(table_text(head, [_row(one) for one in made]))
+
+
+def _row(made: MadeCertificate) -> tuple[str, ...]:
+    until = (
+        f"{made.ends:%Y-%m-%d}"
+        if made.ends - datetime.now(UTC) > timedelta(days=2)
+        else (f"{made.ends:%Y-%m-%d %H:%M} UTC")
+    )
+    return made.name, made.role, made.done, until, f"{made.folder}/how-to-use.txt"

@@ -1,0 +1,54 @@
+"""What a fleet file says of who may use the bus, and what of that cannot work."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+Access = Literal["roles", "any-certificate", "anyone-may-command"]
+
+ANYONE: Access = "anyone-may-command"
+
+CURE = "smartcam fleet certificates makes certificates: then listen: tls/..., certificates: DIR"
+
+Mistake = tuple[tuple[str, ...], str]
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer reaches what listens there."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def access_of(said: Access | None, listen: Sequence[str]) -> Access | None:
+    """Return what counts: with TLS roles, for else every certificate could command."""
+    tls = any(one.startswith("tls/") for one in listen)
+    return said or ("roles" if tls else None)
+
+
+def access_mistakes(said: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
+    """Give what cannot work."""
+    plain = [one for one in listen if not one.startswith("tls/")]
+    open_to_all = [one for one in plain if not is_loopback(one[4:].rpartition(":")[0])]
+    access = access_of(said, listen)
+    if access == "roles" and plain:
+        yield (
+            ("listen",),
+            f"{plain[0]} asks for no certificate, so nobody there has a role: expected tls/ "
+            "endpoints alone, or access: any-certificate beside them",
+        )
+    elif access != ANYONE and open_to_all:
+        yield (
+            ("listen",),
+            f"{open_to_all[0]} takes everybody who reaches it, without a certificate, and who is "
+            f"in may command the cameras. {CURE}. Or say that you want it so: access: {ANYONE}",
+        )
+    elif said in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
+        yield ("access",), f"{said} wants listen: tls/... and certificates"
