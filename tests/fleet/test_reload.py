@@ -179,7 +179,7 @@ WRONG = {
     ),
     "another agent": ("agent: a2\ncameras: {one: {url: 'bvs://h'}}", "agent: it was changed"),
     "another place": (
-        "agent: a1\nlisten: tcp/h:1\ncameras: {one: {url: 'bvs://h'}}",
+        "agent: a1\nlisten: tcp/127.0.0.1:1\ncameras: {one: {url: 'bvs://h'}}",
         "listen: it was changed",
     ),
     "another bound": (
