@@ -21,7 +21,6 @@ from smartcam.recording._form import (
     EPOCH,
     FILE_METADATA,
     FORMAT,
-    GAP,
     KINDS,
     MAX_CAMERAS,
     RecordedError,
@@ -148,7 +147,7 @@ class Recording:
     def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
         """Yield what a replay wants: also what is before ``since``, and what a camera was.
 
-        Where the rest of a file could not be read, and another one follows, there is a gap.
+        Where the rest of a file could not be read it is not known what the camera was then.
         """
         for path in self._files_of(camera):
             scan, last = _Scan(path), None
@@ -166,7 +165,7 @@ class Recording:
                 scan.remark = str(exc)
             if scan.remark and path != self.path and last is not None:
                 name, at = last
-                yield RecordedError(name, at, GAP, scan.remark, None)
+                yield RecordedState(name, at=at)
 
     def _files_of(self, camera: str | None) -> Iterator[Path]:
         for path in self.files:

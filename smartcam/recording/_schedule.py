@@ -245,6 +245,7 @@ class _Seams:
             self._whole = True
             return []
         if not item.connected:
+            self._whole = False
             return [_ReplayStep(at, _What.LOST)]
         if self._whole:
             return []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import shutil
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -77,7 +78,7 @@ def test_folder_goes_on_after_a_kill_and_is_played_as_a_fleet(tmp_path: Path) ->
 
 def _until_written(path: Path, count: int) -> None:
     while load_recording(path).counts.results < count:
-        pass
+        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -143,11 +144,12 @@ def test_from_and_until_choose_what_is_played(folder: Path) -> None:
     run("replay", str(folder), *late).failed(2, "no recordings of a fleet are in this folder")
 
 
+@pytest.mark.long
 def test_serve_says_where_it_cannot_record_and_goes_on(tmp_path: Path) -> None:
     with emulators(tmp_path, (), (), ()) as urls, serving(tmp_path, urls) as agent:
         shown = agent.read_until(b"\n", count=3).split()
         while not files(tmp_path, "line1/text"):
-            pass
+            time.sleep(0.02)
         shutil.rmtree(tmp_path / "rec")
         run("trigger", shown[1], "--count", "2").done()
         said = agent.read_until(b"until it is better", stream="stderr")

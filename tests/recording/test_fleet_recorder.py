@@ -22,7 +22,7 @@ import pytest
 from smartcam._client.triggering import TriggerRequest
 from smartcam.exceptions import ConfigurationError, NotRunningError, RecordingError
 from smartcam.fleet._shared import Carrier
-from smartcam.models import Status
+from smartcam.models import ApplicationChanged, Connected, Status, StatusChanged
 from smartcam.recording import FleetRecorder, Recorder, load_recording
 from smartcam.recording import _folder_files as folder_files
 from smartcam.recording import _folder_writer as folder_writer
@@ -44,7 +44,7 @@ from tests.recording.folderkit import (
     server,
     until,
 )
-from tests.recording.recordingkit import at, frame
+from tests.recording.recordingkit import URL, at, container, frame, session
 
 pytestmark = pytest.mark.real_time
 
@@ -172,6 +172,34 @@ def test_names_sort_also_where_the_clock_goes_back(tmp_path: Path) -> None:
     assert [name_of(path).at - at(100) for path in files(tmp_path)] == [
         timedelta(milliseconds=place) for place in range(4)
     ]
+
+
+def test_trigger_behind_which_a_file_is_damaged_gets_no_others_result(tmp_path: Path) -> None:
+    mcap = importlib.import_module("mcap.writer")
+    folder = RecordingFolder(tmp_path / "rec")
+    writer = FolderFiles(folder, Limits(1e9, 1e9, 1e9), mcap, lambda: 0.0)
+    writer.enter()
+    track = CameraTrack(NAME, lambda given: iter([given]))
+
+    def write(*items: Any) -> None:
+        writer.write(track, [item._replace(camera=NAME) for item in items])
+
+    writer.write(track, [Connected(camera=NAME, at=at(0), url=URL)])
+    writer.write(track, [ApplicationChanged(camera=NAME, at=at(0), application=5, previous=None)])
+    waits = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+    writer.write(track, [StatusChanged(camera=NAME, at=at(0), status=waits, previous=None)])
+    write(*session()[:4], frame(1, "> Trigger"), container(1.5, b"one"), frame(2, "> Trigger"))
+    first = files(tmp_path)[0]
+    size = first.stat().st_size
+    write(container(2.5, b"lost"))
+    writer.finish(track)
+    write(container(3, b"by itself"), frame(4, "> Trigger"), container(4.25, b"two"))
+    writer.finish(track)
+    folder.leave()
+    os.truncate(first, size)
+    app = plan_replay(load_recording(tmp_path / "rec")).applications[5]
+    assert [take.containers for take in app.triggered] == [[b"one"], [b"two"]]
+    assert [take.containers for take in app.unasked] == [[b"by itself"]]
 
 
 # ---------------------------------------------------------------------- the bound on the disk
