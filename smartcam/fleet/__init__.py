@@ -30,12 +30,14 @@ if TYPE_CHECKING:
     from smartcam.fleet._frame_wire import FleetFrame
     from smartcam.fleet._opening import open, serve
     from smartcam.fleet._server import FleetServer
+    from smartcam.fleet._summary import CameraSummary
 
 __all__ = [
     "AgentJoined",
     "AgentLeft",
     "CameraJoined",
     "CameraLeft",
+    "CameraSummary",
     "Fleet",
     "FleetCamera",
     "FleetEvent",
@@ -59,5 +61,6 @@ if not TYPE_CHECKING:
             "_frame_wire": "FleetFrame",
             "_opening": "open serve",
             "_server": "FleetServer",
+            "_summary": "CameraSummary",
         },
     )

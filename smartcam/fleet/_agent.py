@@ -20,6 +20,7 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
+from smartcam.fleet._bundle import Bundle
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
 from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._frame_encoding import FrameEncoder
@@ -29,6 +30,7 @@ from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._plain import Plain
 from smartcam.fleet._shared import Owner
+from smartcam.fleet._summary import Summaries
 from smartcam.fleet._wire import (
     BusMessage,
     TriggerOrder,
@@ -140,6 +142,9 @@ class Agent:
         self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
         self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
         self._plain = Plain(self, keys, bus)
+        self._summaries = Summaries(self, keys, bus)
+        self._bundle = Bundle(name, self.epoch, keys, bus)
+        self.stands_by = False
 
     # ------------------------------------------------------------------ life
 
@@ -158,6 +163,8 @@ class Agent:
                 key = keys.call(self.name, "**", command=command)
                 declared.append(bus.subscribe(key, self._hears(command)))
             self._plain.open()
+            self._summaries.open()
+            self._bundle.open()
             declared.append(bus.be_present(keys.agent(self.name)))
             for name, settings in self._cameras.items():
                 self.share(name, settings)
@@ -173,6 +180,7 @@ class Agent:
         """
         declared, self._declared = self._declared, []
         self._plain.close()
+        self._summaries.close()
         for handle in (*declared, *(token for token, _ in self._shared.values())):
             handle.close()
         for program in [*self._programs]:
@@ -185,6 +193,7 @@ class Agent:
             await asyncio.gather(*closing, return_exceptions=True)
             await self._encoder.close()
         finally:
+            self._bundle.close()
             self._sender.close()
             await self._bus.close()
 
@@ -198,7 +207,10 @@ class Agent:
         found = self._frames.get(name, NO_FRAMES)
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
         events = self._on_event
-        host = Host(name, settings, bus, keys, self.epoch, self._history, events, topics, frames)
+        history, bundle = self._history, self._bundle
+        host = Host(
+            name, settings, bus, keys, self.epoch, history, events, topics, frames, bundle
+        )
         host.numbers = self._numbers_at.pop(name, host.numbers)
         self.hosts[name] = host
         running = self.begin(host.run(), f"smartcam.fleet.{name}")

@@ -110,6 +110,7 @@ class FleetCamera(Camera[ValueT]):
             lambda: None if self._switch_in_doubt else self._expected,
         )
         self._opened = False
+        self.opening: asyncio.Task[None] | None = None  # whoever made it waits for its agent
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
         self._trying = True  # the agent has not done with the first try
@@ -515,12 +516,21 @@ class FleetCamera(Camera[ValueT]):
         """Have the agent do something; what it said before its reply is taken first."""
         limit = self.settings.request_timeout if timeout is None else timeout
         deadline = self._deadline(limit)
+        await self._met_first(deadline)
         self._require_session()
         reply = await self._caller.call(do, deadline, arguments, blobs, call, limit)
         states, results = reply.fields.get("states"), reply.fields.get("results")
         if isinstance(states, int) and isinstance(results, int):
             await self._reach(states, results, deadline)
         return reply
+
+    async def _met_first(self, deadline: float) -> None:
+        """Wait for an agent that was not met yet; bounded."""
+        opening = self.opening
+        if opening is not None:
+            await asyncio.wait({opening}, timeout=deadline - asyncio.get_running_loop().time())
+            if opening.done():
+                self.opening = None
 
     async def _reach(self, states: int, results: int, deadline: float) -> None:
         """Wait for what the agent has said before its reply."""
@@ -536,6 +546,7 @@ class FleetCamera(Camera[ValueT]):
             timeout = await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
         deadline = self._deadline(timeout)
+        await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
         own = receiver.own[number] = Own(request.interpretation, expected)

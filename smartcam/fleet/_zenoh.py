@@ -77,6 +77,13 @@ class ZenohEnd(ZenohSession, Bus):
         sender, self._sender = self._sender, None
         return super()._threads() + ([] if sender is None else [sender])
 
+    @property
+    def reached(self) -> bool:
+        session = self._session
+        if session is None:
+            return False
+        return bool(self._link.listen or session.info.routers_zid())
+
     # ------------------------------------------------------------------ what is said
 
     def put(self, key: str, payload: bytes) -> None:
