@@ -31,10 +31,11 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
 RUNTIME = (
-    "(rx:(handover:app),acc:(handover:app),tx:(handover:app),net:(handover:app),"
+    "(rx:(handover:app),acc:(handover:app),tx:(worker_threads:1),net:(handover:app),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: one for everything, which halves the CPU time of a call; its callbacks here only
+"""Zenoh's threads: one for everything but what is sent, which halves the CPU time of a call: a router
+that passes on more than there is room for would wait for itself. Its callbacks here only
 put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
@@ -97,7 +98,7 @@ class BusLink:
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
             "transport/unicast/open_timeout": max(1, int(1e3 * timeout)),
         }
-        for queue in ("data", "interactive_high", "data_low"):
+        for queue in ("control", "data", "interactive_high", "data_low"):
             found[f"transport/link/tx/queue/size/{queue}"] = 16
         if self.certificates is not None:
             tls = f"{self.certificates.rstrip('/')}/"
