@@ -22,6 +22,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet._bundle import Bundle
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
+from smartcam.fleet._claims import Claims
 from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._frame_encoding import FrameEncoder
 from smartcam.fleet._frame_sender import FrameSender
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.fleet._frames import FramesOf
     from smartcam.fleet._keys import Keys
+    from smartcam.fleet._standby_file import Standby
     from smartcam.models import CameraEvent
     from smartcam.settings import CameraSettings
 
@@ -114,6 +116,7 @@ class Agent:
         history: results that are kept for each camera, and their bytes.
         on_event: is told what happens to the cameras.
         frames: where the frames of each camera come from that has any, by the camera's name.
+        standby: how it stands by for cameras that others have; None: it does not.
     """
 
     def __init__(
@@ -126,6 +129,7 @@ class Agent:
         history: tuple[int, int] = (10_000, 1 << 24),
         on_event: Callable[[CameraEvent], None] = lambda _: None,
         frames: Mapping[str, FramesOf] | None = None,
+        standby: Standby | None = None,
     ) -> None:
         self.name = name
         self._frames = dict(frames or {})
@@ -144,7 +148,8 @@ class Agent:
         self._plain = Plain(self, keys, bus)
         self._summaries = Summaries(self, keys, bus)
         self._bundle = Bundle(name, self.epoch, keys, bus)
-        self.stands_by = False
+        self.stands_by: bool = standby is not None
+        self._claims = Claims(self, keys, bus, standby)
 
     # ------------------------------------------------------------------ life
 
@@ -153,7 +158,8 @@ class Agent:
 
         Raises:
             ConnectFailedError: there is no bus within ``timeout`` seconds.
-            ConfigurationError: an option of a camera cannot work.
+            ConfigurationError: an option of a camera cannot work, or another agent has it and
+                neither stands by.
         """
         await self._bus.open(timeout)
         keys, bus, declared = self._keys, self._bus, self._declared
@@ -166,8 +172,7 @@ class Agent:
             self._summaries.open()
             self._bundle.open()
             declared.append(bus.be_present(keys.agent(self.name)))
-            for name, settings in self._cameras.items():
-                self.share(name, settings)
+            await self._claims.open(self._cameras, timeout)
         except BaseException:
             await self.close()
             raise
@@ -179,6 +184,7 @@ class Agent:
         Cancellation: the sessions' links are dropped at once; the bus is left nevertheless.
         """
         declared, self._declared = self._declared, []
+        self._claims.close()
         self._plain.close()
         self._summaries.close()
         for handle in (*declared, *(token for token, _ in self._shared.values())):
@@ -206,12 +212,13 @@ class Agent:
         bus, keys, topics = self._bus, self._keys, self._plain.topics
         found = self._frames.get(name, NO_FRAMES)
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
-        events = self._on_event
+        events = self._on_camera_event
         history, bundle = self._history, self._bundle
         host = Host(
             name, settings, bus, keys, self.epoch, history, events, topics, frames, bundle
         )
         host.numbers = self._numbers_at.pop(name, host.numbers)
+        host.began, host.final = host.results.following, not self.stands_by
         self.hosts[name] = host
         running = self.begin(host.run(), f"smartcam.fleet.{name}")
         self._shared[name] = bus.be_present(keys.camera(self.name, name)), running
@@ -228,6 +235,10 @@ class Agent:
         self._numbers_at[name] = host.numbers
         if len(self._numbers_at) > KNOWN_CAMERAS:
             del self._numbers_at[next(iter(self._numbers_at))]
+
+    def _on_camera_event(self, event: CameraEvent) -> None:
+        self._claims.on_event(event)
+        self._on_event(event)
 
     async def wait_tried(self) -> None:
         """Wait until each camera was tried once, well or not; bounded."""

@@ -359,6 +359,7 @@ class FleetCamera(Camera[ValueT]):
 
     def _lose(self, error: LinkError, reason: str, *, expected: bool = False) -> None:
         self._trouble = error
+        self._caller.unlink()
         if not self._linked:
             self._stir(error)
             return
@@ -433,6 +434,7 @@ class FleetCamera(Camera[ValueT]):
 
     def _begin_session(self, said: dict[str, Any], at: datetime) -> None:
         self._linked, self._trouble = True, None
+        self._caller.linked = True
         self._about |= said.get("about", {})
         self._counters.begin(self._wire if not self._sessions else Counters())
         self._sessions += 1

@@ -30,6 +30,7 @@ from smartcam.fleet._address import (
     missing_certificates,
 )
 from smartcam.fleet._ros_file import Fields, RosCamera, RosSection, node_names
+from smartcam.fleet._standby_file import Standby, standby_of
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address
 
@@ -114,6 +115,10 @@ def _never(given: object) -> object:
 
 def _or_false(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"const": False})
+
+
+def _or_bool(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"type": "boolean"})
 
 
 class Emulated(Fields):
@@ -321,6 +326,12 @@ class FleetFile(Fields):
     )
     ros2: RosSection | None = Field(
         None, description="have the cameras seen in ROS 2; {} is enough"
+    )
+    standby: Annotated[Standby | None, BeforeValidator(standby_of)] = Field(
+        None,
+        description="stand by for cameras that another agent has, and take over when it is gone: "
+        "true, or a mapping with more",
+        json_schema_extra=_or_bool,
     )
     cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
         description="by name, such as line1/cam3; emulated ones at a name that ends in /**",

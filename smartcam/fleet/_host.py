@@ -78,6 +78,7 @@ class Host:
     Attributes:
         epoch: of the agent, or of this time that it has the camera.
         began: the number of the first result since then.
+        final: no other agent takes the camera over when there will be no session any more.
         gate: whose commands may pass.
         results: the last results.
         states: the last things that happened.
@@ -110,6 +111,7 @@ class Host:
         self.failure: SmartCamError | None = None
         self.epoch: int = epoch
         self.began: int = 1
+        self.final: bool = True
         self._tell, self._bundle = on_event, bundle
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self.topics: CameraTopics = CameraTopics(self, topics)
@@ -269,7 +271,7 @@ class Host:
         if not self._opened.is_set():
             fields["trying"] = True
         elif trouble is not None:
-            fields |= {"error": to_fields(trouble), "over": self._over}
+            fields |= {"error": to_fields(trouble), "over": self._over and self.final}
         return fields
 
     def known(self) -> tuple[bool, int | None, int | None, str | None]:

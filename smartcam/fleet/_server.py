@@ -98,6 +98,7 @@ class FleetServer(Server):
                 history=history,
                 on_event=self._tell,
                 frames=frames,
+                standby=file.standby,
             )
             stack.push_async_callback(agent.close)
             await agent.open(OPEN_TIMEOUT)
