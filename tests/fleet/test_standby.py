@@ -11,7 +11,12 @@ from typing import Any
 import pytest
 
 from smartcam import Backoff
-from smartcam.exceptions import ConfigurationError, LinkError, SmartCamError
+from smartcam.exceptions import (
+    ConfigurationError,
+    LinkError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import MemoryBus, MemoryEnd
 from smartcam.fleet._camera import FleetCamera
@@ -101,16 +106,16 @@ class Work:
             token += 1
             try:
                 result = await self.camera.trigger(
-                    application=2, input_data=token.to_bytes(4, "little"), timeout=2.0
+                    2, input=token.to_bytes(4, "little"), timeout=2.0
                 )
-                self.outcomes[token] = result.value["token"]
+                self.outcomes[token] = result.value.token
             except SmartCamError as error:
                 self.outcomes[token] = error
                 await asyncio.sleep(0.02)
 
     async def take(self) -> None:
         async for result in self.stream:
-            self.streamed.append(result.value["run"])
+            self.streamed.append(result.value.run)
 
     @contextlib.asynccontextmanager
     async def going_on(self) -> AsyncIterator[None]:
@@ -142,7 +147,7 @@ class Work:
             if isinstance(outcome, int):
                 assert outcome == token
             else:
-                assert isinstance(outcome, LinkError), outcome
+                assert isinstance(outcome, (LinkError, TriggerTimeoutError)), outcome
         times = Counter(box.inputs.values())
         assert max(times.values()) == 1, times  # no trigger was sent again
         assert self.streamed == sorted(set(self.streamed))
