@@ -223,6 +223,28 @@ async def test_agent_that_has_it_again_goes_on_with_its_numbers() -> None:
             await work.some()
 
 
+async def test_program_that_comes_later_misses_nothing_of_before() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        async with pair.program() as camera:
+            for _ in range(3):
+                await camera.trigger(timeout=PATIENCE)
+        pair.ends["north"].detach()
+        await until(lambda: pair.having() == ["south"])
+        pair.ends["north"].attach()
+        await until(lambda: pair.sharing() == ["south"])
+        async with pair.program() as camera, camera.results() as results:
+            first = await camera.trigger(timeout=PATIENCE)
+            await pair.agents.pop("south").close()
+            await until(lambda: pair.having() == ["north"] and camera.connected)
+            second = await camera.trigger(timeout=PATIENCE)
+            assert [await anext(results), await anext(results)] == [first, second]
+            assert second.number == 4  # of north's
+            account = results.statistics()
+            assert (account.taken, account.missed) == (2, 0)
+
+
 async def test_of_several_the_preferred_one_takes_over() -> None:
     async with Pair() as pair:
         await pair.start("north")
