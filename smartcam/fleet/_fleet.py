@@ -21,7 +21,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
     SmartCamError,
 )
-from smartcam.fleet._address import FleetAddress, check_pattern
+from smartcam.fleet._address import FleetAddress, check_name, check_pattern
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._exchange import Exchange
 from smartcam.fleet._keys import meets
@@ -363,6 +363,15 @@ class Fleet:
         check_pattern(pattern)
         there = self._agents.items()
         return sorted(name for name, agents in there if agents and meets(pattern, name))
+
+    def url_of(self, name: str) -> str:
+        """Return the URL of a camera, by which :func:`smartcam.connect` has it alone.
+
+        Raises:
+            ConfigurationError: the name cannot be one.
+        """
+        url: str = self._address_of(check_name(name)).url
+        return url
 
     def _known(self, name: str) -> FleetCamera[Any]:
         """Return a camera; of a large fleet it is met now, if it was not before."""
