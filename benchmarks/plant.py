@@ -86,8 +86,8 @@ def run(plan: Plan) -> Iterable[Comparison | Curve]:
     )
     if sys.platform == "linux":
         yield _memory(rows["memory"], sizes[-1] // agents)
-    lines = {
-        side: [(size, Series("", "us", one[what]).median) for size, one in found.items()]
+    lines: dict[str, list[tuple[float, float]]] = {
+        side: [(float(size), Series("", "us", one[what]).median) for size, one in found.items()]
         for side, what in (("program", "here"), ("agent", "there"))
     }
     yield Curve("plant", "A result of a plant", "cameras", "us of CPU time a result", lines)

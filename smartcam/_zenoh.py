@@ -34,9 +34,9 @@ RUNTIME = (
     "(rx:(handover:app),acc:(handover:app),tx:(worker_threads:1),net:(handover:app),"
     "app:(worker_threads:1))"
 )
-"""Zenoh's threads: one for everything but what is sent, which halves the CPU time of a call: a router
-that passes on more than there is room for would wait for itself. Its callbacks here only
-put what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
+"""Zenoh's threads: one for everything, which halves the CPU time of a call, but what is sent: a
+router that passes on more than there is room for would wait for itself. Its callbacks here only put
+what comes into a queue. The variable ZENOH_RUNTIME goes before it."""
 
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""

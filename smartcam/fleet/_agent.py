@@ -214,9 +214,7 @@ class Agent:
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
         events = self._on_camera_event
         history, bundle = self._history, self._bundle
-        host = Host(
-            name, settings, bus, keys, self.epoch, history, events, topics, frames, bundle
-        )
+        host = Host(name, settings, bus, keys, self.epoch, history, events, topics, frames, bundle)
         host.numbers = self._numbers_at.pop(name, host.numbers)
         host.began, host.final = host.results.following, not self.stands_by
         self.hosts[name] = host

@@ -188,11 +188,11 @@ class Claims:
             told = await ask_cameras(self._bus, self._keys, other, name, ASK)
             if host.connected or agent.hosts.get(name) is not host:
                 return
-            if other in self._others.get(name, ()) and told:
-                # of two that have no session the first one by name goes on trying
-                if told[0].summary.connected or other < agent.name:
-                    await self._give_up(name, other)
-                    return
+            # of two that have no session the first one by name goes on trying
+            yields = bool(told) and (told[0].summary.connected or other < agent.name)
+            if yields and other in self._others.get(name, ()):
+                await self._give_up(name, other)
+                return
             await asyncio.sleep(ASK)
 
     async def _give_up(self, name: str, other: str) -> None:

@@ -281,7 +281,8 @@ class Host:
             status: int | None = int(camera.status)
         except SmartCamError:
             status = None
-        return trouble is None, status, camera.active_application, trouble and str(trouble)
+        why = None if trouble is None else str(trouble)
+        return trouble is None, status, camera.active_application, why
 
     def about(self) -> dict[str, Any]:
         """Return what else there is to know of it, the same for a whole session."""

@@ -2,7 +2,8 @@
 
 ``python -m tests.fleet.partner agent PLACE CAMERA_URL``, or ``... holder FLEET_URL``, or ``...
 viewer FLEET_URL``, or ``... standby PLACE CAMERA_URL NAME``: an agent that connects to a router,
-and stands by for a camera that another one has. It says when it is ready, and goes on until its end.
+and stands by for a camera that another one has. It says when it is ready, and goes on until its
+end.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ async def _agent(place: str, url: str) -> None:
 async def _standby(place: str, url: str, name: str) -> None:
     settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
     end = ZenohEnd(BusLink(connect=(place,)))
-    agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=Standby())
+    agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=Standby.model_validate({}))
     await agent.open(PATIENCE)
     await agent.wait_tried()
     await _ready()

@@ -23,7 +23,6 @@ from smartcam.exceptions import (
     LocalProtocolError,
     NotRunningError,
     ResponseTimeoutError,
-    SmartCamError,
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
