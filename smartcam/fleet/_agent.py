@@ -20,7 +20,7 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
-from smartcam.fleet._bundle import Bundle
+from smartcam.fleet._bundle import AgentBundle
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
 from smartcam.fleet._claims import Claims
 from smartcam.fleet._errors import late, to_fields
@@ -147,7 +147,7 @@ class Agent:
         self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
         self._plain = Plain(self, keys, bus)
         self._summaries = Summaries(self, keys, bus)
-        self._bundle = Bundle(name, self.epoch, keys, bus)
+        self._bundle = AgentBundle(name, self.epoch, keys, bus)
         self.stands_by: bool = standby is not None
         self._claims = Claims(self, keys, bus, standby)
 

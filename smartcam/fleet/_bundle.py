@@ -73,7 +73,7 @@ def decode_bundle(payload: bytes, what: str) -> Bundled:
     return Bundled(epoch, number, following, parts)
 
 
-class Bundle:
+class AgentBundle:
     """Says the results of an agent's cameras together.
 
     Args:

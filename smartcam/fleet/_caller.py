@@ -61,7 +61,7 @@ class Met:
         self.hello: dict[str, Any] = hello
 
 
-class _Heard(NamedTuple):
+class _HelloHeard(NamedTuple):
     """What an agent answered to a hello, and when: loop times, its clock in between."""
 
     agent: str
@@ -210,7 +210,7 @@ class Caller:
     async def _choose(self, agents: list[str], met: Met | None) -> None:
         """Meet one of the agents: with several, or instead of another, one that has a session."""
         only_linked = met is not None
-        heard: list[_Heard] = []
+        heard: list[_HelloHeard] = []
         failed: SmartCamError | None = None
         for agent in agents:
             try:
@@ -233,7 +233,7 @@ class Caller:
             self.lose(f"the agent {met.agent} has no session with the camera, {best.agent} has one")
         self._meet(best)
 
-    async def _say_hello(self, agent: str) -> _Heard:
+    async def _say_hello(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)
@@ -243,9 +243,9 @@ class Caller:
             hello = dict(fields["answer"])
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
-        return _Heard(agent, epoch, hello, clock, begun, loop.time())
+        return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
 
-    def _meet(self, heard: _Heard) -> None:
+    def _meet(self, heard: _HelloHeard) -> None:
         self._ahead, self._measured = heard.clock - heard.at, heard.at
         self._most = math.inf
         self.bound(heard.clock, heard.begun)

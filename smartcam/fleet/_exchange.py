@@ -65,10 +65,19 @@ class Exchange(Bus):
         self._covers: dict[str, Handle] = {}
         self._present: dict[str, set[str]] = {}  # presences that are there, by the camera's name
         self._bundles: dict[str, tuple[int, int]] = {}  # of agents: epoch, the number to come next
+        self._seers: list[Callable[[str, bool], None]] = []  # of all cameras' presences
         self._lacking: set[str] = set()  # agents of whose bundles something is missing
         self._asking: dict[str, asyncio.Task[None]] = {}
 
     # ------------------------------------------------------------------ for many
+
+    def see_all(self, see: Callable[[str, bool], None]) -> None:
+        """Hear of all cameras' presences from now on, for who watches one of them, and for all.
+
+        ``see(key, present)`` is called for each.
+        """
+        self._seers.append(see)
+        self.cover("presence/camera")
 
     def cover(self, kind: str) -> None:
         """Hear everything of a kind from now on: ``states``, ``results``, ``presence/camera``."""
@@ -130,6 +139,8 @@ class Exchange(Bus):
         name = self._name(key)
         there = self._present.setdefault(name, set())
         (there.add if present else there.discard)(key)
+        for see in self._seers:
+            see(key, present)
         for place in tuple(self._places.get("presence/camera", {}).get(name, ())):
             place.call(key, present)
 

@@ -287,14 +287,14 @@ class Fleet:
             keys, bus = self._program.keys, self._program.bus
             there = await bus.present(keys.camera("*", "**"), max(0.0, deadline - loop.time()))
             self._meets = len(there) <= MOST_MET
-            if not self._meets:
-                self._cover_states()
             for key in there:
                 self._on_camera(key, True)
-            self._handles = [
-                bus.watch(keys.camera("*", "**"), self._on_camera),
-                bus.watch(keys.agent("*"), self._on_agent),
-            ]
+            if self._meets:
+                self._handles.append(bus.watch(keys.camera("*", "**"), self._on_camera))
+            else:
+                self._exchange.see_all(self._on_camera)
+                self._exchange.cover("states")
+            self._handles.append(bus.watch(keys.agent("*"), self._on_agent))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(deadline):
                     await asyncio.gather(*map(asyncio.shield, self._opening.values()))
@@ -302,11 +302,6 @@ class Fleet:
             await self.close()
             raise
         return self
-
-    def _cover_states(self) -> None:
-        """Hear of all cameras by one subscription of a kind."""
-        self._exchange.cover("presence/camera")
-        self._exchange.cover("states")
 
     async def close(self) -> None:
         """Leave the fleet; its cameras are closed with it. Idempotent, bounded."""

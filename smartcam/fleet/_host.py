@@ -30,7 +30,7 @@ from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Sequence
 
-    from smartcam.fleet._bundle import Bundle
+    from smartcam.fleet._bundle import AgentBundle
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._frames import SharedFrames
     from smartcam.fleet._keys import Keys
@@ -99,7 +99,7 @@ class Host:
         on_event: Callable[[CameraEvent], None],
         topics: Topics,
         frames: SharedFrames,
-        bundle: Bundle,
+        bundle: AgentBundle,
     ) -> None:
         self.name = name
         self.frames = frames

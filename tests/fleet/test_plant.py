@@ -13,7 +13,7 @@ from smartcam import Result
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, RemoteProtocolError
 from smartcam.fleet import _fleet
-from smartcam.fleet._bundle import Bundle, decode_bundle
+from smartcam.fleet._bundle import AgentBundle, decode_bundle
 from smartcam.fleet._bus import MemoryBus, MemoryEnd
 from smartcam.fleet._exchange import Exchange
 from smartcam.fleet._fleet import Fleet
@@ -173,7 +173,7 @@ async def test_nobody_who_hears_is_no_bundle(monkeypatch: Any) -> None:
         results.close()
         await until(lambda: "results" in fleet._exchange._covers)
         said: list[str] = []
-        monkeypatch.setattr(Bundle, "add", lambda *_: said.append(""))
+        monkeypatch.setattr(AgentBundle, "add", lambda *_: said.append(""))
         await triggered(fleet, 3)
         assert "results" not in fleet._exchange._covers
         said.clear()
