@@ -107,7 +107,7 @@ class BusLink:
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
             "transport/unicast/open_timeout": max(1, int(1e3 * timeout)),
         }
-        for queue in ("data", "interactive_high", "data_low"):
+        for queue in ("control", "data", "interactive_high", "data_low"):
             found[f"transport/link/tx/queue/size/{queue}"] = 16
         if self.certificates is not None:
             tls = f"{self.certificates.rstrip('/')}/"

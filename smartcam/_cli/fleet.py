@@ -18,7 +18,7 @@ from smartcam.fleet._keys import meets
 from smartcam.models import jsonable
 
 if TYPE_CHECKING:
-    from smartcam.fleet import Fleet, FleetCamera, FleetEvent, FleetResults
+    from smartcam.fleet import CameraSummary, Fleet, FleetEvent, FleetResults
     from smartcam.models import Result
     from smartcam.streams import Subscription
 
@@ -72,7 +72,8 @@ def _require_cameras(opened: Fleet) -> None:
 async def list_(url: str, pattern: str, options: Options) -> None:
     async with _opened(url, options) as opened:
         _require_cameras(opened)
-        found = [_camera(opened, one) for one in opened.cameras(pattern)]
+        known = await opened.status(pattern)
+        found = [_camera(opened, name, known.get(name)) for name in opened.names(pattern)]
         warning = opened.warning
     if warning:
         click.echo(f"{tinted('error', 'warning:')} {warning}", err=True)
@@ -90,17 +91,17 @@ async def list_(url: str, pattern: str, options: Options) -> None:
             click.echo(value["reason"])
 
 
-def _camera(opened: Fleet, camera: FleetCamera[Any]) -> dict[str, Any]:
+def _camera(opened: Fleet, name: str, known: CameraSummary | None) -> dict[str, Any]:
     """Return what is known of a camera, for JSON."""
-    there = camera.connected
+    there = known is not None and known.connected
     return {
-        "camera": camera.name,
-        "agents": opened.agents(camera.name),
+        "camera": name,
+        "agents": opened.agents(name) if known is None else [known.agent],
         "connected": there,
-        "application": camera.active_application if there else None,
-        "status": camera.status if there else None,
-        "url": camera.url,
-        "reason": None if camera.trouble is None else str(camera.trouble),
+        "application": known.application if known is not None and there else None,
+        "status": known.status if known is not None and there else None,
+        "url": opened.url_of(name),
+        "reason": f"{name}: its agent does not answer" if known is None else known.reason,
     }
 
 

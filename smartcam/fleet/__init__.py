@@ -31,12 +31,14 @@ if TYPE_CHECKING:
     from smartcam.fleet._opening import open, serve
     from smartcam.fleet._reload import FleetChanges
     from smartcam.fleet._server import FleetServer
+    from smartcam.fleet._summary import CameraSummary
 
 __all__ = [
     "AgentJoined",
     "AgentLeft",
     "CameraJoined",
     "CameraLeft",
+    "CameraSummary",
     "Fleet",
     "FleetCamera",
     "FleetChanges",
@@ -62,5 +64,6 @@ if not TYPE_CHECKING:
             "_opening": "open serve",
             "_reload": "FleetChanges",
             "_server": "FleetServer",
+            "_summary": "CameraSummary",
         },
     )

@@ -20,7 +20,9 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
+from smartcam.fleet._bundle import AgentBundle
 from smartcam.fleet._calls import ACTIONS, PASSES_GATE, ProgramCall, now
+from smartcam.fleet._claims import Claims
 from smartcam.fleet._errors import late, to_fields
 from smartcam.fleet._frame_encoding import FrameEncoder
 from smartcam.fleet._frame_sender import FrameSender
@@ -29,6 +31,7 @@ from smartcam.fleet._host import Host
 from smartcam.fleet._keys import COMMANDS
 from smartcam.fleet._plain import Plain
 from smartcam.fleet._shared import Owner
+from smartcam.fleet._summary import Summaries
 from smartcam.fleet._trigger_counts import RESULT, Totals, outcome_of
 from smartcam.fleet._wire import (
     BusMessage,
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.fleet._frames import FramesOf
     from smartcam.fleet._keys import Keys
+    from smartcam.fleet._standby_file import Standby
     from smartcam.models import CameraEvent
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
@@ -141,6 +145,7 @@ class Agent:
         on_event: is told what happens to the cameras.
         frames: where the frames of each camera come from that has any, by the camera's name.
         observers: see what the sessions see.
+        standby: how it stands by for cameras that others have; None: it does not.
     """
 
     def __init__(
@@ -154,6 +159,7 @@ class Agent:
         on_event: Callable[[CameraEvent], None] = lambda _: None,
         frames: Mapping[str, FramesOf] | None = None,
         observers: Iterable[Observer] = (),
+        standby: Standby | None = None,
     ) -> None:
         self.name = name
         self._frames = dict(frames or {})
@@ -173,6 +179,10 @@ class Agent:
         self._plain = Plain(self, keys, bus)
         self.leaving: set[Host] = set()  # are being closed
         self.past: Totals = Totals()  # of cameras shared no more
+        self._summaries = Summaries(self, keys, bus)
+        self._bundle = AgentBundle(name, self.epoch, keys, bus)
+        self.stands_by: bool = standby is not None
+        self._claims = Claims(self, keys, bus, standby)
 
     # ------------------------------------------------------------------ life
 
@@ -181,7 +191,8 @@ class Agent:
 
         Raises:
             ConnectFailedError: there is no bus within ``timeout`` seconds.
-            ConfigurationError: an option of a camera cannot work.
+            ConfigurationError: an option of a camera cannot work, or another agent has it and
+                neither stands by.
         """
         await self._bus.open(timeout)
         keys, bus, declared = self._keys, self._bus, self._declared
@@ -191,9 +202,10 @@ class Agent:
                 key = keys.call(self.name, "**", command=command)
                 declared.append(bus.subscribe(key, self._hears(command)))
             self._plain.open()
+            self._summaries.open()
+            self._bundle.open()
             declared.append(bus.be_present(keys.agent(self.name)))
-            for name, settings in self._cameras.items():
-                self.share(name, settings, self._frames.get(name))
+            await self._claims.open(self._cameras, timeout)
         except BaseException:
             await self.close()
             raise
@@ -205,7 +217,9 @@ class Agent:
         Cancellation: the sessions' links are dropped at once; the bus is left nevertheless.
         """
         declared, self._declared = self._declared, []
+        self._claims.close()
         self._plain.close()
+        self._summaries.close()
         for handle in (*declared, *(token for token, _ in self._shared.values())):
             handle.close()
         for program in [*self._programs]:
@@ -218,6 +232,7 @@ class Agent:
             await asyncio.gather(*closing, return_exceptions=True)
             await self._encoder.close()
         finally:
+            self._bundle.close()
             self._sender.close()
             await self._bus.close()
 
@@ -233,9 +248,11 @@ class Agent:
             ConfigurationError: an option of it cannot work.
         """
         bus, keys, topics = self._bus, self._keys, self._plain.topics
-        found = frames_of or NO_FRAMES
+        if frames_of is not None:
+            self._frames[name] = frames_of
+        found = self._frames.get(name, NO_FRAMES)
         frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
-        events = self._on_event
+        events = self._on_camera_event
         host = Host(
             name,
             settings,
@@ -246,9 +263,11 @@ class Agent:
             events,
             topics,
             frames,
+            self._bundle,
             self._observers,
         )
         host.numbers = self._numbers_at.pop(name, host.numbers)
+        host.began, host.final = host.results.following, not self.stands_by
         self.hosts[name] = host
         running = self.begin(host.run(), f"smartcam.fleet.{name}")
         self._shared[name] = bus.be_present(keys.camera(self.name, name)), running
@@ -280,6 +299,10 @@ class Agent:
     def calls(self) -> int:
         """How many calls of theirs are under way."""
         return sum(len(guest.tasks) for guest in self._programs.values())
+
+    def _on_camera_event(self, event: CameraEvent) -> None:
+        self._claims.on_event(event)
+        self._on_event(event)
 
     async def wait_tried(self) -> None:
         """Wait until each camera was tried once, well or not; bounded."""

@@ -64,6 +64,11 @@ class Bus(abc.ABC):
         """Bytes that wait to be said; 0 where nothing ever waits."""
         return 0
 
+    @property
+    @abc.abstractmethod
+    def reached(self) -> bool:
+        """Whether this end is on the bus now, as far as it knows: open, and not cut off."""
+
     @abc.abstractmethod
     async def open(self, timeout: float) -> Self:
         """Come to the bus.
@@ -214,6 +219,10 @@ class MemoryEnd(Bus):
     def attached(self) -> bool:
         """Whether it is on the bus now: open, and not cut off."""
         return self in self._bus.ends
+
+    @property
+    def reached(self) -> bool:
+        return self.attached
 
     async def open(self, timeout: float) -> Self:
         self._loop = asyncio.get_running_loop()

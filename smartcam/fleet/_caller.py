@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import (
     ConnectionClosedError,
@@ -38,6 +39,12 @@ HELLO_TIMEOUT = 2.0
 
 SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
 """What a user calls these calls."""
+LOOK_ELSEWHERE = 0.25
+"""Seconds between two looks whether another agent has a session, where the one that was met has
+none."""
+
+MOST_EPOCHS = 16
+"""Agents of a camera that are remembered."""
 
 INSIST_AFTER = 1.0
 """Seconds until something is said again that the agent has to know: it may have been lost."""
@@ -58,6 +65,17 @@ class Met:
         self.hello: dict[str, Any] = hello
 
 
+class _HelloHeard(NamedTuple):
+    """What an agent answered to a hello, and when: loop times, its clock in between."""
+
+    agent: str
+    epoch: int
+    hello: dict[str, Any]
+    clock: float
+    begun: float
+    at: float
+
+
 class Caller:
     """Calls one camera's agent.
 
@@ -73,6 +91,7 @@ class Caller:
         met: the agent, None while there is none.
         trouble: why there is none.
         end: why there will be none any more.
+        linked: whether the agent has a session with the camera, as far as it has said.
     """
 
     def __init__(
@@ -91,6 +110,8 @@ class Caller:
         self.met: Met | None = None
         self.trouble: LinkError | None = None
         self.end: LinkError | None = None
+        self.linked: bool = False
+        self._epochs: dict[str, int] = {}  # of agents that were met
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
         self._stirred = asyncio.Event()
@@ -166,35 +187,60 @@ class Caller:
         """The agent is gone: every call under way ends, and nobody knows what became of it."""
         if self.met is None:
             return
-        self.met = None
+        self.met, self.linked = None, False
         error = self.trouble = ConnectionLostError(f"{self.name}: {why}")
         self.program.fail(self, lambda: _unknown(error))
         self._stirred.set()
         self._on_lost(error)
 
     async def _attend(self) -> None:
-        """Meet the agent whenever there is one."""
+        """Meet the agent whenever there is one; of several, the one that has a session."""
         while True:
-            await self._stirred.wait()
+            elsewhere = self.met is not None and not self.linked and len(self._agents) > 1
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LOOK_ELSEWHERE if elsewhere else None):
+                    await self._stirred.wait()
             self._stirred.clear()
-            if self.met is not None or not self._agents:
+            met = self.met
+            others = sorted(self._agents.keys() - ({met.agent} if met is not None else set()))
+            if not others or (met is not None and self.linked):
                 continue
-            if len(self._agents) > 1:
-                self.trouble = ConnectionLostError(
-                    f"{self.name}: {len(self._agents)} agents say that they have this camera: "
-                    f"{', '.join(sorted(self._agents))}; which one is meant cannot be known"
-                )
-                continue
-            (agent,) = self._agents
             try:
-                await self._meet(agent)
+                await self._choose(others, met)
             except SmartCamError as error:
-                self.trouble = ConnectionLostError(f"{self.name}: {error}")
-                if agent in self._agents:
-                    await asyncio.sleep(HELLO_TIMEOUT / 10)
-                    self._stirred.set()
+                if met is None:
+                    self.trouble = ConnectionLostError(f"{self.name}: {error}")
+                    if self._agents:
+                        await asyncio.sleep(HELLO_TIMEOUT / 10)
+                        self._stirred.set()
 
-    async def _meet(self, agent: str) -> None:
+    async def _choose(self, agents: list[str], met: Met | None) -> None:
+        """Meet one of the agents: with several, or instead of another, one that has a session."""
+        only_linked = met is not None
+        heard: list[_HelloHeard] = []
+        failed: SmartCamError | None = None
+        for agent in agents:
+            try:
+                heard.append(await self._say_hello(agent))
+            except SmartCamError as error:
+                failed = error
+                continue
+            if heard[-1].hello.get("connected") and not heard[-1].hello.get("trying"):
+                break  # a camera has one session
+        if self.met is not met:
+            return  # it came or went meanwhile
+        if not heard:
+            if failed is not None:
+                raise failed
+            return
+        best = heard[-1] if heard[-1].hello.get("connected") else heard[0]
+        if only_linked and not best.hello.get("connected"):
+            return
+        if met is not None:
+            self.lose(f"the agent {met.agent} has no session with the camera, {best.agent} has one")
+        self._meet(best)
+
+    async def _say_hello(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
         begun = loop.time()
         reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)
@@ -204,13 +250,32 @@ class Caller:
             hello = dict(fields["answer"])
         except (KeyError, TypeError, ValueError) as exc:
             raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
-        self._ahead, self._measured = clock - loop.time(), loop.time()
+        return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
+
+    def _meet(self, heard: _HelloHeard) -> None:
+        self._ahead, self._measured = heard.clock - heard.at, heard.at
         self._most = math.inf
-        self.bound(clock, begun)
-        if agent in self._agents:
-            self.met = Met(agent, epoch, hello)
+        self.bound(heard.clock, heard.begun)
+        if heard.agent in self._agents:
+            self._epochs[heard.agent] = heard.epoch
+            if len(self._epochs) > MOST_EPOCHS:
+                del self._epochs[next(iter(self._epochs))]
+            self.met = Met(heard.agent, heard.epoch, heard.hello)
             self.trouble = None
             self._on_met(self.met)
+
+    def restarted(self, epoch: int) -> bool:
+        """Whether a newer start of the agent that was met says something, and no other agent."""
+        met = self.met
+        if met is None or epoch <= met.epoch or len(self._agents) > 1:
+            return False
+        return all(one != epoch for agent, one in self._epochs.items() if agent != met.agent)
+
+    def unlink(self) -> None:
+        """The agent has no session with the camera: another one may have."""
+        self.linked = False
+        if len(self._agents) > 1:
+            self._stirred.set()
 
     # ------------------------------------------------------------------ the clock
 

@@ -285,6 +285,7 @@ async def _hello(call: ProgramCall) -> Answer:
         "program": call.owner.program,
         "frames": host.frames.make is not None,
         "results": host.results.following,
+        "began": host.began,
         "states": host.states.following,
     }, []
 

@@ -111,6 +111,7 @@ class FleetCamera(Camera[ValueT]):
             lambda: None if self._switch_in_doubt else self._expected,
         )
         self._opened = False
+        self.opening: asyncio.Task[None] | None = None  # whoever made it waits for its agent
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
         self._trying = True  # the agent has not done with the first try
@@ -359,6 +360,7 @@ class FleetCamera(Camera[ValueT]):
 
     def _lose(self, error: LinkError, reason: str, *, expected: bool = False) -> None:
         self._trouble = error
+        self._caller.unlink()
         if not self._linked:
             self._stir(error)
             return
@@ -433,6 +435,7 @@ class FleetCamera(Camera[ValueT]):
 
     def _begin_session(self, said: dict[str, Any], at: datetime) -> None:
         self._linked, self._trouble = True, None
+        self._caller.linked = True
         self._about |= said.get("about", {})
         self._counters.begin(self._wire if not self._sessions else Counters())
         self._sessions += 1
@@ -521,12 +524,21 @@ class FleetCamera(Camera[ValueT]):
         """Have the agent do something; what it said before its reply is taken first."""
         limit = self.settings.request_timeout if timeout is None else timeout
         deadline = self._deadline(limit)
+        await self._met_first(deadline)
         self._require_session()
         reply = await self._caller.call(do, deadline, arguments, blobs, call, limit)
         states, results = reply.fields.get("states"), reply.fields.get("results")
         if isinstance(states, int) and isinstance(results, int):
             await self._reach(states, results, deadline)
         return reply
+
+    async def _met_first(self, deadline: float) -> None:
+        """Wait for an agent that was not met yet; bounded."""
+        opening = self.opening
+        if opening is not None:
+            await asyncio.wait({opening}, timeout=deadline - asyncio.get_running_loop().time())
+            if opening.done():
+                self.opening = None
 
     async def _reach(self, states: int, results: int, deadline: float) -> None:
         """Wait for what the agent has said before its reply."""
@@ -542,6 +554,7 @@ class FleetCamera(Camera[ValueT]):
             timeout = await self._settle_switch(timeout)
         expected = application if application is not None else self._expected
         deadline = self._deadline(timeout)
+        await self._met_first(deadline)
         self._require_session()
         receiver, number = self._receiver, self._program.next_call()
         own = receiver.own[number] = Own(request.interpretation, expected)

@@ -33,6 +33,7 @@ from smartcam.fleet._address import (
 from smartcam.fleet._operations_file import OperationsSection  # noqa: TC001 - pydantic does
 from smartcam.fleet._recording_file import RecordSection, mistakes_of
 from smartcam.fleet._ros_file import Fields, RosCamera, RosSection, node_names
+from smartcam.fleet._standby_file import Standby, standby_of
 from smartcam.layout._yaml_files import read_model
 from smartcam.settings import CameraSettings, Seconds, masked, parse_address
 
@@ -117,6 +118,10 @@ def _never(given: object) -> object:
 
 def _or_false(schema: dict[str, Any]) -> None:
     schema["anyOf"].append({"const": False})
+
+
+def _or_bool(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"type": "boolean"})
 
 
 class Emulated(Fields):
@@ -336,6 +341,12 @@ class FleetFile(Fields):
     )
     record: RecordSection | None = Field(
         None, description="record the cameras beside the agent; {} is enough"
+    )
+    standby: Annotated[Standby | None, BeforeValidator(standby_of)] = Field(
+        None,
+        description="stand by for cameras that another agent has, and take over when it is gone: "
+        "true, or a mapping with more",
+        json_schema_extra=_or_bool,
     )
     cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
         description="by name, such as line1/cam3; emulated ones at a name that ends in /**",

@@ -7,6 +7,7 @@ import collections
 import contextlib
 import dataclasses
 import functools
+import math
 import weakref
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,11 +21,13 @@ from smartcam.exceptions import (
     LocalProtocolError,
     SmartCamError,
 )
-from smartcam.fleet._address import FleetAddress, check_pattern
+from smartcam.fleet._address import FleetAddress, check_name, check_pattern
 from smartcam.fleet._camera import FleetCamera
+from smartcam.fleet._exchange import Exchange
 from smartcam.fleet._keys import meets
 from smartcam.fleet._program import Program
 from smartcam.fleet._reload_service import reload_agents
+from smartcam.fleet._summary import ask_cameras, by_name
 from smartcam.models import ValueT
 from smartcam.settings import CameraSettings
 from smartcam.streams import Subscribers, Subscription
@@ -36,7 +39,20 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._bus import Bus, Handle
     from smartcam.fleet._reload import FleetChanges
+    from smartcam.fleet._summary import CameraSummary
     from smartcam.models import Result, SubscriberStatistics
+
+MOST_MET = 256
+"""Cameras of a fleet that are met when it is opened; of a larger one each when it is used."""
+
+AT_ONCE = 100
+"""Cameras that are met, or left, at a time."""
+
+MOST_SINGLE = 64
+"""Cameras whose results are heard one by one; of more, and most of the fleet, all together."""
+
+STATUS_TIMEOUT = 5.0
+"""Seconds for the answers of all agents."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +249,8 @@ class Fleet:
         guest: bool = False,
     ) -> None:
         self._address = address
-        self._program = Program(bus, fleet, guest=guest)
+        self._exchange = Exchange(bus, lambda: self._program.keys)
+        self._program = Program(self._exchange, fleet, guest=guest)
         self._around, self._timeout = around, timeout
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
@@ -245,6 +262,8 @@ class Fleet:
         self._results: list[tuple[str, weakref.ref[FleetResults[Any]]]] = []
         self._stack = contextlib.AsyncExitStack()
         self._state: Literal["new", "open", "closed"] = "new"
+        self._meets = True  # every camera at once: there are not so many
+        self._turn = asyncio.Semaphore(AT_ONCE)
         self._make("camera")  # wrong options are told at once
 
     # ------------------------------------------------------------------ life
@@ -269,12 +288,15 @@ class Fleet:
             await self._program.open(self._timeout)
             keys, bus = self._program.keys, self._program.bus
             there = await bus.present(keys.camera("*", "**"), max(0.0, deadline - loop.time()))
+            self._meets = len(there) <= MOST_MET
             for key in there:
                 self._on_camera(key, True)
-            self._handles = [
-                bus.watch(keys.camera("*", "**"), self._on_camera),
-                bus.watch(keys.agent("*"), self._on_agent),
-            ]
+            if self._meets:
+                self._handles.append(bus.watch(keys.camera("*", "**"), self._on_camera))
+            else:
+                self._exchange.see_all(self._on_camera)
+                self._exchange.cover("states")
+            self._handles.append(bus.watch(keys.agent("*"), self._on_agent))
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout_at(deadline):
                     await asyncio.gather(*map(asyncio.shield, self._opening.values()))
@@ -292,12 +314,14 @@ class Fleet:
         for task in self._opening.values():
             task.cancel()
         await asyncio.gather(*self._opening.values(), return_exceptions=True)
-        for camera in self._cameras.values():
-            await camera.close()
+        cameras = [*self._cameras.values()]
+        for begin in range(0, len(cameras), AT_ONCE):
+            await asyncio.gather(*(one.close() for one in cameras[begin : begin + AT_ONCE]))
         for results in self._subscribed("**"):
             results.end()
         for stream in self._events:
             stream.end(None)
+        await self._exchange.leave()
         await self._program.close()
         await self._stack.aclose()
 
@@ -331,9 +355,33 @@ class Fleet:
         Raises:
             ConfigurationError: the pattern cannot be one.
         """
+        return [self._known(name) for name in self.names(pattern)]
+
+    def names(self, pattern: str = "**") -> list[str]:
+        """Return the names of the cameras that an agent shares now.
+
+        Raises:
+            ConfigurationError: the pattern cannot be one.
+        """
         check_pattern(pattern)
-        there = sorted(name for name, agents in self._agents.items() if agents)
-        return [self._cameras[name] for name in there if meets(pattern, name)]
+        there = self._agents.items()
+        return sorted(name for name, agents in there if agents and meets(pattern, name))
+
+    def url_of(self, name: str) -> str:
+        """Return the URL of a camera, by which :func:`smartcam.connect` has it alone.
+
+        Raises:
+            ConfigurationError: the name cannot be one.
+        """
+        url: str = self._address_of(check_name(name)).url
+        return url
+
+    def _known(self, name: str) -> FleetCamera[Any]:
+        """Return a camera; of a large fleet it is met now, if it was not before."""
+        camera = self._cameras.get(name)
+        if camera is None:
+            camera = self._meet(name)
+        return camera
 
     def agents(self, pattern: str = "**") -> list[str]:
         """Return the agents that share a camera of a pattern, by name.
@@ -354,23 +402,71 @@ class Fleet:
         Raises:
             ConfigurationError: none is called so.
         """
-        camera = self._cameras.get(name)
-        if camera is None:
-            there = ", ".join(sorted(self._cameras)[:20]) or "none"
+        if name not in self._agents:
+            there = ", ".join(sorted(self._agents)[:20]) or "none"
             raise ConfigurationError(
                 f"the fleet has no camera {name!r}; there are {there}"
-                f"{did_you_mean(name, self._cameras)}"
+                f"{did_you_mean(name, self._agents)}"
             )
-        return camera
+        return self._known(name)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._cameras
+        return name in self._agents
 
     def __iter__(self) -> Iterator[FleetCamera[Any]]:
         return iter(self.cameras())
 
     def __len__(self) -> int:
-        return len(self.cameras())
+        return sum(map(bool, self._agents.values()))
+
+    async def meet(self, pattern: str = "**") -> list[FleetCamera[Any]]:
+        """Return the cameras of a pattern once their agents have answered, or were silent.
+
+        A fleet of up to 256 cameras is met when it is opened; in a larger one each camera is met
+        when it is first asked for. Its commands wait for that, what is known of it does not.
+
+        Raises:
+            ConfigurationError: the pattern cannot be one.
+            ConnectionClosedError: the fleet is not open.
+
+        Cancellation: safe; they are met nevertheless.
+        """
+        cameras = self.cameras(pattern)
+        self._require_open()
+        meeting = [self._opening[one.name] for one in cameras if one.name in self._opening]
+        await asyncio.gather(*map(asyncio.shield, meeting))
+        return cameras
+
+    async def status(
+        self, pattern: str = "**", *, timeout: float = STATUS_TIMEOUT
+    ) -> dict[str, CameraSummary]:
+        """Return what is known of every camera of a pattern, by name.
+
+        Each agent is asked once and answers from what it knows; no camera is asked anything. Those
+        whose agent does not answer in time are not in it.
+
+        Args:
+            pattern: of names.
+            timeout: seconds for the answers of all agents.
+
+        Raises:
+            ConfigurationError: the pattern, or the timeout, cannot work.
+            ConnectionClosedError: the fleet is not open.
+
+        Cancellation: safe.
+        """
+        check_pattern(pattern)
+        if not 0 <= timeout < math.inf:
+            raise ConfigurationError(f"status: timeout {timeout!r} is no number of seconds")
+        self._require_open()
+        program = self._program
+        told = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
+        best = by_name(told, lambda one: (one.summary.connected, one.summary.agent))
+        return {name: best[name].summary for name in sorted(best)}
+
+    def _require_open(self) -> None:
+        if self._state != "open":
+            raise ConnectionClosedError(f"{self.url}: not open: the fleet is new, or was closed")
 
     def events(
         self,
@@ -426,7 +522,8 @@ class Fleet:
         self._on_agent(keys.agent(agent), True)  # it comes before its cameras
         sharing.add(agent)
         known = self._cameras.get(name)
-        if known is None or known.ended:
+        wanted = self._meets or bool(self._subscribed(name))
+        if (known is None and wanted) or (known is not None and known.ended):
             self._meet(name)
         self._tell(CameraJoined, agent, name)
 
@@ -444,7 +541,7 @@ class Fleet:
         settings = CameraSettings.of(self._address_of(name), {**self._options, **own})
         return FleetCamera[Any](settings, name, self._program, shared=True)
 
-    def _meet(self, name: str) -> None:
+    def _meet(self, name: str) -> FleetCamera[Any]:
         before = self._cameras.get(name)
         camera = self._cameras[name] = self._make(name)
         for results in self._subscribed(name):
@@ -459,11 +556,14 @@ class Fleet:
                 del self._opening[name]
 
         task.add_done_callback(forget)
+        camera.opening = task
+        return camera
 
     async def _attend(self, camera: FleetCamera[Any], before: FleetCamera[Any] | None) -> None:
         if before is not None:
             await before.close()
-        await camera.attend(self._timeout)
+        async with self._turn:
+            await camera.attend(self._timeout)
 
     # ------------------------------------------------------------------ over many
 
@@ -523,11 +623,11 @@ class Fleet:
     async def _each(
         self, pattern: str, do: Callable[[FleetCamera[Any]], Awaitable[Any]]
     ) -> dict[str, Any]:
-        cameras = self.cameras(pattern)
-        if self._state != "open":
-            raise ConnectionClosedError(f"{self.url}: not open: the fleet is new, or was closed")
+        self.names(pattern)
+        self._require_open()
+        cameras = await self.meet(pattern)
         if not cameras:
-            there = ", ".join(one.name for one in self.cameras()[:20]) or "none"
+            there = ", ".join(self.names()[:20]) or "none"
             raise ConfigurationError(f"no camera of the fleet is {pattern!r}; there are {there}")
 
         async def outcome(doing: Awaitable[Any]) -> Any:
@@ -577,9 +677,11 @@ class Fleet:
         results = FleetResults[Any](subscribe)
         self._results = [one for one in self._results if one[1]() is not None]
         self._results.append((pattern, weakref.ref(results)))
-        for name, camera in self._cameras.items():
-            if meets(pattern, name):
-                results.add(camera)
+        names = {*self.names(pattern), *(name for name in self._cameras if meets(pattern, name))}
+        if len(names) > MOST_SINGLE and 2 * len(names) > len(self):
+            self._exchange.cover("results")
+        for name in names:
+            results.add(self._known(name))
         if self._state == "closed":
             results.end()
         return results

@@ -32,6 +32,7 @@ from smartcam.models import Connected, Reconnected, StatusChanged, jsonable
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterator, Sequence
 
+    from smartcam.fleet._bundle import AgentBundle
     from smartcam.fleet._bus import Bus, Publisher
     from smartcam.fleet._frames import SharedFrames
     from smartcam.fleet._keys import Keys
@@ -75,9 +76,13 @@ class Host:
         on_event: is told what happens to the camera.
         topics: where it is said in JSON.
         frames: its frames.
+        bundle: says its results with those of others.
         observers: see what its sessions see.
 
     Attributes:
+        epoch: of the agent, or of this time that it has the camera.
+        began: the number of the first result since then.
+        final: no other agent takes the camera over when there will be no session any more.
         gate: whose commands may pass.
         results: the last results.
         states: the last things that happened.
@@ -99,6 +104,7 @@ class Host:
         on_event: Callable[[CameraEvent], None],
         topics: Topics,
         frames: SharedFrames,
+        bundle: AgentBundle,
         observers: Sequence[Observer] = (),
     ) -> None:
         self.name = name
@@ -110,7 +116,10 @@ class Host:
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
         self.triggers: collections.Counter[str] = collections.Counter()
-        self._epoch, self._tell, self._observers = epoch, on_event, observers
+        self.epoch: int = epoch
+        self.began: int = 1
+        self.final: bool = True
+        self._tell, self._bundle, self._observers = on_event, bundle, observers
         Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
         self.topics: CameraTopics = CameraTopics(self, topics)
         self._camera = self._make()
@@ -287,8 +296,18 @@ class Host:
         if not self._opened.is_set():
             fields["trying"] = True
         elif trouble is not None:
-            fields |= {"error": to_fields(trouble), "over": self._over}
+            fields |= {"error": to_fields(trouble), "over": self._over and self.final}
         return fields
+
+    def known(self) -> tuple[bool, int | None, int | None, str | None]:
+        """Return whether there is a session, its status, its application, and why there is none."""
+        camera, trouble = self._camera, self.failure or self._camera.trouble
+        try:
+            status: int | None = int(camera.status)
+        except SmartCamError:
+            status = None
+        why = None if trouble is None else str(trouble)
+        return trouble is None, status, camera.active_application, why
 
     def about(self) -> dict[str, Any]:
         """Return what else there is to know of it, the same for a whole session."""
@@ -373,7 +392,7 @@ class Host:
         self.results.add(len(run.payloads), clock, data)
         if owner in self.outcomes:
             self.outcomes[owner].append(data)
-        if self._results_out.heard:
+        if self._results_out.heard or self._bundle.heard:
             self._fresh.append(data)
             self._fresh_bytes += len(data)
             if self._fresh_bytes >= FULL:
@@ -401,6 +420,7 @@ class Host:
         if states:
             self._flush_states()
         self._flush_results()
+        self._bundle.flush()
 
     def _flush_states(self) -> None:
         self._held.clear()
@@ -411,7 +431,7 @@ class Host:
         self._catch_up.clear()
         fresh, self._fresh_states = self._fresh_states, []
         following = self.states.following
-        self._states_out.put(encode({"epoch": self._epoch, "following": following}, fresh))
+        self._states_out.put(encode({"epoch": self.epoch, "following": following}, fresh))
 
     def _flush_results(self) -> None:
         if self._due is not None:
@@ -420,8 +440,12 @@ class Host:
         if self._fresh:
             self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
             fresh, self._fresh = self._fresh, []
-            self._results_out.put(encode_runs(self._epoch, self.results.following, fresh))
-            self._remind(0)
+            said = encode_runs(self.epoch, self.results.following, fresh)
+            if self._bundle.heard:
+                self._bundle.add(self.name, said)
+            if self._results_out.heard:
+                self._results_out.put(said)
+                self._remind(0)
 
     def _on_heard(self, heard: bool) -> None:
         if heard:
@@ -439,5 +463,5 @@ class Host:
     def _say_number(self, step: int) -> None:
         self._reminder = None
         if self._results_out.heard:
-            self._results_out.put(encode_runs(self._epoch, self.results.following, []))
+            self._results_out.put(encode_runs(self.epoch, self.results.following, []))
             self._remind(step)

@@ -103,6 +103,14 @@ class Keys:
         """Results of a camera."""
         return f"{self.root}/results/{camera}"
 
+    def bundle(self, agent: str) -> str:
+        """Results of all cameras of an agent, together."""
+        return f"{self.root}/bundle/{agent}"
+
+    def summary(self, agent: str) -> str:
+        """What an agent knows of all its cameras, for who asks; in JSON."""
+        return f"{self.root}/summary/{agent}"
+
     def listing(self, camera: str) -> str:
         """What there is to know of a camera, for who asks; in JSON."""
         return f"{self.root}/cameras/{camera}"

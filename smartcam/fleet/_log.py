@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from typing import Self
 
 
+MOST_PLACES = 16
+"""Epochs before whose places are known."""
+
+
 class Numbered(Protocol):
     """One thing, or several with consecutive numbers."""
 
@@ -143,6 +147,8 @@ class Feed(Generic[NumberedT]):
             what follows ``expected``, and to :meth:`fill` it in.
         most_held: bytes that wait for what is missing before them; what comes beyond is dropped,
             and asked for later.
+        returns: an epoch that comes again after another one's goes on where it was; what is
+            missing of one that ends is told.
 
     Attributes:
         epoch: of the agent, 0 before the first.
@@ -157,6 +163,7 @@ class Feed(Generic[NumberedT]):
         lacks: Callable[[], None],
         *,
         most_held: int = 1 << 23,
+        returns: bool = False,
     ) -> None:
         self.epoch: int = 0
         self.expected: int = 0
@@ -165,6 +172,9 @@ class Feed(Generic[NumberedT]):
         self._held: collections.deque[NumberedT] = collections.deque()
         self._held_epoch = 0
         self._held_bytes, self._most_held = 0, most_held
+        self._returns = returns
+        self._announced = 0  # the highest number of this epoch that the agent said comes next
+        self._places: dict[int, int] = {}  # of epochs before: the number to come next
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
         """Take what has ``expected`` or a later number, of this epoch of the agent.
@@ -173,10 +183,32 @@ class Feed(Generic[NumberedT]):
         that the agent gives next: what is missing before it is asked for.
         """
         if epoch != self.epoch or not self.expected:
+            if self._returns and self.expected:
+                self._end_epoch()
+                expected = self._places.get(epoch, expected)
             self.epoch, self.expected = epoch, expected
+            self._announced = 0
         if epoch != self._held_epoch:
             self._drop_held()
         self._go_on(following)
+
+    def _end_epoch(self) -> None:
+        """Another agent goes on: take what is held, and tell what of this one cannot come."""
+        held = self._now_held()
+        while held:
+            thing = held.popleft()
+            self._held_bytes -= thing.size
+            if thing.number > self.expected:
+                self._miss(thing.number - self.expected, thing)
+                self.expected = thing.number
+            if thing.next > self.expected:
+                self._have(thing)
+        if self._announced > self.expected:
+            self._miss(self._announced - self.expected, None)
+            self.expected = self._announced
+        self._places[self.epoch] = self.expected
+        if len(self._places) > MOST_PLACES:
+            del self._places[next(iter(self._places))]
 
     def receive(self, epoch: int, following: int, things: list[NumberedT]) -> None:
         """Take what the agent said by itself; ``following`` is the number it gives next."""
@@ -188,6 +220,8 @@ class Feed(Generic[NumberedT]):
                     self._have(thing)
             self._go_on(following)
         elif epoch >= self.epoch:
+            if epoch == self.epoch and self.expected:
+                self._announced = max(self._announced, following)
             for thing in things:
                 self._hold(epoch, thing)
 
@@ -213,7 +247,8 @@ class Feed(Generic[NumberedT]):
 
     def stop(self) -> None:
         """Nobody wants any more."""
-        self.expected = 0
+        self.expected = self._announced = 0
+        self._places.clear()
         self.lacking = False
         self._drop_held()
 
@@ -225,6 +260,7 @@ class Feed(Generic[NumberedT]):
     def _go_on(self, following: int) -> None:
         """Take what was held as far as it fits; ask for what is missing before the rest."""
         self.lacking = False
+        self._announced = max(self._announced, following)
         held = self._now_held()
         while held and held[0].number <= self.expected:
             thing = held.popleft()

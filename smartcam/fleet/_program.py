@@ -98,7 +98,11 @@ class Program:
     async def _find(self, deadline: float, timeout: float) -> str:
         """Return the name of the only fleet that has what is looked for."""
         loop = asyncio.get_running_loop()
-        pattern = Keys("*").camera("*", self._camera)
+        # of all cameras there may be thousands, of agents a few
+        keys_of = Keys("*")
+        pattern = keys_of.camera("*", self._camera)
+        if self._camera == "**":
+            pattern = keys_of.agent("*")
         while (left := deadline - loop.time()) > 0:
             keys = await self.bus.present(pattern, left)
             found = sorted({key.split("/")[1] for key in keys})

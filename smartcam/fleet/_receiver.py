@@ -151,7 +151,7 @@ class Receiver:
             self._take_state, _ignore, lambda: self._lack("states")
         )
         self._results: Feed[ResultRun] = Feed(
-            self._take_run, listeners.miss, lambda: self._lack("results")
+            self._take_run, listeners.miss, lambda: self._lack("results"), returns=True
         )
         self._handles: dict[str, Handle] = {}
         self._since = math.inf  # the agent's clock when results were first wanted
@@ -190,8 +190,8 @@ class Receiver:
         self._states.begin(met.epoch, states, states)
         if "results" not in self._handles:
             return
-        if self._results.expected:  # of a new start of the agent's, everything
-            self._results.begin(met.epoch, 1, results)
+        if self._results.expected:  # of a new start, or another agent's turn, everything
+            self._results.begin(met.epoch, int(hello.get("began", 1)), results)
         else:
             self._begin("find", self._find())
 
@@ -358,7 +358,7 @@ class Receiver:
     def _see(self, epoch: int) -> None:
         """Look whether the agent was started anew: presence does not tell where it is back soon."""
         met = self._caller.met
-        if met is not None and epoch > met.epoch:
+        if met is not None and self._caller.restarted(epoch):
             self._caller.lose(f"the agent {met.agent} was restarted")
 
     def _count(self, payload: bytes) -> None:

@@ -122,6 +122,7 @@ class FleetServer(Server):
                 history=history,
                 on_event=self._tell,
                 frames={name: source.frames for name, source in sources.items() if source.frames},
+                standby=file.standby,
                 observers=self.observers,
             )
             self._hosts = agent.hosts  # observers want them from their first result on

@@ -166,6 +166,13 @@ class ZenohEnd(ZenohSession, Bus):
                     return found.trouble
         return ""
 
+    @property
+    def reached(self) -> bool:
+        session = self._session
+        if session is None:
+            return False
+        return bool(self._link.listen or session.info.routers_zid())
+
     # ------------------------------------------------------------------ what is said
 
     @property

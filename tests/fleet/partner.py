@@ -1,7 +1,9 @@
 """An agent, or a program that has a camera or looks, in a process of its own, to be killed.
 
 ``python -m tests.fleet.partner agent PLACE CAMERA_URL``, or ``... holder FLEET_URL``, or ``...
-viewer FLEET_URL``. It says when it is ready, and goes on until its end.
+viewer FLEET_URL``, or ``... standby PLACE CAMERA_URL NAME``: an agent that connects to a router,
+and stands by for a camera that another one has. It says when it is ready, and goes on until its
+end.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from smartcam._zenoh import BusLink
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._keys import Keys
+from smartcam.fleet._standby_file import Standby
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
@@ -66,6 +69,15 @@ async def _agent(place: str, url: str) -> None:
     await _ready()
 
 
+async def _standby(place: str, url: str, name: str) -> None:
+    settings = CameraSettings.make(url, None, {"reconnect": FAST, "name": NAME})
+    end = ZenohEnd(BusLink(connect=(place,)))
+    agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=Standby.model_validate({}))
+    await agent.open(PATIENCE)
+    await agent.wait_tried()
+    await _ready()
+
+
 async def _holder(url: str) -> None:
     async with smartcam.connect(url) as camera:
         assert isinstance(camera, FleetCamera)
@@ -85,5 +97,10 @@ async def _ready() -> None:
 
 
 if __name__ == "__main__":
-    programs: dict[str, Any] = {"agent": _agent, "holder": _holder, "viewer": _viewer}
+    programs: dict[str, Any] = {
+        "agent": _agent,
+        "standby": _standby,
+        "holder": _holder,
+        "viewer": _viewer,
+    }
     asyncio.run(programs[sys.argv[1]](*sys.argv[2:]))

@@ -23,7 +23,6 @@ from smartcam.exceptions import (
     LocalProtocolError,
     NotRunningError,
     ResponseTimeoutError,
-    SmartCamError,
     SubscriberOverflowError,
     TriggerTimeoutError,
 )
@@ -538,12 +537,14 @@ async def test_agent_that_is_cut_off_has_left_and_comes_back() -> None:
     assert kinds == [AgentJoined, CameraJoined, CameraLeft, AgentLeft, AgentJoined, CameraJoined]
 
 
-async def test_camera_of_two_agents_is_nobodys() -> None:
+async def test_second_agent_with_a_camera_refuses_and_names_the_first() -> None:
     bus = MemoryBus()
-    async with agent(bus, "one", "a"), agent(bus, "two", "a"), fleet_on(bus) as fleet:
-        outcome = (await fleet.trigger())["a"]
-        assert isinstance(outcome, SmartCamError)
-        assert "2 agents say that they have this camera: one, two" in str(outcome)
+    async with agent(bus, "one", "a", "b"), fleet_on(bus) as fleet:
+        second = agent(bus, "two", "b", "c")
+        with pytest.raises(ConfigurationError, match=r"^b: the agent one of fleet plant has this"):
+            await second.start()
+        assert fleet.names() == ["a", "b"]  # not even the camera that nobody has
+        assert isinstance((await fleet.trigger())["b"], Result)
 
 
 # ---------------------------------------------------------------------- reservations

@@ -232,6 +232,37 @@ def test_stopped_feed_takes_nothing() -> None:
     assert (ear.taken, ear.missed, ear.feed.lacking) == ([], 0, False)
 
 
+def alternating() -> Ear:
+    """An ear for agents that have a camera by turns."""
+    ear = Ear()
+    ear.feed = Feed(ear.take, ear.miss, ear.lack, returns=True)
+    return ear
+
+
+def test_agent_that_comes_again_goes_on_where_it_was() -> None:
+    ear = alternating()
+    ear.feed.begin(1, 1, 1)
+    ear.feed.receive(1, 3, said(1, 2))
+    ear.feed.begin(2, 1, 1)
+    ear.feed.receive(2, 2, said(1, epoch=2))
+    ear.feed.begin(1, 1, 4)  # its log has all of them yet
+    ear.feed.fill(1, 3, 4, said(3))
+    assert ear.taken == [(1, 1), (1, 2), (2, 1), (1, 3)]
+    assert ear.missed == 0
+
+
+def test_what_an_agent_had_said_is_missed_when_another_goes_on() -> None:
+    ear = alternating()
+    ear.feed.begin(1, 1, 1)
+    ear.feed.receive(1, 2, said(1))
+    ear.feed.receive(1, 9, said(4, 5))  # 2 and 3 are missing, and it says that there is an 8
+    ear.feed.begin(2, 1, 1)
+    assert ear.taken == [(1, 1), (1, 4), (1, 5)]
+    assert ear.missed == 2 + 3
+    ear.feed.begin(1, 1, 9)
+    assert not ear.feed.lacking
+
+
 class Hearing(RuleBasedStateMachine):
     """An agent that speaks, forgets and is restarted; a bus that loses, doubles and mixes up.
 

@@ -240,7 +240,7 @@ def as_started_anew(plant: Plant) -> None:
     """
     agent, host = plant.agent, plant.agent.hosts[NAME]
     agent.epoch += 1
-    host._epoch += 1
+    host.epoch += 1
     host.results, host.states = AgentLog(100, 1 << 20), AgentLog(100, 1 << 20)
     for program in [*agent._programs]:
         agent._forget(program)

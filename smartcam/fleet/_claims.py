@@ -1,0 +1,205 @@
+"""Which agent has a camera: one of a fleet at a time, and who stands by takes over.
+
+An agent says by its presence that it has a camera. Another one with the same camera either refuses
+to start, or stands by: without a session, until that presence ends. Two that have a camera both,
+behind a split of the network, leave it to the camera, which serves the newcomer: whoever has lost
+its session and sees another's presence asks that agent, and lets it have the camera.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from smartcam._zenoh import LEASE
+from smartcam.exceptions import ConfigurationError, ConnectionTakenError
+from smartcam.fleet._summary import ask_cameras
+from smartcam.models import Disconnected
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.fleet._agent import Agent
+    from smartcam.fleet._bus import Bus, Handle
+    from smartcam.fleet._keys import Keys
+    from smartcam.fleet._standby_file import Standby
+    from smartcam.models import CameraEvent
+    from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+HOLD_OFF = 0.2
+"""Seconds for each step of preference until who stands by takes a camera that nobody has."""
+
+ASK = 0.5
+"""Seconds for another agent's answer, and between two looks at what it has."""
+
+RETURN = 2.0
+"""Seconds for others to be back on a bus that was away, before what they had is taken over."""
+
+
+class Claims:
+    """The cameras that an agent has, or stands by for.
+
+    Args:
+        agent: the agent.
+        keys: of the fleet.
+        bus: the agent's end of it.
+        standby: how it stands by; None: it does not.
+
+    Attributes:
+        given_up: why a camera is another agent's now, by its name.
+    """
+
+    def __init__(self, agent: Agent, keys: Keys, bus: Bus, standby: Standby | None) -> None:
+        self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
+        self._wanted: dict[str, CameraSettings] = {}
+        self._others: dict[str, set[str]] = {}  # agents that have a camera of ours
+        self._settling: set[str] = set()
+        self._again: set[str] = set()
+        self._watch: Handle | None = None
+        self.given_up: dict[str, ConnectionTakenError] = {}
+
+    async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
+        """Have the cameras that no other agent has.
+
+        Raises:
+            ConfigurationError: another one has a camera, and neither stands by; nothing is shared.
+                Or an option of a camera cannot work.
+        """
+        self._wanted = dict(cameras)
+        keys, bus = self._keys, self._bus
+        for key in await bus.present(keys.camera("*", "**"), timeout):
+            self._note(key, True)
+        self._watch = bus.watch(keys.camera("*", "**"), self._on_presence)
+        if self._standby is None:
+            await self._refuse()
+        for name, settings in cameras.items():
+            if self._others.get(name):
+                self._consider(name)
+            else:
+                self._agent.share(name, settings)
+
+    def close(self) -> None:
+        """Claim nothing more. Idempotent."""
+        self._wanted.clear()
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+
+    async def _refuse(self) -> None:
+        """Raise where another agent has a camera of ours, and neither is one that stands by.
+
+        One that neither answers nor goes may have died a moment ago: its presence ends with the
+        engine's lease.
+        """
+        loop = asyncio.get_running_loop()
+        patience = loop.time() + LEASE + 1.0
+        while True:
+            there = {(name, other) for name, others in self._others.items() for other in others}
+            if not there:
+                return
+            told = {
+                (one.summary.camera, one.summary.agent): one.standby
+                for agent in sorted({agent for _, agent in there})
+                for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK)
+            }
+            if all(told.get(one) for one in there):
+                return
+            silent = not there & told.keys()
+            if not silent or loop.time() > patience:
+                name, agent = min(one for one in there if not told.get(one))
+                more = f", and {len(there) - 1} more cameras" if len(there) > 1 else ""
+                says = ", which does not answer" if silent else ""
+                raise ConfigurationError(
+                    f"{name}: the agent {agent} of fleet {self._keys.fleet}{says} has this camera "
+                    f"already{more}; a camera has one agent. `standby: true` in both fleet files "
+                    "makes this one stand by"
+                )
+            await asyncio.sleep(ASK)
+
+    # ------------------------------------------------------------------ who has what
+
+    def _note(self, key: str, present: bool) -> str:
+        """Return the camera that somebody else comes or goes for; nothing if it is none of ours."""
+        agent, *chunks = self._keys.tail(key, "presence/camera")
+        name = "/".join(chunks)
+        if agent == self._agent.name or name not in self._wanted:
+            return ""
+        others = self._others.setdefault(name, set())
+        (others.add if present else others.discard)(agent)
+        return name
+
+    def _on_presence(self, key: str, present: bool) -> None:
+        if name := self._note(key, present):
+            self._consider(name)
+
+    def on_event(self, event: CameraEvent) -> None:
+        """Something happened to a camera that this agent has."""
+        if isinstance(event, Disconnected) and self._others.get(event.camera):
+            self._consider(event.camera)
+
+    def _consider(self, name: str) -> None:
+        """Look whose a camera is, in a task; once at a time for each."""
+        self._again.add(name)
+        if name not in self._settling:
+            self._settling.add(name)
+            self._agent.begin(self._settle(name), f"smartcam.fleet.{name}.claim")
+
+    async def _settle(self, name: str) -> None:
+        try:
+            while name in self._again and name in self._wanted:
+                self._again.discard(name)
+                if name in self._agent.hosts:
+                    await self._defend(name)
+                else:
+                    await self._stand_by(name)
+        finally:
+            self._settling.discard(name)
+
+    async def _stand_by(self, name: str) -> None:
+        """Take a camera over if nobody has it."""
+        if self._standby is None or self._others.get(name):
+            return
+        away = not self._bus.reached  # we are gone, and not the others
+        await asyncio.sleep(HOLD_OFF * self._standby.preference)
+        while away or not self._bus.reached:
+            if self._bus.reached:
+                await asyncio.sleep(RETURN)
+                away = False
+            else:
+                away = True
+                await asyncio.sleep(ASK)
+        settings = self._wanted.get(name)
+        if settings is None or self._others.get(name) or name in self._agent.hosts:
+            return
+        logger.warning("%s = the agent %s takes it over", name, self._agent.name)
+        self.given_up.pop(name, None)
+        self._agent.share(name, settings)
+
+    async def _defend(self, name: str) -> None:
+        """Keep a camera that another agent says it has, too, as long as it serves this one."""
+        agent = self._agent
+        while (host := agent.hosts.get(name)) and (others := self._others.get(name)):
+            if host.connected:
+                return  # its loss is an event
+            other = min(others)
+            told = await ask_cameras(self._bus, self._keys, other, name, ASK)
+            if host.connected or agent.hosts.get(name) is not host:
+                return
+            # of two that have no session the first one by name goes on trying
+            yields = bool(told) and (told[0].summary.connected or other < agent.name)
+            if yields and other in self._others.get(name, ()):
+                await self._give_up(name, other)
+                return
+            await asyncio.sleep(ASK)
+
+    async def _give_up(self, name: str, other: str) -> None:
+        stays = "stands by" if self._standby is not None else "shares it no more"
+        error = self.given_up[name] = ConnectionTakenError(
+            f"{name}: the agent {other} has the camera now, which serves one; the agent "
+            f"{self._agent.name} {stays}"
+        )
+        logger.warning("! %s", error)
+        await self._agent.unshare(name)

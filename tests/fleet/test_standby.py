@@ -1,0 +1,388 @@
+"""Agents that stand by: who has a camera, when it is taken over, and what programs see of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import Counter
+from collections.abc import AsyncIterator
+from typing import Any, Self
+
+import pytest
+
+from smartcam import Backoff
+from smartcam.exceptions import (
+    ConfigurationError,
+    LinkError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.fleet._agent import Agent
+from smartcam.fleet._bus import MemoryBus, MemoryEnd
+from smartcam.fleet._camera import FleetCamera
+from smartcam.fleet._claims import ASK, HOLD_OFF
+from smartcam.fleet._file import FleetFile
+from smartcam.fleet._fleet import Fleet
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._program import Program
+from smartcam.fleet._standby_file import Standby
+from smartcam.models import Connected, Disconnected, Reconnected
+from smartcam.settings import Address, CameraSettings
+from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
+
+QUICK = Backoff(initial=0.1, maximum=0.2, jitter=0.0)
+STANDS_BY = Standby.model_validate({})
+SOON = 1.0
+"""Seconds within which a camera is taken over, once the presence of who had it has ended."""
+
+
+class Pair:
+    """A camera, and agents on one bus that may have it; a context manager."""
+
+    def __init__(self) -> None:
+        self.box = NumberedCamera(time=0.01)
+        self.bus = MemoryBus()
+        self.agents: dict[str, Agent] = {}
+        self.ends: dict[str, MemoryEnd] = {}
+        self._stack = contextlib.AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        await self._stack.enter_async_context(self.box)
+        self._stack.push_async_callback(self.close)
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self._stack.aclose()
+
+    async def close(self) -> None:
+        for agent in self.agents.values():
+            await agent.close()
+
+    async def start(self, name: str, standby: Standby | None = STANDS_BY) -> Agent:
+        """Start an agent."""
+        end = self.ends[name] = self.bus.end()
+        settings = CameraSettings.make(self.box.url, None, {"reconnect": QUICK, "name": NAME})
+        agent = Agent(name, Keys(FLEET), end, {NAME: settings}, standby=standby)
+        await agent.open(PATIENCE)
+        self.agents[name] = agent
+        await agent.wait_tried()
+        return agent
+
+    def having(self) -> list[str]:
+        """Return who has a session with the camera."""
+        found = [(name, one.hosts.get(NAME)) for name, one in self.agents.items()]
+        return [name for name, host in found if host is not None and host.connected]
+
+    def sharing(self) -> list[str]:
+        """Return who says that it has the camera."""
+        return [name for name, one in self.agents.items() if NAME in one.hosts]
+
+    def program(self) -> FleetCamera[Any]:
+        """Return the camera of a program, to be opened."""
+        options = {"name": NAME, "interpret_as": LAYOUT, "reconnect": QUICK}
+        address = Address("fleet", "fleet", "127.0.0.1", 7447, path=NAME)
+        settings = CameraSettings.of(address, options)
+        return FleetCamera(settings, NAME, Program(self.bus.end(), FLEET, NAME))
+
+
+class Work:
+    """A program that triggers again and again, and takes all results.
+
+    Attributes:
+        outcomes: what became of each trigger, by its token: the token of its result, or an error.
+        streamed: the run of each result that came.
+    """
+
+    def __init__(self, camera: FleetCamera[Any]) -> None:
+        self.camera = camera
+        self.outcomes: dict[int, int | SmartCamError] = {}
+        self.streamed: list[int] = []
+        self.stream = camera.results()
+        self.events = camera.events()
+        self._over = False
+
+    async def trigger(self) -> None:
+        token = 0
+        while not self._over:
+            token += 1
+            try:
+                result = await self.camera.trigger(
+                    2, input=token.to_bytes(4, "little"), timeout=2.0
+                )
+                self.outcomes[token] = result.value.token
+            except SmartCamError as error:
+                self.outcomes[token] = error
+                await asyncio.sleep(0.02)
+
+    async def take(self) -> None:
+        async for result in self.stream:
+            self.streamed.append(result.value.run)
+
+    @contextlib.asynccontextmanager
+    async def going_on(self) -> AsyncIterator[None]:
+        taking = asyncio.create_task(self.take())
+        working = asyncio.create_task(self.trigger())
+        try:
+            await self.some()
+            yield
+            await self.some()
+        finally:
+            self._over = True
+            await working
+            await asyncio.sleep(2.0)  # reminders
+            taking.cancel()
+            await asyncio.gather(taking, return_exceptions=True)
+
+    @property
+    def done(self) -> int:
+        return sum(isinstance(one, int) for one in self.outcomes.values())
+
+    async def some(self) -> None:
+        """Wait until some more triggers went well."""
+        wanted = self.done + 5
+        await until(lambda: self.done >= wanted)
+
+    def check(self, box: NumberedCamera) -> None:
+        """No result twice, none under another's trigger, each in the account."""
+        for token, outcome in self.outcomes.items():
+            if isinstance(outcome, int):
+                assert outcome == token
+            else:
+                assert isinstance(outcome, (LinkError, TriggerTimeoutError)), outcome
+        times = Counter(box.inputs.values())
+        assert max(times.values()) == 1, times  # no trigger was sent again
+        assert self.streamed == sorted(set(self.streamed))
+        account = self.stream.statistics()
+        assert account.offered == account.taken == len(self.streamed)
+        assert (account.dropped, account.queued) == (0, 0)
+        # what no session heard is in no account; what an agent had numbered is
+        well = {run for run, token in box.inputs.items() if self.outcomes.get(token or 0) == token}
+        assert len(well - {*self.streamed}) <= account.missed
+
+    async def told(self) -> list[str]:
+        """Return what was told of sessions."""
+        kinds: list[str] = []
+        while self.events.statistics().queued:
+            event = await anext(self.events)
+            if isinstance(event, (Connected, Disconnected, Reconnected)):
+                kinds.append(type(event).__name__)
+        return kinds
+
+
+@contextlib.asynccontextmanager
+async def pair_at_work() -> AsyncIterator[tuple[Pair, Work]]:
+    """Give a pair of which north has the camera and south stands by, and a program at work."""
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        async with pair.program() as camera:
+            work = Work(camera)
+            async with work.going_on():
+                assert (pair.having(), pair.sharing()) == (["north"], ["north"])
+                yield pair, work
+            work.check(pair.box)
+
+
+# ---------------------------------------------------------------------- taking over
+
+
+async def test_who_stands_by_has_no_session_and_takes_over_at_a_clean_stop() -> None:
+    async with pair_at_work() as (pair, work):
+        north = pair.agents.pop("north")
+        await north.close()
+        await until(lambda: pair.having() == ["south"], SOON)
+        await work.some()
+        assert (await work.told())[-2:] == ["Disconnected", "Reconnected"]
+
+
+async def test_who_stands_by_takes_over_from_one_that_is_cut_off() -> None:
+    async with pair_at_work() as (pair, work):
+        pair.ends["north"].detach()
+        await until(lambda: pair.having() == ["south"], SOON)
+        await work.some()
+
+
+async def test_the_one_that_has_it_keeps_it() -> None:
+    async with pair_at_work() as (pair, work):
+        await pair.agents.pop("north").close()
+        await until(lambda: pair.having() == ["south"], SOON)
+        await pair.start("north")
+        await work.some()
+        assert (pair.having(), pair.sharing()) == (["south"], ["south"])
+        await pair.agents.pop("south").close()  # and back again
+        await until(lambda: pair.having() == ["north"], SOON)
+        await work.some()
+
+
+async def test_agent_that_has_it_again_goes_on_with_its_numbers() -> None:
+    async with pair_at_work() as (pair, work):
+        for one, other in (("north", "south"), ("south", "north"), ("north", "south")):
+            pair.ends[one].detach()
+            await until(lambda other=other: pair.having() == [other], PATIENCE)
+            pair.ends[one].attach()
+            await until(lambda other=other: pair.sharing() == [other], PATIENCE)
+            await work.some()
+
+
+async def test_program_that_comes_later_misses_nothing_of_before() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        async with pair.program() as camera:
+            for _ in range(3):
+                await camera.trigger(timeout=PATIENCE)
+        pair.ends["north"].detach()
+        await until(lambda: pair.having() == ["south"])
+        pair.ends["north"].attach()
+        await until(lambda: pair.sharing() == ["south"])
+        async with pair.program() as camera, camera.results() as results:
+            first = await camera.trigger(timeout=PATIENCE)
+            await pair.agents.pop("south").close()
+            await until(lambda: pair.having() == ["north"] and camera.connected)
+            second = await camera.trigger(timeout=PATIENCE)
+            assert [await anext(results), await anext(results)] == [first, second]
+            assert second.number == 4  # of north's
+            account = results.statistics()
+            assert (account.taken, account.missed) == (2, 0)
+
+
+async def test_of_several_the_preferred_one_takes_over() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("late", Standby(preference=2))
+        await pair.start("soon", Standby(preference=1))
+        await pair.agents.pop("north").close()
+        await until(lambda: pair.having() == ["soon"], SOON)
+        await asyncio.sleep(4 * HOLD_OFF)
+        assert pair.sharing() == ["soon"]
+
+
+async def test_of_two_at_the_same_time_one_keeps_it() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("east")
+        await pair.start("west")
+        await pair.agents.pop("north").close()
+        await until(lambda: len(pair.having()) == len(pair.sharing()) == 1)
+        (first,) = pair.having()
+        await asyncio.sleep(20.0)
+        assert (pair.having(), pair.sharing()) == ([first], [first])
+
+
+# ---------------------------------------------------------------------- splits
+
+
+async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
+    async with pair_at_work() as (pair, _):
+        pair.ends["north"].detach()
+        await until(lambda: "south" in pair.sharing(), SOON)
+        await asyncio.sleep(15.0)
+        (winner,) = pair.having()
+        sessions = [one.camera.statistics().sessions for one in hosts(pair)]
+        await asyncio.sleep(30.0)
+        assert pair.having() == [winner]
+        assert [one.camera.statistics().sessions for one in hosts(pair)] == sessions
+        pair.ends["north"].attach()
+        await until(lambda: len(pair.sharing()) == 1, PATIENCE)
+        assert pair.having() == pair.sharing() == [winner]
+        loser = pair.agents["north" if winner == "south" else "south"]
+        assert winner in str(loser._claims.given_up[NAME])
+
+
+async def test_program_follows_to_who_won_a_split() -> None:
+    async with pair_at_work() as (pair, work):
+        pair.ends["north"].detach()
+        await until(lambda: "south" in pair.sharing(), SOON)
+        await asyncio.sleep(15.0)
+        pair.ends["north"].attach()
+        await until(lambda: len(pair.sharing()) == 1, PATIENCE)
+        await work.some()
+        assert work.camera.connected
+        assert not work.camera.ended
+
+
+async def test_without_standby_the_one_that_lost_it_shares_it_no_more() -> None:
+    async with Pair() as pair:
+        await pair.start("north", None)
+        pair.ends["north"].detach()
+        await pair.start("south", None)
+        await until(lambda: len(pair.having()) == 1)
+        await asyncio.sleep(15.0)
+        (winner,) = pair.having()
+        pair.ends["north"].attach()
+        await until(lambda: pair.sharing() == [winner], PATIENCE)
+        await pair.agents.pop(winner).close()
+        await asyncio.sleep(10.0)
+        assert pair.sharing() == []
+
+
+async def test_bus_that_was_away_is_no_reason_to_take_over() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        for end in pair.ends.values():  # as with a router that ends
+            end.detach()
+        await asyncio.sleep(10 * ASK)
+        assert pair.having() == ["north"]
+        pair.ends["south"].attach()
+        await asyncio.sleep(ASK)
+        pair.ends["north"].attach()
+        await asyncio.sleep(10.0)
+        assert (pair.having(), pair.sharing()) == (["north"], ["north"])
+        assert pair.agents["north"].hosts[NAME].camera.statistics().sessions == 1
+
+
+def hosts(pair: Pair) -> list[Any]:
+    return [one.hosts[NAME] for one in pair.agents.values() if NAME in one.hosts]
+
+
+# ---------------------------------------------------------------------- who refuses
+
+
+async def test_agent_that_does_not_stand_by_gives_way_to_one_that_does() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south", None)
+        assert pair.sharing() == ["north"]
+
+
+async def test_presence_of_the_dead_is_waited_for() -> None:
+    async with Pair() as pair:
+        end = pair.bus.end()
+        await end.open(1.0)
+        token = end.be_present(Keys(FLEET).camera("ghost", NAME))
+        asyncio.get_running_loop().call_later(3.0, token.close)
+        await pair.start("north", None)
+        assert pair.having() == ["north"]
+
+
+async def test_agent_that_says_nothing_is_named() -> None:
+    async with Pair() as pair:
+        end = pair.bus.end()
+        await end.open(1.0)
+        end.be_present(Keys(FLEET).camera("ghost", NAME))
+        with pytest.raises(ConfigurationError, match="agent ghost of fleet plant, which does not"):
+            await pair.start("north", None)
+
+
+@pytest.mark.parametrize(
+    ("said", "found"),
+    [(True, STANDS_BY), (False, None), ({"preference": 2}, Standby(preference=2)), ({}, STANDS_BY)],
+)
+def test_standby_in_a_file(said: object, found: Standby | None) -> None:
+    cameras = {"a": {"url": "bvs://192.0.2.1"}}
+    file = FleetFile.model_validate({"standby": said, "cameras": cameras})
+    assert file.standby == found
+
+
+async def test_fleet_sees_one_camera_throughout() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        async with Fleet(pair.bus.end(), None, FLEET, None, 2.0, {}) as fleet:
+            camera = fleet[NAME]
+            assert (await fleet.status())[NAME].agent == "north"
+            await pair.agents.pop("north").close()
+            await until(lambda: fleet.agents(NAME) == ["south"] and camera.connected, SOON)
+            assert fleet[NAME] is camera
+            assert (await fleet.status())[NAME].agent == "south"

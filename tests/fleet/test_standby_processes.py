@@ -1,0 +1,111 @@
+"""Agents that stand by as processes, over Zenoh: killed, stopped, and without their router."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import AsyncIterator
+
+import pytest
+
+pytest.importorskip("zenoh")
+
+from smartcam._zenoh import BusLink, with_ports
+from smartcam.fleet import Fleet
+from smartcam.fleet._address import FleetAddress
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._zenoh import ZenohEnd
+from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
+from tests.fleet.partner import Partner, partner
+from tests.fleet.test_standby import QUICK, Work
+
+pytestmark = [pytest.mark.real_time, pytest.mark.long]
+
+
+class Hosts:
+    """A router, a camera, two agents and a program.
+
+    Attributes:
+        place: the router's.
+        router: its end.
+        agents: the processes, by name.
+    """
+
+    def __init__(self, box: NumberedCamera) -> None:
+        self.box = box
+        (self.place,) = with_ports(["tcp/127.0.0.1:0"])
+        self.router = ZenohEnd(BusLink(listen=(self.place,)))
+        self.agents: dict[str, Partner] = {}
+
+    async def restart_router(self) -> None:
+        await self.router.close()
+        await asyncio.sleep(1.0)
+        self.router = ZenohEnd(BusLink(listen=(self.place,)))
+        await self.router.open(PATIENCE)
+
+    async def sharing(self) -> list[str]:
+        """Return the agents that say that they have the camera."""
+        keys = Keys(FLEET)
+        found = await self.router.present(keys.camera("*", NAME), 1.0)
+        return sorted(keys.tail(key, "presence/camera")[0] for key in found)
+
+    async def settled(self, *agents: str) -> None:
+        async with asyncio.timeout(PATIENCE):
+            while await self.sharing() != [*agents]:  # noqa: ASYNC110 - the bus tells
+                await asyncio.sleep(0.05)
+
+
+@contextlib.asynccontextmanager
+async def hosts_at_work() -> AsyncIterator[tuple[Hosts, Work]]:
+    """Give a pair of which north has the camera and south stands by, and a program at work."""
+    async with contextlib.AsyncExitStack() as stack:
+        box = await stack.enter_async_context(NumberedCamera(time=0.01))
+        hosts = Hosts(box)
+        await hosts.router.open(PATIENCE)
+        stack.push_async_callback(lambda: hosts.router.close())
+        for name in ("north", "south"):
+            hosts.agents[name] = await stack.enter_async_context(
+                partner("standby", hosts.place, box.url, name)
+            )
+        address = FleetAddress.parse(f"fleet://{hosts.place.partition('/')[2]}")
+        link = ZenohEnd(BusLink(connect=(hosts.place,)))
+        options = {"interpret_as": LAYOUT, "reconnect": QUICK}
+        fleet = Fleet(link, address, FLEET, None, PATIENCE, options)
+        await stack.enter_async_context(fleet)
+        await until(lambda: fleet[NAME].connected)
+        work = Work(fleet[NAME])
+        async with work.going_on():
+            await hosts.settled("north")
+            yield hosts, work
+        work.check(box)
+
+
+async def test_killed_agent_is_replaced() -> None:
+    async with hosts_at_work() as (hosts, work):
+        await hosts.agents["north"].kill()
+        await hosts.settled("south")
+        await work.some()
+        assert "Reconnected" in await work.told()
+
+
+async def test_stopped_agent_is_replaced_and_does_not_take_it_back() -> None:
+    async with hosts_at_work() as (hosts, work):
+        hosts.agents["north"].signal(signal.SIGSTOP)  # as if its cable was cut
+        await hosts.settled("south")
+        await work.some()
+        hosts.agents["north"].signal(signal.SIGCONT)
+        await asyncio.sleep(2.0)
+        async with asyncio.timeout(PATIENCE):
+            while len(await hosts.sharing()) != 1:  # noqa: ASYNC110 - the bus tells
+                await asyncio.sleep(0.05)
+        await work.some()
+
+
+async def test_router_that_is_back_soon_changes_nobodys_cameras() -> None:
+    async with hosts_at_work() as (hosts, work):
+        await hosts.restart_router()
+        await hosts.settled("north")
+        await work.some()
+        await asyncio.sleep(3.0)
+        assert await hosts.sharing() == ["north"]
