@@ -65,6 +65,8 @@ RIGHTS: tuple[Right, ...] = (
     Right("hear results and states", "hear", (_ANY.results("**"), _ANY.states("**")), _LOOKS),
     Right("ask what changes nothing", "say", (_ANY.call("*", "**", command=False),), _LOOKS),
     Right("get answers and frames", "hear", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
+    Right("hear results in bundles", "hear", (_ANY.bundle("*"),), _LOOKS),
+    Right("ask what agents know of all cameras", "ask", (_ANY.summary("*"),), _LOOKS),
     Right("JSON: list the cameras", "ask", (_ANY.listing("**"),), _LOOKS),
     Right("JSON: hear topics", "hear", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS),
     Right(
@@ -87,6 +89,8 @@ RIGHTS: tuple[Right, ...] = (
     ),
     Right("answer calls", "say", (_ANY.reply("*"), _ANY.frames("*")), _SHARES),
     Right("tell results and states", "say", (_ANY.results("**"), _ANY.states("**")), _SHARES),
+    Right("tell results in bundles", "say", (_ANY.bundle("*"),), _SHARES),
+    Right("say what it knows of all cameras", "answer", (_ANY.summary("*"),), _SHARES),
     Right("JSON: tell topics", "say", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES),
     Right(
         "JSON: list, serve",
