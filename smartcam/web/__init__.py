@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: an emulator, a camera, wizards, frames, colours, clouds.
+"""Pages and HTTP calls: an emulator, a camera, a fleet, wizards, frames, colours, clouds.
 
 ::
 
@@ -20,11 +20,20 @@ if TYPE_CHECKING:
     from smartcam.web._clouds import CloudSite
     from smartcam.web._colours import ColourSite
     from smartcam.web._emulator import EmulatorSite
+    from smartcam.web._fleet import FleetSite
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._wizard import WizardSite
 
-__all__ = ["CloudSite", "ColourSite", "EmulatorSite", "FramesSite", "LiveSite", "WizardSite"]
+__all__ = [
+    "CloudSite",
+    "ColourSite",
+    "EmulatorSite",
+    "FleetSite",
+    "FramesSite",
+    "LiveSite",
+    "WizardSite",
+]
 
 _resolve = lazy(
     __name__,
@@ -32,6 +41,7 @@ _resolve = lazy(
         "_clouds": "CloudSite",
         "_colours": "ColourSite",
         "_emulator": "EmulatorSite",
+        "_fleet": "FleetSite",
         "_frames": "FramesSite",
         "_live": "LiveSite",
         "_wizard": "WizardSite",

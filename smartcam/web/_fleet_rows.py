@@ -1,0 +1,326 @@
+"""One camera of the fleet's page: what it is, what it has sent, and its last result."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import functools
+import json
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+
+from smartcam.exceptions import InterpretationError, SmartCamError
+from smartcam.models import Localization, Status
+from smartcam.web._live_view import meaning, shown_value
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.fleet import FleetCamera
+    from smartcam.models import CameraEvent, Result
+    from smartcam.streams import BatchSubscription, Subscription
+
+MAX_QUEUE: Final = 64
+"""Results of a camera that wait for a look; of those beyond only their number is known."""
+
+MAX_QUEUE_BYTES: Final = 1 << 18
+"""Bytes of them."""
+
+MAX_KEPT: Final = 1 << 16
+"""Bytes of a result that is kept for its picture; of a longer one its length is told."""
+
+MAX_JUDGED: Final = 200
+"""Records of a result in which pass or fail is looked for."""
+
+MAX_DRAWN: Final = 30
+"""Parts of a result in its picture."""
+
+MAX_TEXT: Final = 160
+"""Characters of a text in a row."""
+
+RATE_SECONDS: Final = 5
+"""Over which a rate is counted."""
+
+BAD_SECONDS: Final = 60.0
+"""For which a camera with an error has the mark of one."""
+
+Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
+OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
+
+MODES: Final = ("error", "lost", "ended", "gone", "awaited", "stopped", "busy", "running")
+"""What a camera is, in a word, the worst first: no agent shares one that is gone; one that has ended
+was taken or given up; one that is awaited was never there."""
+
+_ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
+
+
+class Row:
+    """A camera.
+
+    Args:
+        name: of the camera.
+        ring: is called with the row when something of it may have changed.
+
+    Attributes:
+        agents: that share it.
+        version: of the view, when it was changed last.
+        mode: what it is, in a word.
+        flags: the filters that it passes.
+        count: results that it has sent since it is followed.
+        text: in which a search looks.
+        rate: results in a second.
+        error_at: when it had an error last, on the loop's clock.
+    """
+
+    def __init__(self, name: str, ring: Callable[[Row], None]) -> None:
+        self.name: str = name
+        self.agents: set[str] = set()
+        self.camera: FleetCamera[Any] | None = None
+        self.version: int = 0
+        self.mode: str = "gone"
+        self.flags: frozenset[str] = frozenset({"all"})
+        self.count: int = 0
+        self.errors: int = 0
+        self.rate: float = 0.0
+        self.text: str = name
+        self.error: str = ""
+        self.error_at: float | None = None
+        self._ring = ring
+        self._counted = (0, 0, 0)  # offered, missed, dropped
+        self._last: Result[Any] | None = None
+        self._marks: collections.deque[int] = collections.deque(maxlen=RATE_SECONDS + 1)
+        self._state: tuple[Any, ...] = ()
+        self._connected = False
+        self._results: BatchSubscription[Result[Any]] | None = None
+        self._events: Subscription[CameraEvent] | None = None
+        self._json: tuple[int, str] = (-1, "")
+
+    # ------------------------------------------------------------------ what it follows
+
+    def follow(self, camera: FleetCamera[Any]) -> None:
+        """Follow this object, which may take the place of one that was given up."""
+        if self.camera is camera:
+            return
+        self.leave()
+        self.camera = camera
+        ring = functools.partial(self._ring, self)
+        self._results = camera.results(
+            batch=True, max_queue=MAX_QUEUE, max_queue_bytes=MAX_QUEUE_BYTES
+        )
+        self._events = camera.events(max_queue=1)
+        # every offer rings, so nobody needs to wait for either, nor to take the events
+        self._results.share(_Bell(ring))
+        self._events.share(_Bell(ring))
+        self._ring(self)
+
+    def leave(self) -> None:
+        """Hear nothing more of it; idempotent."""
+        for stream in (self._results, self._events):
+            if stream is not None:
+                stream.close()
+        self._results = self._events = self.camera = None
+        self._counted = (0, 0, 0)
+
+    # ------------------------------------------------------------------ looks
+
+    async def take(self, now: float) -> collections.Counter[str]:
+        """Take what has come; return how it turned out. It does not wait."""
+        outcomes: collections.Counter[str] = collections.Counter()
+        stream = self._results
+        while stream is not None and stream.waiting:
+            try:
+                batch = await anext(stream)
+            except InterpretationError as exc:
+                outcomes["errors"] += 1
+                self._note(str(exc), now)
+                continue
+            except (StopAsyncIteration, SmartCamError):
+                break
+            for result in batch:
+                outcomes[judged(result.value)] += 1
+            self._last = batch[-1]
+        self._account(outcomes, now)
+        return outcomes
+
+    def _account(self, outcomes: collections.Counter[str], now: float) -> None:
+        """Count what came, be it taken or not: a result that nobody judged is another one."""
+        if self._results is None:
+            return
+        said, before = self._results.statistics(), self._counted
+        self._counted = (said.offered, said.missed, said.dropped)
+        offered, missed, dropped = (n - b for n, b in zip(self._counted, before, strict=True))
+        self.count += offered + missed
+        outcomes["other"] += dropped
+        if missed:
+            outcomes["errors"] += missed
+            self._note(f"{missed} results did not come: cut off from the agent for too long", now)
+        self.errors += outcomes["errors"]
+
+    def _note(self, error: str, now: float) -> None:
+        self.error, self.error_at = error[:MAX_TEXT], now
+
+    def refresh(self, now: float) -> tuple[bool, bool]:
+        """Look how the camera is; return whether that changed, and whether it was lost."""
+        camera = self.camera
+        connected = camera is not None and camera.connected and bool(self.agents)
+        lost = self._connected and not connected
+        self._connected = connected
+        status = Status(0)
+        if camera is not None and connected and camera.active_application is not None:
+            status = camera.status
+        reason = "" if connected or camera is None else str(camera.trouble or "")[:MAX_TEXT]
+        mode = self._word(connected, status)
+        bad = self.error_at is not None and now - self.error_at < BAD_SECONDS
+        if self.error_at is not None and not bad:
+            self.error, self.error_at = "", None
+        application = camera.active_application if camera is not None and connected else None
+        state = (mode, int(status), application, reason, self.error, tuple(sorted(self.agents)))
+        if lost:
+            self._note(reason or "lost", now)
+            self.errors += 1
+            bad, state = True, (*state[:4], self.error, state[5])
+        if state == self._state:
+            return False, False
+        self._state = state
+        self.mode = mode
+        self.flags = _flags(mode, status, connected=connected, bad=bad)
+        told = (self.name, *state[5], mode, reason, self.error, application)
+        self.text = "\n".join(str(one) for one in told if one is not None).lower()
+        return True, lost
+
+    def _word(self, connected: bool, status: Status) -> str:
+        if not self.agents or self.camera is None:
+            return "gone"
+        if not connected:
+            if self.camera.ended:
+                return "ended"
+            return "awaited" if self.camera.active_application is None else "lost"
+        if status & _ERRORS:
+            return "error"
+        if status & Status.BUSY:
+            return "busy"
+        if not status & Status.RUNNING:
+            return "stopped"
+        return "running"
+
+    def mark(self) -> bool:
+        """Count the rate, once a second; return whether it will change by itself."""
+        self._marks.append(self.count)
+        seconds = len(self._marks) - 1
+        self.rate = (self._marks[-1] - self._marks[0]) / seconds if seconds else 0.0
+        return self._marks[0] != self.count or len(self._marks) <= RATE_SECONDS
+
+    # ------------------------------------------------------------------ for the page
+
+    @property
+    def last(self) -> Result[Any] | None:
+        """The last result."""
+        return self._last
+
+    @property
+    def last_at(self) -> float:
+        """When the last result came, seconds since 1970; 0 without one."""
+        return self._last.received_at.timestamp() if self._last is not None else 0.0
+
+    def as_json(self) -> str:
+        """Return it as JSON, made once for all who look."""
+        if self._json[0] != self.version:
+            self._json = (self.version, json.dumps(self.fields(), separators=(",", ":")))
+        return self._json[1]
+
+    def fields(self) -> dict[str, Any]:
+        """Return it as a page shows it."""
+        mode, status, application, reason, error, agents = self._state or (
+            "gone",
+            0,
+            None,
+            "",
+            "",
+            (),
+        )
+        return {
+            "name": self.name,
+            "agents": agents,
+            "mode": mode,
+            "status": Status(status).names,
+            "application": application,
+            "reason": reason or error,
+            "rate": round(self.rate, 1),
+            "count": self.count,
+            "errors": self.errors,
+            "last": None if self._last is None else _pictured(self._last),
+        }
+
+
+class _Bell(asyncio.Event):
+    """Calls somebody instead of waking one."""
+
+    def __init__(self, ring: Callable[[], None]) -> None:
+        super().__init__()
+        self._call = ring
+
+    def set(self) -> None:
+        self._call()
+
+
+def _flags(mode: str, status: Status, *, connected: bool, bad: bool) -> frozenset[str]:
+    inspecting = bool(status & Status.RUNNING) and not status & Status.WAITING_FOR_TRIGGER
+    flags = {
+        "all": True,
+        "connected": connected,
+        "errors": bad or not connected or mode == "error",
+        "busy": connected and (inspecting or bool(status & Status.BUSY)),
+        "stopped": mode == "stopped",
+    }
+    return frozenset(name for name, on in flags.items() if on)
+
+
+_meaning = functools.lru_cache(maxsize=4096)(meaning)
+
+
+def judged(value: Any) -> Outcome:
+    """Return how a result turned out, by the names of its truth values."""
+    rows = value if isinstance(value, list) else [value]
+    verdict: Outcome = "other"
+    for row in rows[:MAX_JUDGED]:
+        if isinstance(row, Localization) or not hasattr(row, "_asdict"):
+            return "other"
+        for name, one in row._asdict().items():
+            if one is True or one is False:
+                good = _meaning(name)
+                if good is not None and one is not good:
+                    return "failed"
+                if good is not None:
+                    verdict = "passed"
+    return verdict
+
+
+def _pictured(result: Result[Any]) -> dict[str, Any]:
+    """Return a result as a row shows it: a line of text, or parts to be drawn."""
+    told: dict[str, Any] = {
+        "at": round(result.received_at.timestamp(), 2),
+        "number": result.number,
+        "outcome": judged(result.value),
+    }
+    if len(result.raw) > MAX_KEPT:
+        return {**told, "text": f"{len(result.raw)} bytes"}
+    value = shown_value(result.value)
+    if "parts" in value:
+        parts = [
+            [one["name"][:40], *(round(one[key], 5) for key in ("x", "y", "theta"))]
+            for one in value["parts"][:MAX_DRAWN]
+            if None not in (one["x"], one["y"], one["theta"])
+        ]
+        return {**told, "parts": parts, "parts_count": value["count"]}
+    text = value.get("cut") or _line(value.get("value"))
+    return {**told, "text": text[:MAX_TEXT]}
+
+
+def _line(value: Any) -> str:
+    """Return a value in one line."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_line(one)}" for name, one in list(value.items())[:20])
+    if isinstance(value, list):
+        return f"{len(value)}: " + " | ".join(map(_line, value[:3]))
+    if isinstance(value, float):
+        return f"{value:.5g}"
+    return value if isinstance(value, str) else json.dumps(value)
