@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from smartcam._cli.decode import from_hex
 from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.running import JsonErrors, error_json, exit_code, first
 from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import result_text, table_text
@@ -140,6 +143,32 @@ async def _show_events(events: Subscription[FleetEvent], pattern: str, options: 
 
 def _named_text(result: Result) -> str:
     return f"{result.camera}: {result_text(result)}"
+
+
+# ---------------------------------------------------------------------- page
+
+
+@fleet.command(
+    help="Serve a page of all cameras until Ctrl-C: state, rate, last result, outcomes, errors, "
+    "and a page for each. The page's address goes to stdout. The extra \"web\" is needed, too."
+)
+@click.argument("url")
+@click.option(
+    "--control", is_flag=True, help="The pages may trigger, start, stop and switch applications."
+)
+@page_options("", always=True)
+@runs(*_READING, "--seconds", "--timeout", *OUTPUT, interrupted=0, terminated=0)
+async def page(url: str, control: bool, web: PageOptions, options: Options) -> None:
+    from smartcam.web import FleetSite
+
+    with contextlib.suppress(TimeoutError):  # --seconds are over
+        async with (
+            asyncio.timeout(options.seconds),
+            _opened(url, options) as opened,
+            FleetSite(opened, control=control, **web.place) as site,
+        ):
+            options.show({"page": site.url}, f"page: {site.url}")
+            await asyncio.Event().wait()
 
 
 # ---------------------------------------------------------------------- trigger

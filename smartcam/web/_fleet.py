@@ -191,9 +191,9 @@ def _fleet(site: FleetSite, _call: CallRequest) -> object:
     about="Some rows of the table: the query may have `first`, `count`, `search`, `filter`, "
     "`sort`, `down`.",
 )
-def _cameras(site: FleetSite, call: CallRequest) -> object:
+async def _cameras(site: FleetSite, call: CallRequest) -> object:
     sight: Sight = call.query
-    names = site.view.ordered(sight.query).names
+    names = (await site.view.ordered(sight.query)).names
     there = [site.view.rows.get(one) for one in names[sight.first : sight.first + sight.count]]
     return {"found": len(names), "cameras": [one.fields() for one in there if one is not None]}
 

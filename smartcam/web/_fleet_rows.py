@@ -6,7 +6,7 @@ import asyncio
 import collections
 import functools
 import json
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from smartcam.exceptions import InterpretationError, SmartCamError
 from smartcam.models import Localization, Status
@@ -47,10 +47,25 @@ Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
 OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
 
 MODES: Final = ("error", "lost", "ended", "gone", "awaited", "stopped", "busy", "running")
-"""What a camera is, in a word, the worst first: no agent shares one that is gone; one that has ended
-was taken or given up; one that is awaited was never there."""
+"""What a camera is, in a word, the worst first: one that has ended was taken or given up, no agent
+shares one that is gone, and one that is awaited was never there."""
 
 _ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
+
+
+class State(NamedTuple):
+    """How a camera is."""
+
+    connected: bool
+    over: bool  # it was given up
+    status: Status
+    application: int | None
+    reason: str  # why it is not connected
+    error: str  # the last one
+    agents: tuple[str, ...]
+
+
+UNKNOWN: Final = State(False, False, Status(0), None, "", "", ())
 
 
 class Row:
@@ -68,6 +83,9 @@ class Row:
         count: results that it has sent since it is followed.
         text: in which a search looks.
         rate: results in a second.
+        errors: results that could not be read or did not come, and times that it was lost.
+        error: the last of them, for as long as it is marked.
+        stirred: it may be otherwise than when it was looked at.
         error_at: when it had an error last, on the loop's clock.
     """
 
@@ -84,11 +102,12 @@ class Row:
         self.text: str = name
         self.error: str = ""
         self.error_at: float | None = None
+        self.stirred: bool = False
         self._ring = ring
-        self._counted = (0, 0, 0)  # offered, missed, dropped
+        self._counted = (0, 0)  # missed, dropped
         self._last: Result[Any] | None = None
         self._marks: collections.deque[int] = collections.deque(maxlen=RATE_SECONDS + 1)
-        self._state: tuple[Any, ...] = ()
+        self._state: State = UNKNOWN
         self._connected = False
         self._results: BatchSubscription[Result[Any]] | None = None
         self._events: Subscription[CameraEvent] | None = None
@@ -109,7 +128,12 @@ class Row:
         self._events = camera.events(max_queue=1)
         # every offer rings, so nobody needs to wait for either, nor to take the events
         self._results.share(_Bell(ring))
-        self._events.share(_Bell(ring))
+        self._events.share(_Bell(self.stir))
+        self.stir()
+
+    def stir(self) -> None:
+        """It may be otherwise than before."""
+        self.stirred = True
         self._ring(self)
 
     def leave(self) -> None:
@@ -118,42 +142,46 @@ class Row:
             if stream is not None:
                 stream.close()
         self._results = self._events = self.camera = None
-        self._counted = (0, 0, 0)
+        self._counted = (0, 0)
 
     # ------------------------------------------------------------------ looks
 
     async def take(self, now: float) -> collections.Counter[str]:
         """Take what has come; return how it turned out. It does not wait."""
         outcomes: collections.Counter[str] = collections.Counter()
-        stream = self._results
+        stream, full = self._results, False
         while stream is not None and stream.waiting:
             try:
                 batch = await anext(stream)
             except InterpretationError as exc:
                 outcomes["errors"] += 1
+                self.errors += 1
                 self._note(str(exc), now)
                 continue
             except (StopAsyncIteration, SmartCamError):
                 break
-            for result in batch:
-                outcomes[judged(result.value)] += 1
+            outcomes.update(judged(result.value) for result in batch)
             self._last = batch[-1]
-        self._account(outcomes, now)
+            full |= len(batch) >= MAX_QUEUE
+        self.count += outcomes.total()
+        if full:
+            self.account(outcomes, now)
         return outcomes
 
-    def _account(self, outcomes: collections.Counter[str], now: float) -> None:
-        """Count what came, be it taken or not: a result that nobody judged is another one."""
+    def account(self, outcomes: collections.Counter[str], now: float) -> None:
+        """Count what did not come, or was not taken: a result that nobody judged is another one."""
         if self._results is None:
             return
         said, before = self._results.statistics(), self._counted
-        self._counted = (said.offered, said.missed, said.dropped)
-        offered, missed, dropped = (n - b for n, b in zip(self._counted, before, strict=True))
-        self.count += offered + missed
-        outcomes["other"] += dropped
+        self._counted = (said.missed, said.dropped)
+        missed, dropped = said.missed - before[0], said.dropped - before[1]
         if missed:
-            outcomes["errors"] += missed
             self._note(f"{missed} results did not come: cut off from the agent for too long", now)
-        self.errors += outcomes["errors"]
+            outcomes["errors"] += missed
+            self.errors += missed
+        if dropped:
+            outcomes["other"] += dropped
+        self.count += missed + dropped
 
     def _note(self, error: str, now: float) -> None:
         self.error, self.error_at = error[:MAX_TEXT], now
@@ -163,44 +191,48 @@ class Row:
         camera = self.camera
         connected = camera is not None and camera.connected and bool(self.agents)
         lost = self._connected and not connected
-        self._connected = connected
-        status = Status(0)
-        if camera is not None and connected and camera.active_application is not None:
-            status = camera.status
-        reason = "" if connected or camera is None else str(camera.trouble or "")[:MAX_TEXT]
-        mode = self._word(connected, status)
-        bad = self.error_at is not None and now - self.error_at < BAD_SECONDS
-        if self.error_at is not None and not bad:
-            self.error, self.error_at = "", None
-        application = camera.active_application if camera is not None and connected else None
-        state = (mode, int(status), application, reason, self.error, tuple(sorted(self.agents)))
+        self._connected, self.stirred = connected, False
+        status, application, reason, over = Status(0), None, "", False
+        if camera is not None:
+            over = camera.ended
+            if connected:
+                application = camera.active_application
+                status = status if application is None else camera.status
+            else:
+                reason = str(camera.trouble or "")[:MAX_TEXT]
         if lost:
             self._note(reason or "lost", now)
             self.errors += 1
-            bad, state = True, (*state[:4], self.error, state[5])
+        elif self.error_at is not None and now - self.error_at >= BAD_SECONDS:
+            self.error, self.error_at = "", None
+        state = State(
+            connected, over, status, application, reason, self.error, tuple(sorted(self.agents))
+        )
         if state == self._state:
             return False, False
         self._state = state
-        self.mode = mode
-        self.flags = _flags(mode, status, connected=connected, bad=bad)
-        told = (self.name, *state[5], mode, reason, self.error, application)
-        self.text = "\n".join(str(one) for one in told if one is not None).lower()
+        self._describe(state)
         return True, lost
 
-    def _word(self, connected: bool, status: Status) -> str:
-        if not self.agents or self.camera is None:
+    def _describe(self, state: State) -> None:
+        """Have the words for what it is."""
+        self.mode = self._word(state)
+        self.flags = _flags(self.mode, state, bad=self.error_at is not None)
+        told = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
+        self.text = "\n".join(str(one) for one in told if one is not None).lower()
+
+    def _word(self, state: State) -> str:
+        if not state.agents or self.camera is None:
             return "gone"
-        if not connected:
-            if self.camera.ended:
+        if not state.connected:
+            if state.over:
                 return "ended"
             return "awaited" if self.camera.active_application is None else "lost"
-        if status & _ERRORS:
+        if state.status & _ERRORS:
             return "error"
-        if status & Status.BUSY:
+        if state.status & Status.BUSY:
             return "busy"
-        if not status & Status.RUNNING:
-            return "stopped"
-        return "running"
+        return "running" if state.status & Status.RUNNING else "stopped"
 
     def mark(self) -> bool:
         """Count the rate, once a second; return whether it will change by itself."""
@@ -229,21 +261,14 @@ class Row:
 
     def fields(self) -> dict[str, Any]:
         """Return it as a page shows it."""
-        mode, status, application, reason, error, agents = self._state or (
-            "gone",
-            0,
-            None,
-            "",
-            "",
-            (),
-        )
+        state = self._state
         return {
             "name": self.name,
-            "agents": agents,
-            "mode": mode,
-            "status": Status(status).names,
-            "application": application,
-            "reason": reason or error,
+            "agents": state.agents,
+            "mode": self.mode,
+            "status": state.status.names,
+            "application": state.application,
+            "reason": state.reason or state.error,
             "rate": round(self.rate, 1),
             "count": self.count,
             "errors": self.errors,
@@ -262,7 +287,8 @@ class _Bell(asyncio.Event):
         self._call()
 
 
-def _flags(mode: str, status: Status, *, connected: bool, bad: bool) -> frozenset[str]:
+def _flags(mode: str, state: State, *, bad: bool) -> frozenset[str]:
+    status, connected = state.status, state.connected
     inspecting = bool(status & Status.RUNNING) and not status & Status.WAITING_FOR_TRIGGER
     flags = {
         "all": True,

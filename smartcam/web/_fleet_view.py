@@ -16,7 +16,7 @@ from smartcam.fleet import AgentJoined, AgentLeft, CameraJoined, CameraLeft
 from smartcam.web._fleet_rows import MODES, OUTCOMES, RATE_SECONDS, Row
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable
 
     from smartcam.fleet import Fleet, FleetEvent
     from smartcam.streams import Subscription
@@ -32,8 +32,11 @@ MAX_EVENTS: Final = 50_000
 MAX_GONE: Final = 10_000
 """Cameras that nobody shares any more and that are shown yet; those gone longest are forgotten."""
 
-AT_ONCE: Final = 200
+AT_ONCE: Final = 50
 """Rows or results that are dealt with before everybody else has a turn."""
+
+SIFTED: Final = 1000
+"""Rows that are searched before everybody else has a turn."""
 
 BUCKET: Final = 5
 """Seconds of one bar of the outcomes."""
@@ -162,7 +165,7 @@ class FleetView:
         await self._take(stream, stream.statistics().queued)
         for name, agents in before.items():
             if agents != self.rows[name].agents:
-                self._ring(self.rows[name])
+                self.rows[name].stir()
         await self._look()
 
     async def _hear(self) -> None:
@@ -196,7 +199,7 @@ class FleetView:
                 row = self.rows.get(event.camera)
                 if row is not None:
                     row.agents.discard(event.agent)
-                    self._ring(row)
+                    row.stir()
             case _:
                 pass
 
@@ -208,7 +211,7 @@ class FleetView:
         self.agents.add(agent)
         row.agents.add(agent)
         row.follow(self.fleet[name])
-        self._ring(row)
+        row.stir()
 
     def _ring(self, row: Row) -> None:
         self._rang[row] = None
@@ -222,30 +225,41 @@ class FleetView:
         for row in rang:
             if self.rows.get(row.name) is not row:
                 continue  # it was forgotten
-            before = row.count
-            outcomes = await row.take(loop.time())
-            self._bar.update(outcomes)
-            came = row.count - before
-            self._count += came
-            self._errors += outcomes["errors"]
-            if came:
-                self._aging.add(row)
-            self._refresh(row, loop.time(), came=bool(came))
+            before, now = row.count, loop.time()
+            outcomes = await row.take(now)
+            if row.stirred:
+                row.account(outcomes, now)
+            came = self._count_in(row, outcomes, row.count - before)
+            if row.stirred or outcomes["errors"]:
+                self._refresh(row, now)
             done += 1 + came
             if done >= AT_ONCE:
                 done = 0
                 await asyncio.sleep(0)
 
-    def _refresh(self, row: Row, now: float, *, came: bool = False) -> None:
+    def _count_in(self, row: Row, outcomes: collections.Counter[str], came: int) -> int:
+        """Count what came of a camera; return how many."""
+        if came:
+            self._bar.update(outcomes)
+            self._count += came
+            self._errors += outcomes["errors"]
+            self._aging.add(row)
+            self._change(row)
+        return came
+
+    def _change(self, row: Row) -> None:
+        self.version += 1
+        row.version = self.version
+
+    def _refresh(self, row: Row, now: float) -> None:
         """Look how a camera is."""
-        flags = row.flags if row.version else frozenset[str]()
+        flags = row.flags
         changed, lost = row.refresh(now)
         if lost:
             self._errors += 1
             self._bar["errors"] += 1
-        if changed or came:
-            self.version += 1
-            row.version = self.version
+        if changed:
+            self._change(row)
         if flags is not row.flags:
             self._flags.subtract(flags)
             self._flags.update(row.flags)
@@ -272,10 +286,17 @@ class FleetView:
         now, wall = asyncio.get_running_loop().time(), time.time()
         aging, self._aging = self._aging, set()
         for number, row in enumerate(aging):
-            rate = row.rate
+            if self.rows.get(row.name) is not row:
+                continue  # it was forgotten
+            before, rate = row.count, row.rate
+            outcomes: collections.Counter[str] = collections.Counter()
+            row.account(outcomes, now)
+            self._count_in(row, outcomes, row.count - before)
             if row.mark() or row.error_at is not None:
                 self._aging.add(row)
-            self._refresh(row, now, came=row.rate != rate)
+            if row.rate != rate:
+                self._change(row)
+            self._refresh(row, now)
             if number % AT_ONCE == AT_ONCE - 1:
                 await asyncio.sleep(0)
         self._marks.append(self._count)
@@ -303,8 +324,11 @@ class FleetView:
             "failures": self._errors,
         }
 
-    def ordered(self, query: Query) -> Ordered:
-        """Return the names of a query's rows; made once for all who ask the same."""
+    async def ordered(self, query: Query) -> Ordered:
+        """Return the names of a query's rows; made once for all who ask the same.
+
+        Cancellation: safe.
+        """
         now = asyncio.get_running_loop().time()
         known = self._orders.get(query)
         if known is not None and (known.version == self.version or now - known.at < ORDERED):
@@ -312,7 +336,8 @@ class FleetView:
             return known
         if not self._names:
             self._names = sorted(self.rows)
-        made = Ordered(self._sorted(query), self.version, now)
+        version = self.version
+        made = Ordered(await self._sorted(query), version, now)
         self._orders[query] = made
         self._orders.move_to_end(query)
         while len(self._orders) > MAX_ORDERS:
@@ -324,16 +349,19 @@ class FleetView:
         known = self._orders.get(query)
         return known is None or known.version != self.version
 
-    def _sorted(self, query: Query) -> list[str]:
-        words = query.search.lower().split()
-        rows: Iterable[Row] = map(self.rows.__getitem__, self._names)
-        found = [
-            row
-            for row in rows
-            if query.filter in row.flags and all(one in row.text for one in words)
-        ]
+    async def _sorted(self, query: Query) -> list[str]:
+        words, found = query.search.lower().split(), list[Row]()
+        names = self._names
+        for start in range(0, len(names), SIFTED):
+            rows = map(self.rows.get, names[start : start + SIFTED])
+            found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
+            await asyncio.sleep(0)
         if query.sort in SORTS:
             found.sort(key=SORTS[query.sort], reverse=query.down)
         elif query.down:
             found.reverse()
         return [row.name for row in found]
+
+
+def _fits(row: Row, wanted: str, words: list[str]) -> bool:
+    return wanted in row.flags and all(one in row.text for one in words)

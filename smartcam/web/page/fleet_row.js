@@ -37,7 +37,7 @@ export class Row {
     this.count = cell("number count");
     this.errors = cell("number errors-count");
     this.element = make("div", { className: "camera", role: "row", id: `camera-${count}`, "data-camera": name },
-      this.picture, cell("called", this.link, this.agents), cell("mode", this.mode, this.reason), cell("last", this.said, this.when), this.rate, this.count, this.errors);
+      this.picture, cell("called", this.link, this.agents), cell("state", this.mode, this.reason), cell("last", this.said, this.when), this.rate, this.count, this.errors);
     this.element.addEventListener("click", (event) => event.target !== this.link && this.open());
   }
 
