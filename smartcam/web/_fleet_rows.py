@@ -106,7 +106,7 @@ class Row:
         self._ring = ring
         self._counted = (0, 0)  # missed, dropped
         self._last: Result[Any] | None = None
-        self._marks: collections.deque[int] = collections.deque(maxlen=RATE_SECONDS + 1)
+        self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._state: State = UNKNOWN
         self._connected = False
         self._results: BatchSubscription[Result[Any]] | None = None
@@ -237,9 +237,8 @@ class Row:
     def mark(self) -> bool:
         """Count the rate, once a second; return whether it will change by itself."""
         self._marks.append(self.count)
-        seconds = len(self._marks) - 1
-        self.rate = (self._marks[-1] - self._marks[0]) / seconds if seconds else 0.0
-        return self._marks[0] != self.count or len(self._marks) <= RATE_SECONDS
+        self.rate = (self.count - self._marks[0]) / (len(self._marks) - 1)
+        return self._marks[0] != self.count
 
     # ------------------------------------------------------------------ for the page
 

@@ -107,7 +107,7 @@ class FleetView:
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
-        self._marks: collections.deque[int] = collections.deque(maxlen=RATE_SECONDS + 1)
+        self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._count = self._errors = 0
         self._orders: collections.OrderedDict[Query, Ordered] = collections.OrderedDict()
         self._events: Subscription[FleetEvent] | None = None
@@ -312,8 +312,7 @@ class FleetView:
 
     def totals(self) -> dict[str, Any]:
         """Return what is true of all cameras."""
-        seconds = len(self._marks) - 1
-        rate = (self._marks[-1] - self._marks[0]) / seconds if seconds > 0 else 0.0
+        rate = (self._marks[-1] - self._marks[0]) / max(1, len(self._marks) - 1)
         counts = {name: self._flags[name] for name in ("connected", "errors", "busy", "stopped")}
         return {
             "cameras": len(self.rows),
