@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
 
-
 class Checked(NamedTuple):
     """A value with a verdict, as a layout's."""
 
