@@ -257,7 +257,6 @@ class FleetView:
         changed, lost = row.refresh(now)
         if lost:
             self._errors += 1
-            self._bar["errors"] += 1
         if changed:
             self._change(row)
         if flags is not row.flags:

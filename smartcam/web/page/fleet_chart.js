@@ -45,8 +45,8 @@ export function drawChart(svg, bars, now) {
   for (const bar of seen) {
     let y = low;
     for (const [kind] of KINDS) {
-      const high = (bar[PLACES[kind]] / most) * (low - top);
-      if (!high) continue;
+      if (!bar[PLACES[kind]]) continue;
+      const high = Math.max(1, (bar[PLACES[kind]] / most) * (low - top)); // one of many can be seen, too
       y -= high;
       drawn.push(draw("rect", { class: kind, x: x(bar[0]).toFixed(1), y: y.toFixed(1), width: Math.max(1, wide - 0.6).toFixed(1), height: high.toFixed(1) }));
     }
