@@ -48,7 +48,7 @@ class World(NamedTuple):
     @contextlib.asynccontextmanager
     async def events(self, camera: str = "line1/cam1") -> AsyncIterator[Listener]:
         url = self.caller.site.api + self.path("/events", camera)
-        async with self.caller.session.get(aiohttp.client.URL(url, encoded=True)) as response:
+        async with self.caller.session.get(url) as response:
             assert response.status == 200
             yield Listener(response)
 
@@ -59,7 +59,7 @@ async def served(fleet: Fleet, **options: Any) -> AsyncIterator[World]:
     async with (
         fleet,
         FleetSite(fleet, **options) as site,
-        aiohttp.ClientSession(requote_redirect_url=False) as session,
+        aiohttp.ClientSession() as session,
     ):
         yield World(fleet, site, Caller(site, session, ""))
 

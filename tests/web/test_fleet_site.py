@@ -372,7 +372,7 @@ async def test_every_result_has_one_outcome(monkeypatch: pytest.MonkeyPatch) -> 
             world.fleet["line01/cam002"].send(GOOD)
         await asyncio.sleep(1.5)
         later = time.time() + 2 * BUCKET
-        monkeypatch.setattr(view_module.time, "time", lambda: later)
+        monkeypatch.setattr(time, "time", lambda: later)
         await asyncio.sleep(1.5)
         sums = [sum(bar[place] for bar in view.series) for place in (1, 2, 3, 4)]
         assert sums == [2 + MAX_QUEUE, 1, 1 + 10, 1 + 7]
