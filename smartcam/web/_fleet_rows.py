@@ -199,7 +199,7 @@ class Row:
                 application = camera.active_application
                 status = status if application is None else camera.status
             else:
-                reason = str(camera.trouble or "")[:MAX_TEXT]
+                reason = _why(camera)
         if lost:
             self._note(reason or "lost", now)
             self.errors += 1
@@ -273,6 +273,14 @@ class Row:
             "errors": self.errors,
             "last": None if self._last is None else _pictured(self._last),
         }
+
+
+def _why(camera: FleetCamera[Any]) -> str:
+    """Return why a camera is not connected: what its agent says, where there is one."""
+    trouble = camera.trouble
+    if trouble is None:
+        return ""
+    return str(trouble.__cause__ or trouble).removeprefix(f"{camera.name}: ")[:MAX_TEXT]
 
 
 class _Bell(asyncio.Event):

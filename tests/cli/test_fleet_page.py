@@ -23,6 +23,7 @@ cameras:
 """
 
 
+@pytest.mark.long
 def test_page_of_a_file_looks_only_and_ends_with_ctrl_c(tmp_path: Path) -> None:
     path = tmp_path / "plant.yaml"
     path.write_text(FILE.format(place="tcp/127.0.0.1:0"), encoding="utf-8")

@@ -118,7 +118,7 @@ async def test_camera_is_left_when_nobody_looks_any_more() -> None:
         streams = len(camera.statistics().subscribers)
         async with world.events() as events:
             await events.next()
-            await asyncio.sleep(3 * LINGER)
+            await asyncio.sleep(LINGER + 3)
             assert len(camera.statistics().subscribers) == streams + 2
         await asyncio.sleep(LINGER + 3)
         assert len(camera.statistics().subscribers) == streams
