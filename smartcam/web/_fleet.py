@@ -194,8 +194,13 @@ def _fleet(site: FleetSite, _call: CallRequest) -> object:
 async def _cameras(site: FleetSite, call: CallRequest) -> object:
     sight: Sight = call.query
     names = (await site.view.ordered(sight.query)).names
-    there = [site.view.rows.get(one) for one in names[sight.first : sight.first + sight.count]]
-    return {"found": len(names), "cameras": [one.fields() for one in there if one is not None]}
+    found: list[dict[str, Any]] = []
+    for name in names[sight.first : sight.first + sight.count]:
+        row = site.view.rows.get(name)
+        if row is not None:  # it was not forgotten meanwhile
+            found.append(row.fields())
+            await asyncio.sleep(0)
+    return {"found": len(names), "cameras": found}
 
 
 @CALLS.add(

@@ -35,6 +35,9 @@ LONGEST: Final = 1024
 ALIVE: Final = 5.0
 """Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
 
+QUICK: Final = 0.05
+"""Seconds between two messages at least, to a page that looks here and there."""
+
 AT_ONCE: Final = 10
 """Rows that are made JSON before everybody else has a turn."""
 
@@ -100,6 +103,7 @@ class FleetSocket(PageSocket):
             if text or loop.time() - said_at >= ALIVE:
                 await self._send(text or "{}")
                 said_at = loop.time()
+                await asyncio.sleep(QUICK)
             try:
                 async with asyncio.timeout(PERIOD):
                     await self._moved.wait()

@@ -155,15 +155,15 @@ async def test_columns_sort(page: Page) -> None:
         assert (await visible(page))[0] == names(FEW)[-1]
 
 
-async def test_keys_go_through_the_table_and_open_a_camera(page: Page) -> None:
+async def test_keys_go_through_the_table(page: Page) -> None:
     async with opened(page, MadeUpFleet(names(FEW)).as_fleet):
-        await page.focus("#box")
+        await page.focus("#grid")
         await page.keyboard.press("ArrowDown")
         await page.keyboard.press("ArrowDown")
         chosen = page.locator(".camera[data-chosen=true]")
         assert await chosen.get_attribute("data-camera") == names(3)[2]
         assert await page.get_attribute(
-            "#box", "aria-activedescendant"
+            "#grid", "aria-activedescendant"
         ) == await chosen.get_attribute("id")
         await page.keyboard.press("End")
         await see(page, f"{row(names(FEW)[-1])}[data-chosen=true]")
@@ -229,6 +229,20 @@ async def test_one_camera_is_triggered_on_its_page(page: Page) -> None:
         square = f"{row('line1/cam1')} polygon[data-part=square]"
         assert len(str(await page.get_attribute(square, "points")).split()) == 4
         assert site.view.rows["line1/cam1"].count == 1
+
+
+async def test_key_opens_a_camera_and_back_finds_the_table_as_it_was(page: Page) -> None:
+    async with smartcam.fleet.open(CELL) as fleet, opened(page, fleet):
+        await page.click("[data-filter=connected]")
+        await page.focus("#grid")
+        await page.keyboard.press("ArrowDown")
+        await see(page, f"{row('line1/cam2')}[data-chosen=true]")
+        await page.keyboard.press("Enter")
+        await see(page, "#name", "line1/cam2")
+        await page.locator(LIVE).wait_for()
+        await page.go_back()
+        await see(page, row("line1/cam1"))
+        assert page.url.endswith("/?filter=connected")
 
 
 async def test_without_control_there_is_no_trigger_and_an_unknown_camera_is_told(

@@ -180,9 +180,9 @@ function place() {
 function choose(index, scroll = true) {
   chosen = index;
   const name = table.names[chosen - table.first];
-  for (const [each, row] of shown) row.choose(each === name && document.activeElement === $("box"));
-  if (name) $("box").setAttribute("aria-activedescendant", shown.get(name).element.id);
-  else $("box").removeAttribute("aria-activedescendant");
+  for (const [each, row] of shown) row.choose(each === name && document.activeElement === $("grid"));
+  if (name) $("grid").setAttribute("aria-activedescendant", shown.get(name).element.id);
+  else $("grid").removeAttribute("aria-activedescendant");
   if (!scroll) return;
   const [top, high, box] = [chosen * height(), height(), $("box")];
   if (top < box.scrollTop) box.scrollTop = top;
@@ -199,14 +199,15 @@ const KEYS = {
   End: () => table.found - 1,
 };
 
-$("box").addEventListener("keydown", (event) => {
-  if (event.target !== $("box") || event.ctrlKey || event.metaKey || event.altKey) return;
+$("grid").addEventListener("keydown", (event) => {
+  if (event.target !== $("grid") || event.ctrlKey || event.metaKey || event.altKey) return;
   if (event.key === "Enter") shown.get(table.names[chosen - table.first])?.open();
   else if (KEYS[event.key]) choose(Math.max(0, Math.min(table.found - 1, KEYS[event.key]())));
   else return;
   event.preventDefault();
 });
-for (const kind of ["focus", "blur"]) $("box").addEventListener(kind, () => choose(chosen, false));
+$("box").addEventListener("focus", () => $("grid").focus({ preventScroll: true })); // a click, or a browser whose keys go to what scrolls
+for (const kind of ["focus", "blur"]) $("grid").addEventListener(kind, () => choose(chosen, false));
 $("box").addEventListener("scroll", () => requestAnimationFrame(sight), { passive: true });
 addEventListener("resize", () => {
   place();
