@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._errors import RefusedError, shown
-from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, Sight
+from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, RowsInSight
 from smartcam.web._fleet_view import FleetView
 from smartcam.web._live import CALLS as LIVE_CALLS
-from smartcam.web._live_camera import LiveCamera
+from smartcam.web._live_camera import WatchedCamera
 from smartcam.web._pictures import FILES
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._shapes import OUTLINES
@@ -82,7 +82,7 @@ class FleetSite(Site):
         self.control: bool = control
         self.view: FleetView = FleetView(fleet)
         self.viewers: set[FleetSocket] = set()
-        self._live: dict[str, LiveCamera] = {}
+        self._live: dict[str, WatchedCamera] = {}
         self._keeper: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
@@ -123,7 +123,7 @@ class FleetSite(Site):
 
     # ------------------------------------------------------------------ one camera
 
-    def live(self, name: str) -> LiveCamera:
+    def live(self, name: str) -> WatchedCamera:
         """Return what follows a camera for its own page; it is made where there is none.
 
         Raises:
@@ -135,7 +135,7 @@ class FleetSite(Site):
         known.used_at = asyncio.get_running_loop().time()
         return known
 
-    def _followed(self, name: str) -> LiveCamera:
+    def _followed(self, name: str) -> WatchedCamera:
         try:
             camera = self.fleet[name]
         except ConfigurationError as exc:
@@ -143,7 +143,7 @@ class FleetSite(Site):
         if len(self._live) >= MAX_CAMERAS:
             what = f"camera {MAX_CAMERAS + 1} on a page of its own"
             raise RefusedError(503, what, f"{MAX_CAMERAS} at one time")
-        live = self._live[name] = LiveCamera(camera, control=self.control)
+        live = self._live[name] = WatchedCamera(camera, control=self.control)
         row = self.view.rows.get(name)
         live.start()
         if row is not None and row.last is not None:
@@ -187,12 +187,12 @@ def _fleet(site: FleetSite, _call: CallRequest) -> object:
 @CALLS.add(
     "GET",
     f"{API}/cameras",
-    query=Sight,
+    query=RowsInSight,
     about="Some rows of the table: the query may have `first`, `count`, `search`, `filter`, "
     "`sort`, `down`.",
 )
 async def _cameras(site: FleetSite, call: CallRequest) -> object:
-    sight: Sight = call.query
+    sight: RowsInSight = call.query
     names = (await site.view.ordered(sight.query)).names
     found: list[dict[str, Any]] = []
     for name in names[sight.first : sight.first + sight.count]:

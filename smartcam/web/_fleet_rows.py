@@ -53,7 +53,7 @@ shares one that is gone, and one that is awaited was never there."""
 _ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
 
 
-class State(NamedTuple):
+class RowState(NamedTuple):
     """How a camera is."""
 
     connected: bool
@@ -65,10 +65,10 @@ class State(NamedTuple):
     agents: tuple[str, ...]
 
 
-UNKNOWN: Final = State(False, False, Status(0), None, "", "", ())
+UNKNOWN: Final = RowState(False, False, Status(0), None, "", "", ())
 
 
-class Row:
+class FleetRow:
     """A camera.
 
     Args:
@@ -89,7 +89,7 @@ class Row:
         error_at: when it had an error last, on the loop's clock.
     """
 
-    def __init__(self, name: str, ring: Callable[[Row], None]) -> None:
+    def __init__(self, name: str, ring: Callable[[FleetRow], None]) -> None:
         self.name: str = name
         self.agents: set[str] = set()
         self.camera: FleetCamera[Any] | None = None
@@ -107,7 +107,7 @@ class Row:
         self._counted = (0, 0)  # missed, dropped
         self._last: Result[Any] | None = None
         self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
-        self._state: State = UNKNOWN
+        self._state: RowState = UNKNOWN
         self._connected = False
         self._results: BatchSubscription[Result[Any]] | None = None
         self._events: Subscription[CameraEvent] | None = None
@@ -127,8 +127,8 @@ class Row:
         )
         self._events = camera.events(max_queue=1)
         # every offer rings, so nobody needs to wait for either, nor to take the events
-        self._results.share(_Bell(ring))
-        self._events.share(_Bell(self.stir))
+        self._results.share(_RowBell(ring))
+        self._events.share(_RowBell(self.stir))
         self.stir()
 
     def stir(self) -> None:
@@ -205,7 +205,7 @@ class Row:
             self.errors += 1
         elif self.error_at is not None and now - self.error_at >= BAD_SECONDS:
             self.error, self.error_at = "", None
-        state = State(
+        state = RowState(
             connected, over, status, application, reason, self.error, tuple(sorted(self.agents))
         )
         if state == self._state:
@@ -214,14 +214,14 @@ class Row:
         self._describe(state)
         return True, lost
 
-    def _describe(self, state: State) -> None:
+    def _describe(self, state: RowState) -> None:
         """Have the words for what it is."""
         self.mode = self._word(state)
         self.flags = _flags(self.mode, state, bad=self.error_at is not None)
         told = (self.name, *state.agents, self.mode, state.reason, state.error, state.application)
         self.text = "\n".join(str(one) for one in told if one is not None).lower()
 
-    def _word(self, state: State) -> str:
+    def _word(self, state: RowState) -> str:
         if not state.agents or self.camera is None:
             return "gone"
         if not state.connected:
@@ -283,7 +283,7 @@ def _why(camera: FleetCamera[Any]) -> str:
     return str(trouble.__cause__ or trouble).removeprefix(f"{camera.name}: ")[:MAX_TEXT]
 
 
-class _Bell(asyncio.Event):
+class _RowBell(asyncio.Event):
     """Calls somebody instead of waking one."""
 
     def __init__(self, ring: Callable[[], None]) -> None:
@@ -294,7 +294,7 @@ class _Bell(asyncio.Event):
         self._call()
 
 
-def _flags(mode: str, state: State, *, bad: bool) -> frozenset[str]:
+def _flags(mode: str, state: RowState, *, bad: bool) -> frozenset[str]:
     status, connected = state.status, state.connected
     inspecting = bool(status & Status.RUNNING) and not status & Status.WAITING_FOR_TRIGGER
     flags = {

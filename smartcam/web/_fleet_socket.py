@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from smartcam.web._fleet_view import PERIOD, Filter, Query, Sort
+from smartcam.web._fleet_view import PERIOD, Filter, RowQuery, Sort
 from smartcam.web._sockets import PageSocket
 from smartcam.web._streams import SLOW
 
@@ -45,7 +45,7 @@ TOTALS: Final = 1.0
 """Seconds between two tellings of what is true of all cameras."""
 
 
-class Sight(BaseModel):
+class RowsInSight(BaseModel):
     """What a page has in sight."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
@@ -58,9 +58,9 @@ class Sight(BaseModel):
     down: bool = False
 
     @property
-    def query(self) -> Query:
+    def query(self) -> RowQuery:
         """Which rows, in which order."""
-        return Query(self.search, self.filter, self.sort, self.down)
+        return RowQuery(self.search, self.filter, self.sort, self.down)
 
 
 class FleetSocket(PageSocket):
@@ -76,7 +76,7 @@ class FleetSocket(PageSocket):
         super().__init__(request, PROTOCOL, "row", heartbeat=SLOW, longest=LONGEST)
         self._view = view
         self._about = about
-        self._sight = Sight()
+        self._sight = RowsInSight()
         self._moved = asyncio.Event()  # something else is in sight
         self._looked = -1  # version of the view that was looked at
         self._seen: dict[str, int] = {}  # versions of the rows that the page has
@@ -87,7 +87,7 @@ class FleetSocket(PageSocket):
 
     def _hear(self, said: str) -> bool:
         try:
-            self._sight = Sight.model_validate_json(said)
+            self._sight = RowsInSight.model_validate_json(said)
         except ValidationError:
             return False
         self._moved.set()

@@ -13,7 +13,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
 from smartcam.fleet import AgentJoined, AgentLeft, CameraJoined, CameraLeft
-from smartcam.web._fleet_rows import MODES, OUTCOMES, RATE_SECONDS, Row
+from smartcam.web._fleet_rows import MODES, OUTCOMES, RATE_SECONDS, FleetRow
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,7 +53,7 @@ MAX_ORDERS: Final = 64
 Filter: TypeAlias = Literal["all", "connected", "errors", "busy", "stopped"]
 Sort: TypeAlias = Literal["name", "state", "rate", "last", "errors"]
 
-SORTS: Final[dict[str, Callable[[Row], Any]]] = {
+SORTS: Final[dict[str, Callable[[FleetRow], Any]]] = {
     "state": lambda row: MODES.index(row.mode),
     "rate": lambda row: row.rate,
     "last": lambda row: row.last_at,
@@ -62,7 +62,7 @@ SORTS: Final[dict[str, Callable[[Row], Any]]] = {
 """What rows are sorted by, but their name."""
 
 
-class Query(NamedTuple):
+class RowQuery(NamedTuple):
     """Which rows, in which order."""
 
     search: str = ""  # words that all must be in a row
@@ -71,7 +71,7 @@ class Query(NamedTuple):
     down: bool = False  # the last one first
 
 
-class Ordered(NamedTuple):
+class RowOrder(NamedTuple):
     """Names in an order."""
 
     names: list[str]
@@ -95,21 +95,21 @@ class FleetView:
 
     def __init__(self, fleet: Fleet) -> None:
         self.fleet: Fleet = fleet
-        self.rows: dict[str, Row] = {}
+        self.rows: dict[str, FleetRow] = {}
         self.version: int = 0
         self.series: collections.deque[tuple[int, ...]] = collections.deque(maxlen=SERIES // BUCKET)
         self.ended: bool = True
         self.agents: set[str] = set()
         self._names: list[str] = []  # sorted; empty: to be made anew
-        self._rang: dict[Row, None] = {}
-        self._aging: set[Row] = set()  # whose rate or mark of an error changes by itself
+        self._rang: dict[FleetRow, None] = {}
+        self._aging: set[FleetRow] = set()  # whose rate or mark of an error changes by itself
         self._gone: dict[str, None] = {}  # the one gone longest first
         self._flags: collections.Counter[str] = collections.Counter()
         self._bar: collections.Counter[str] = collections.Counter()
         self._bar_at = 0
         self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._count = self._errors = 0
-        self._orders: collections.OrderedDict[Query, Ordered] = collections.OrderedDict()
+        self._orders: collections.OrderedDict[RowQuery, RowOrder] = collections.OrderedDict()
         self._events: Subscription[FleetEvent] | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -206,14 +206,14 @@ class FleetView:
     def _join(self, name: str, agent: str) -> None:
         row = self.rows.get(name)
         if row is None:
-            row = self.rows[name] = Row(name, self._ring)
+            row = self.rows[name] = FleetRow(name, self._ring)
             self._names = []
         self.agents.add(agent)
         row.agents.add(agent)
         row.follow(self.fleet[name])
         row.stir()
 
-    def _ring(self, row: Row) -> None:
+    def _ring(self, row: FleetRow) -> None:
         self._rang[row] = None
 
     # ------------------------------------------------------------------ what they do
@@ -237,7 +237,7 @@ class FleetView:
                 done = 0
                 await asyncio.sleep(0)
 
-    def _count_in(self, row: Row, outcomes: collections.Counter[str], came: int) -> int:
+    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], came: int) -> int:
         """Count what came of a camera; return how many."""
         if came:
             self._bar.update(outcomes)
@@ -247,11 +247,11 @@ class FleetView:
             self._change(row)
         return came
 
-    def _change(self, row: Row) -> None:
+    def _change(self, row: FleetRow) -> None:
         self.version += 1
         row.version = self.version
 
-    def _refresh(self, row: Row, now: float) -> None:
+    def _refresh(self, row: FleetRow, now: float) -> None:
         """Look how a camera is."""
         flags = row.flags
         changed, lost = row.refresh(now)
@@ -322,7 +322,7 @@ class FleetView:
             "failures": self._errors,
         }
 
-    async def ordered(self, query: Query) -> Ordered:
+    async def ordered(self, query: RowQuery) -> RowOrder:
         """Return the names of a query's rows; made once for all who ask the same.
 
         Cancellation: safe.
@@ -335,20 +335,20 @@ class FleetView:
         if not self._names:
             self._names = sorted(self.rows)
         version = self.version
-        made = Ordered(await self._sorted(query), version, now)
+        made = RowOrder(await self._sorted(query), version, now)
         self._orders[query] = made
         self._orders.move_to_end(query)
         while len(self._orders) > MAX_ORDERS:
             self._orders.popitem(last=False)
         return made
 
-    def is_late(self, query: Query) -> bool:
+    def is_late(self, query: RowQuery) -> bool:
         """Whether a query's order is of before the last change."""
         known = self._orders.get(query)
         return known is None or known.version != self.version
 
-    async def _sorted(self, query: Query) -> list[str]:
-        words, found = query.search.lower().split(), list[Row]()
+    async def _sorted(self, query: RowQuery) -> list[str]:
+        words, found = query.search.lower().split(), list[FleetRow]()
         names = self._names
         for start in range(0, len(names), SIFTED):
             rows = map(self.rows.get, names[start : start + SIFTED])
@@ -361,5 +361,5 @@ class FleetView:
         return [row.name for row in found]
 
 
-def _fits(row: Row, wanted: str, words: list[str]) -> bool:
+def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:
     return wanted in row.flags and all(one in row.text for one in words)

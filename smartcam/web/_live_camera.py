@@ -25,7 +25,7 @@ class ShowsCamera(Protocol):
         ...
 
 
-class LiveCamera:
+class WatchedCamera:
     """One camera of a site of many, while somebody looks at it.
 
     Args:
