@@ -56,6 +56,7 @@ def test_fleet_that_is_not_there_yet_is_awaited(tmp_path: Path) -> None:
         assert shown.wait().code == 0
 
 
+@pytest.mark.long
 def test_waiting_ends_after_its_seconds() -> None:
     pytest.importorskip("zenoh", reason="needs the extra fleet")
     with closed_port() as gone:

@@ -14,6 +14,7 @@ import pytest
 from smartcam.exceptions import InterpretationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion, Status
 from smartcam.web import FleetSite
+from smartcam.web import _fleet as site_module
 from smartcam.web import _fleet_view as view_module
 from smartcam.web._fleet import CALLS, MAX_VIEWERS
 from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT, MAX_QUEUE, judged
@@ -434,14 +435,16 @@ async def test_page_may_look_elsewhere_while_nothing_happens() -> None:
 # ---------------------------------------------------------------------- who may look
 
 
-async def test_lookers_are_bounded() -> None:
+async def test_lookers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert MAX_VIEWERS > 3
+    monkeypatch.setattr(site_module, "MAX_VIEWERS", 3)
     async with served(3) as world, contextlib.AsyncExitStack() as stack:
-        for _ in range(MAX_VIEWERS):
+        for _ in range(3):
             await stack.enter_async_context(world.looking())
         headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
         answer = await world.caller.call("GET", "/api/table", headers=headers)
         assert answer.status == 503
-        assert len(world.site.viewers) == MAX_VIEWERS
+        assert len(world.site.viewers) == 3
 
 
 async def test_what_is_no_socket_of_this_page_is_refused() -> None:
