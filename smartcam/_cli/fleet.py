@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -9,15 +11,19 @@ import click
 from smartcam._cli.decode import from_hex
 from smartcam._cli.fleet_certificates import certificates
 from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.running import JsonErrors, error_json, exit_code, first
 from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import result_text, table_text
+from smartcam.backoff import Backoff
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._keys import meets
 from smartcam.models import jsonable
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
     from smartcam.fleet import CameraSummary, Fleet, FleetEvent, FleetResults
     from smartcam.models import Result
     from smartcam.streams import Subscription
@@ -175,6 +181,56 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
             options.show(outcome, f"{name}: {outcome}")
     if codes:
         raise SystemExit(codes[0])
+
+
+# ---------------------------------------------------------------------- page
+
+
+@fleet.command(
+    help="Serve a page of all cameras until Ctrl-C: state, rate, last result, outcomes, errors, "
+    "and a page for each. The page's address goes to stdout. A fleet of which no agent is there is "
+    'awaited. Needs the extra "web", too.'
+)
+@click.argument("url")
+@click.option(
+    "--control", is_flag=True, help="The pages may trigger, start, stop and switch applications."
+)
+@page_options("", always=True)
+@runs(*_READING, "--seconds", "--timeout", *OUTPUT, interrupted=0, terminated=0)
+async def page(url: str, control: bool, web: PageOptions, options: Options) -> None:
+    from smartcam.web import FleetSite
+
+    with contextlib.suppress(TimeoutError):  # --seconds are over
+        async with (
+            asyncio.timeout(options.seconds),
+            contextlib.AsyncExitStack() as stack,
+        ):
+            opened = await stack.enter_async_context(_awaited(url, options))
+            site = FleetSite(opened, control=control, **web.place)
+            await stack.enter_async_context(site)
+            options.show({"page": site.url}, f"page: {site.url}")
+            await asyncio.Event().wait()
+
+
+@contextlib.asynccontextmanager
+async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
+    """Have the fleet open, once an agent of it is there."""
+    told = False
+    for delay in Backoff(maximum=2.0).delays():
+        opened = _opened(url, options)
+        try:
+            await opened.open()
+        except ConnectFailedError as exc:
+            if not told:
+                click.echo(f"{exc}; it is awaited", err=True)
+            told = True
+        else:
+            try:
+                yield opened
+            finally:
+                await opened.close()
+            return
+        await asyncio.sleep(delay)
 
 
 # ---------------------------------------------------------------------- trigger

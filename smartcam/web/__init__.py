@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: an emulator, a camera, wizards, frames, colours, clouds.
+"""Pages and HTTP calls: an emulator, a camera, a fleet, wizards, frames, colours, clouds.
 
 ::
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from smartcam.web._clouds import CloudSite
     from smartcam.web._colours import ColourSite
     from smartcam.web._emulator import EmulatorSite
+    from smartcam.web._fleet import FleetSite
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._operations import OperationsSite
@@ -29,6 +30,7 @@ __all__ = [
     "CloudSite",
     "ColourSite",
     "EmulatorSite",
+    "FleetSite",
     "FramesSite",
     "LiveSite",
     "OperationsSite",
@@ -41,6 +43,7 @@ _resolve = lazy(
         "_clouds": "CloudSite",
         "_colours": "ColourSite",
         "_emulator": "EmulatorSite",
+        "_fleet": "FleetSite",
         "_frames": "FramesSite",
         "_live": "LiveSite",
         "_operations": "OperationsSite",

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from smartcam.exceptions import SmartCamError
 from smartcam.web._errors import RefusedError
+from smartcam.web._live_camera import state_of
 from smartcam.web._live_frames import LiveFrames
 from smartcam.web._live_view import LiveView
 from smartcam.web._pictures import FILES
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator
 
     from smartcam.camera import Camera
+    from smartcam.web._live_camera import ShowsCamera
 
 MAX_NEWS = 20
 """Results in one event: at ten a second the page sees 200 a second, and is told what it missed."""
@@ -82,14 +84,13 @@ class LiveSite(Site):
 
     def state(self) -> dict[str, Any]:
         """Return how the camera is, and what the page may do, as JSON."""
-        has_frames = self.frames.pictures is not None
-        return {**self.view.state(), "control": self.control, "frames": has_frames}
+        return state_of(self)
 
 
 class LiveReader:
     """What one reader knows."""
 
-    def __init__(self, site: LiveSite, since: int | None = None) -> None:
+    def __init__(self, site: ShowsCamera, since: int | None = None) -> None:
         self._site = site
         self._view = site.view
         oldest = self._view.entries[0].serial if self._view.entries else self._view.serial
@@ -143,11 +144,11 @@ class _SwitchBody(CallBody):
 
 # ---------------------------------------------------------------------- what calls do
 
-CALLS: Calls[LiveSite] = Calls()
+CALLS: Calls[ShowsCamera] = Calls()
 """All calls."""
 
 
-async def _commanded(site: LiveSite, do: Callable[[], Awaitable[Any]]) -> Any:
+async def _commanded(site: ShowsCamera, do: Callable[[], Awaitable[Any]]) -> Any:
     """Do something to the camera, where that is allowed."""
     if not site.control:
         raise RefusedError(403, "a command to the camera", "looking only: no --control was given")
@@ -160,25 +161,25 @@ async def _commanded(site: LiveSite, do: Callable[[], Awaitable[Any]]) -> Any:
 
 
 @CALLS.add("GET", API)
-def _calls(_site: LiveSite, _call: CallRequest) -> object:
+def _calls(_site: ShowsCamera, _call: CallRequest) -> object:
     """These calls."""
     return {"calls": CALLS.as_json()}
 
 
 @CALLS.add("GET", f"{API}/camera")
-def _camera(site: LiveSite, _call: CallRequest) -> object:
+def _camera(site: ShowsCamera, _call: CallRequest) -> object:
     """How the camera is, and what was counted."""
     return {**site.state(), "account": site.view.account()}
 
 
 @CALLS.add("GET", f"{API}/results")
-def _results(site: LiveSite, _call: CallRequest) -> object:
+def _results(site: ShowsCamera, _call: CallRequest) -> object:
     """The last results, the oldest first."""
     return {"results": [one.as_json() for one in site.view.entries]}
 
 
 @CALLS.add("GET", f"{API}/picture")
-def _picture(site: LiveSite, _call: CallRequest) -> web.Response:
+def _picture(site: ShowsCamera, _call: CallRequest) -> web.Response:
     """The last picture that was fetched, as the camera sends it."""
     picture = site.view.picture
     if picture is None:
@@ -188,7 +189,7 @@ def _picture(site: LiveSite, _call: CallRequest) -> web.Response:
 
 
 @CALLS.add("POST", f"{API}/picture")
-def _want_picture(site: LiveSite, _call: CallRequest) -> object:
+def _want_picture(site: ShowsCamera, _call: CallRequest) -> object:
     """Ask the camera for its picture anew, once a second at most; the events tell of it."""
     site.view.want_picture()
     return site.view.state()
@@ -199,7 +200,7 @@ def _want_picture(site: LiveSite, _call: CallRequest) -> object:
     f"{API}/frames",
     about="A WebSocket of a camera with frames, as [here](frames.md#calls): one after each `next`.",
 )
-async def _frames(site: LiveSite, call: CallRequest) -> web.StreamResponse:
+async def _frames(site: ShowsCamera, call: CallRequest) -> web.StreamResponse:
     pictures = site.frames.pictures
     if pictures is None:
         raise RefusedError(404, "a camera without frames", "one of a fleet, with frames: URL there")
@@ -211,14 +212,14 @@ async def _frames(site: LiveSite, call: CallRequest) -> web.StreamResponse:
     f"{API}/events",
     about="What happens, as server-sent events: camera, results, picture, account, clock.",
 )
-def _events(site: LiveSite, call: CallRequest) -> object:
+def _events(site: ShowsCamera, call: CallRequest) -> object:
     last = call.request.headers.get("Last-Event-ID", "")
     since = int(last) if last.isdecimal() and len(last) < 20 else None
     return site.streams.serve(call.request, LiveReader(site, since).look)
 
 
 @CALLS.add("POST", f"{API}/trigger", body=_TriggerBody, optional=True, sample='{"timeout": 5.0}')
-async def _trigger(site: LiveSite, call: CallRequest) -> object:
+async def _trigger(site: ShowsCamera, call: CallRequest) -> object:
     """Trigger; answers when the result is there, which the events tell."""
     body: _TriggerBody = call.body
     camera = site.view.camera
@@ -227,21 +228,21 @@ async def _trigger(site: LiveSite, call: CallRequest) -> object:
 
 
 @CALLS.add("POST", f"{API}/switch", body=_SwitchBody, sample='{"application": 7}')
-async def _switch(site: LiveSite, call: CallRequest) -> object:
+async def _switch(site: ShowsCamera, call: CallRequest) -> object:
     """Load another application."""
     await _commanded(site, lambda: site.view.camera.switch_application(call.body.application))
     return site.view.state()
 
 
 @CALLS.add("POST", f"{API}/start")
-async def _start(site: LiveSite, _call: CallRequest) -> object:
+async def _start(site: ShowsCamera, _call: CallRequest) -> object:
     """Enter run mode."""
     await _commanded(site, site.view.camera.start)
     return site.view.state()
 
 
 @CALLS.add("POST", f"{API}/stop")
-async def _stop(site: LiveSite, _call: CallRequest) -> object:
+async def _stop(site: ShowsCamera, _call: CallRequest) -> object:
     """Leave run mode."""
     await _commanded(site, site.view.camera.stop)
     return site.view.state()

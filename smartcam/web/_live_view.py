@@ -58,7 +58,7 @@ class ShownResult(NamedTuple):
             "latency": result.latency,
             "size": len(result.raw),
             "raw": result.raw[:MAX_SHOWN_RAW].hex(" "),
-            **_shown(result.value),
+            **shown_value(result.value),
         }
 
 
@@ -126,6 +126,10 @@ class LiveView:
         self.camera = camera
         self._subscribe(camera)
         self.start()
+
+    def show(self, result: Result[Any]) -> None:
+        """Show a result of before it was followed."""
+        self._add(result)
 
     def want_picture(self) -> None:
         """Have the camera's picture fetched when its time has come, while anybody looks."""
@@ -239,7 +243,7 @@ class LiveView:
             self.picture = Picture(1 + (self.picture.serial if self.picture else 0), data)
 
 
-def _shown(value: Any) -> dict[str, Any]:
+def shown_value(value: Any) -> dict[str, Any]:
     """Return a value as the page shows it: parts that it draws, or JSON, cut where it is long."""
     if isinstance(value, list) and all(isinstance(one, Localization) for one in value):
         found: list[Localization] = value

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import inspect
 import json
 import logging
@@ -39,7 +40,7 @@ READ_TIMEOUT = 10.0
 C = TypeVar("C")
 
 _Method: TypeAlias = Literal["GET", "POST", "PUT", "DELETE"]
-_Action: TypeAlias = "Callable[[C, CallRequest], object]"
+Action: TypeAlias = "Callable[[C, CallRequest], object]"
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 _Model = type[BaseModel] | TypeAdapter[Any]
 
@@ -69,7 +70,7 @@ class _Call(Generic[C]):
     about: str  # what it does and answers, for people
     # does it, given the site and what was asked; returns the answer, or raises RefusedError. An
     # event stream returns a coroutine.
-    handler: _Action[C]
+    handler: Action[C]
     query: type[BaseModel] | None = None  # the query's model; None: it takes none
     body: _Model | None = None  # the body's model; None: it takes none
     optional: bool = False  # whether it may come without its body
@@ -165,20 +166,24 @@ class Calls(Generic[C]):
 
     def add(
         self, method: _Method, path: str, *, about: str = "", **takes: Any
-    ) -> Callable[[_Action[C]], _Action[C]]:
+    ) -> Callable[[Action[C]], Action[C]]:
         """Make the function below a call's handler; its docstring says what the call is about.
 
         ``about`` says it where the docstring has no room for it; ``takes`` are ``query``, ``body``,
         ``optional`` and ``sample`` of the call.
         """
 
-        def declare(handler: _Action[C]) -> _Action[C]:
+        def declare(handler: Action[C]) -> Action[C]:
             text = about or " ".join((handler.__doc__ or "").split())
             row = _Call(method=method, path=path, about=text, handler=handler, **takes)
             self._rows.append(row)
             return handler
 
         return declare
+
+    def adopt(self, row: _Call[Any], path: str, handler: Action[C]) -> None:
+        """Have another table's call, at a path of this one's, done by this handler."""
+        self._rows.append(dataclasses.replace(row, path=path, handler=handler))
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return them as JSON-able rows: ``method``, ``path``, ``about``, ``body``."""

@@ -19,7 +19,7 @@ from smartcam.web._routes import MAX_BODY, middleware, routes
 from smartcam.web._streams import Streams
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Mapping
 
     from smartcam.web._routes import Calls
 
@@ -49,6 +49,7 @@ class Site(Server):
             Pages may use ``base.css`` and ``base.js``, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
         files: of others that the page uses beside these.
+        pages: files that are pages of their own, by their path, as aiohttp's router takes it.
 
     Attributes:
         host: as given.
@@ -68,6 +69,7 @@ class Site(Server):
         port: int = 0,
         token: str | None = None,
         files: tuple[str, ...] = (),
+        pages: Mapping[str, str] | None = None,
     ) -> None:
         if token is not None:
             checked_token(token)
@@ -79,6 +81,7 @@ class Site(Server):
         self._calls = calls
         self._page = page
         self._files = ("base.css", "base.js", f"{page}.css", f"{page}.js", *files)
+        self._pages = dict(pages or {})
         self._port = port
         self._open: OpenPort | None = None
 
@@ -156,6 +159,8 @@ class Site(Server):
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
         application.router.add_get("/", _file(f"{self._page}.html"))
+        for path, name in self._pages.items():
+            application.router.add_get(path, _file(name))
         for name in self._files:
             application.router.add_get(f"/{name}", _file(name))
         return application

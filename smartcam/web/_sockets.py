@@ -28,16 +28,23 @@ class PageSocket(ABC):
         protocol: of it.
         what: is shown, for the log.
         heartbeat: seconds between pings, by which one that vanished is noticed; None: none.
+        longest: bytes of what it may say.
     """
 
     def __init__(
-        self, request: web.Request, protocol: str, what: str, *, heartbeat: float | None = None
+        self,
+        request: web.Request,
+        protocol: str,
+        what: str,
+        *,
+        heartbeat: float | None = None,
+        longest: int = LONGEST_WORD,
     ) -> None:
         self._request = request
         self._what = what
         self._socket = web.WebSocketResponse(
             protocols=(protocol,),
-            max_msg_size=LONGEST_WORD,
+            max_msg_size=longest,
             timeout=FAREWELL,
             compress=False,
             heartbeat=heartbeat,
@@ -77,9 +84,16 @@ class PageSocket(ABC):
         """Hear that something was shown, until the page goes or says something else."""
         while True:
             message = await self._socket.receive()
-            if message.type is not WSMsgType.TEXT or message.data != "next":
+            if message.type is not WSMsgType.TEXT:
                 return
-            self._shown.set()
+            if message.data == "next":
+                self._shown.set()
+            elif not self._hear(message.data):
+                return
+
+    def _hear(self, _said: str) -> bool:
+        """Hear something else; False where it means nothing, which ends it."""
+        return False
 
 
 async def _first(*jobs: Coroutine[object, object, object]) -> None:

@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
 
@@ -23,6 +23,12 @@ from smartcam.web import _routes as routes
 from smartcam.web import _serialize as serialize
 from smartcam.web import _streams as streams
 from smartcam.web._emulator import CALLS
+from smartcam.web._fleet import CALLS as FLEET_CALLS
+from smartcam.web._fleet import LINGER, MAX_CAMERAS
+from smartcam.web._fleet import MAX_VIEWERS as MAX_FLEET_VIEWERS
+from smartcam.web._fleet_rows import BAD_SECONDS, MAX_QUEUE
+from smartcam.web._fleet_socket import ALIVE, MAX_ROWS
+from smartcam.web._fleet_view import BUCKET, PERIOD, SERIES, SORTS, Filter
 from smartcam.web._frames import CALLS as FRAMES_CALLS
 from smartcam.web._live import CALLS as LIVE_CALLS
 from smartcam.web._live import MAX_NEWS
@@ -32,7 +38,11 @@ from smartcam.web._wizard import CALLS as WIZARD_CALLS
 from tests import ROOT
 from tests.web.sitekit import TOKEN
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
 PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
+FLEET_PAGE = (ROOT / "docs" / "fleet-page.md").read_text(encoding="utf-8")
 LIVE_PAGE = (ROOT / "docs" / "live.md").read_text(encoding="utf-8")
 FRAMES_PAGE = (ROOT / "docs" / "frames.md").read_text(encoding="utf-8")
 WIZARD_PAGE = (ROOT / "docs" / "calibrating.md").read_text(encoding="utf-8")
@@ -54,6 +64,26 @@ def test_live_page_has_its_numbers() -> None:
     assert {one.removesuffix("ed") for one in words} | NOT_WORDS == named
 
 
+def test_fleet_page_has_its_numbers() -> None:
+    assert (PERIOD, SERIES, BUCKET, ALIVE) == (0.2, 600, 5, 5.0)  # which it has as words
+    said = {
+        f"for {BAD_SECONDS:g} s after a loss",
+        f"in sight, {MAX_ROWS} at most",
+        f"shows nothing for {streams.SLOW:g} s",
+        f"may be {MAX_FLEET_VIEWERS} at a time, and {MAX_CAMERAS} cameras",
+        f"and {LINGER:g} s longer",
+        f"two looks, {MAX_QUEUE} are looked at",
+        "`filter` is " + _listed(get_args(Filter)),
+        "`sort` is " + _listed(["name", *SORTS]),
+    }
+    assert [text for text in said if text not in FLEET_PAGE] == []
+
+
+def _listed(words: Sequence[str]) -> str:
+    *first, last = [f"`{word}`" for word in words]
+    return f"{', '.join(first)} or {last}"
+
+
 def test_frames_page_has_its_numbers() -> None:
     assert f"There may be {MAX_VIEWERS} of them" in FRAMES_PAGE
     assert f"takes no picture for {streams.SLOW:g} s" in FRAMES_PAGE
@@ -64,12 +94,13 @@ def test_frames_page_has_its_numbers() -> None:
     [
         (PAGE, CALLS),
         (LIVE_PAGE, LIVE_CALLS),
+        (FLEET_PAGE, [one for one in FLEET_CALLS if "{camera}" not in one.path]),
         (WIZARD_PAGE, WIZARD_CALLS),
         (FRAMES_PAGE, FRAMES_CALLS),
     ],
-    ids=["control", "live", "calibrating", "frames"],
+    ids=["control", "live", "fleet", "calibrating", "frames"],
 )
-def test_table_has_every_call(page: str, calls: routes.Calls[Any]) -> None:
+def test_table_has_every_call(page: str, calls: Iterable[Any]) -> None:
     table = page.partition("\n## Calls\n")[2].partition("\n`GET /api")[0]
     rows = [[cell.strip() for cell in row.split("|")[1:-1]] for row in table.splitlines()[3:]]
     assert [row for row in rows if row] == [

@@ -8,6 +8,13 @@ const OLD_S = 10; // a result of before is called old
 const SERIES = 300; // seconds that the plots show
 const MM = 1000;
 
+// One camera of a fleet has a page of its own; its calls stand under its name.
+const FLEETS = location.pathname.startsWith("/camera/");
+const CALLED = decodeURIComponent(location.pathname.slice("/camera/".length));
+const API = FLEETS ? `/api/cameras/${encodeURIComponent(CALLED)}` : "/api";
+const SERVED = FLEETS ? "smartcam fleet page" : "smartcam live";
+
+let unknown = ""; // why there is no such camera
 let state = null; // the camera, as its events tell it
 let reached = false; // whether the page's own server answers
 let results = []; // the newest first
@@ -54,18 +61,19 @@ async function listen() {
     let watchdog = setTimeout(stop, SILENT_MS);
     try {
       const more = last === null ? {} : { "Last-Event-ID": last };
-      const response = await ask("/api/events", { headers: more, signal: quiet.signal });
+      const response = await ask(`${API}/events`, { headers: more, signal: quiet.signal });
       for await (const event of events(response.body)) {
         clearTimeout(watchdog);
         watchdog = setTimeout(stop, SILENT_MS);
         pause = 300;
-        reached = true;
+        [reached, unknown] = [true, ""];
         last = event.id ?? last;
         TAKE[event.kind]?.(event.data);
         showAlarm();
       }
     } catch (error) {
       if (error.status === 401) return;
+      unknown = error.status ? error.message : "";
     } finally {
       clearTimeout(watchdog);
     }
@@ -130,18 +138,19 @@ function showControls(can) {
   $("looking").hidden = state.control;
 }
 
-$("trigger").addEventListener("click", () => act("", "/api/trigger", {}));
-$("start").addEventListener("click", () => act("It runs.", "/api/start"));
-$("stop").addEventListener("click", () => act("It has stopped.", "/api/stop"));
+$("trigger").addEventListener("click", () => act("", `${API}/trigger`, {}));
+$("start").addEventListener("click", () => act("It runs.", `${API}/start`));
+$("stop").addEventListener("click", () => act("It has stopped.", `${API}/stop`));
 $("switch").addEventListener("submit", (event) => {
   event.preventDefault();
-  act("Loaded.", "/api/switch", { application: $("application").valueAsNumber });
+  act("Loaded.", `${API}/switch`, { application: $("application").valueAsNumber });
 });
 
 // Says in words what is wrong; what is shown is dimmed then, as it is of before.
 function showAlarm() {
   let text = "";
-  if (!reached) text = "This page's server does not answer: smartcam live has ended, or the network is gone. What is shown is of before.";
+  if (unknown) text = `${unknown} It is asked for again.`;
+  else if (!reached) text = `This page's server does not answer: ${SERVED} has ended, or the network is gone. What is shown is of before.`;
   else if (state && state.connection !== "connected") {
     const since = clock(state.changed_at);
     const why = state.loss ? ` (${state.loss})` : "";
@@ -149,8 +158,8 @@ function showAlarm() {
     text = {
       awaited: state.loss ? `The camera is not reached yet; it is tried again. ${state.loss}` : "The camera is being connected.",
       lost: `The camera is lost since ${since}${why}; it is tried again.${tried} What is shown is of before.`,
-      taken: `Another client has taken the camera, at ${since}. Start smartcam live again to take it back.`,
-      ended: `The camera is given up, at ${since}${why}. Start smartcam live again.`,
+      taken: `Another client has taken the camera, at ${since}. ${FLEETS ? "Its agent can take it back." : "Start smartcam live again to take it back."}`,
+      ended: `The camera is given up, at ${since}${why}.${FLEETS ? "" : " Start smartcam live again."}`,
     }[state.connection];
   }
   if ($("gate").hidden) $("alarm").hidden = !text;
@@ -349,7 +358,7 @@ function takeFrames() {
     frames = null;
     return;
   }
-  frames = new Source({ name: "What the camera sees", path: "/api/frames" });
+  frames = new Source({ name: "What the camera sees", path: `${API}/frames` });
   frames.view.addEventListener("click", enlarge);
   $("main").append(frames.panel);
 }
@@ -375,7 +384,7 @@ async function takePicture({ serial }) {
   try {
     while (newest && newest !== shown) {
       const wanted = newest;
-      const data = await (await ask("/api/picture")).blob();
+      const data = await (await ask(`${API}/picture`)).blob();
       $("image").src = await new Promise((done, failed) => {
         const reader = new FileReader();
         reader.onload = () => done(reader.result);
@@ -392,7 +401,7 @@ async function takePicture({ serial }) {
   fetching = false;
 }
 
-$("fetch").addEventListener("click", () => act("", "/api/picture"));
+$("fetch").addEventListener("click", () => act("", `${API}/picture`));
 
 // ---------------------------------------------------------------------- account and plots
 
@@ -449,6 +458,9 @@ function plot(id, points) {
 
 // ---------------------------------------------------------------------- begin
 
+$("back").hidden = !FLEETS;
+if (FLEETS) setText("name", CALLED);
+setText("gate-served", SERVED);
 atGate(listen);
 setInterval(showAge, 500);
 addEventListener("resize", drawParts);

@@ -1,0 +1,246 @@
+"""The site of a fleet: all its cameras in one table, and each on a live page of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.web._errors import RefusedError, shown
+from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, RowsInSight
+from smartcam.web._fleet_view import FleetView
+from smartcam.web._live import CALLS as LIVE_CALLS
+from smartcam.web._live_camera import WatchedCamera
+from smartcam.web._pictures import FILES
+from smartcam.web._routes import CallRequest, Calls
+from smartcam.web._shapes import OUTLINES
+from smartcam.web._site import API, Site
+
+if TYPE_CHECKING:
+    from aiohttp import web
+
+    from smartcam.fleet import Fleet
+    from smartcam.web._live_camera import ShowsCamera
+    from smartcam.web._routes import Action
+
+MAX_VIEWERS: Final = 32
+"""Pages of the table at one time."""
+
+MAX_CAMERAS: Final = 16
+"""Cameras that are looked at on a page of their own, at one time."""
+
+LINGER: Final = 30.0
+"""Seconds that a camera is followed for its own page after nobody looks at that any more."""
+
+KEEP_PERIOD: Final = 1.0
+"""Seconds between two looks at whether anybody does."""
+
+
+class FleetSite(Site):
+    """A page and HTTP calls that show the cameras of a fleet, and each on a page of its own.
+
+    ::
+
+        async with smartcam.fleet.open("fleet://plant-server") as fleet, FleetSite(fleet) as site:
+            site.url    # http://127.0.0.1:PORT/
+
+    Args:
+        fleet: it, opened; closed by who made it.
+        control: whether the pages may trigger, start, stop and switch cameras.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry, as :class:`~smartcam.web.FramesSite` has it.
+
+    Attributes:
+        view: what the table shows.
+        control: as given.
+        viewers: who looks at the table.
+
+    Raises:
+        ConfigurationError: the token cannot be used.
+    """
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        *,
+        control: bool = False,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        super().__init__(
+            CALLS,
+            "fleet",
+            host=host,
+            port=port,
+            token=token,
+            files=(*FILES, "fleet_chart.js", "fleet_row.js", "live.css", "live.js"),
+            pages={"/camera/{name:.+}": "live.html"},
+        )
+        self.fleet: Fleet = fleet
+        self.control: bool = control
+        self.view: FleetView = FleetView(fleet)
+        self.viewers: set[FleetSocket] = set()
+        self._live: dict[str, WatchedCamera] = {}
+        self._keeper: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Follow the fleet, and open the port.
+
+        Raises:
+            ConfigurationError: it cannot listen there.
+
+        Cancellation: leaves it stopped.
+        """
+        try:
+            await self.view.start()
+            if self._keeper is None:
+                self._keeper = asyncio.create_task(self._keep(), name="smartcam.web.fleet.keeper")
+            await super().start()
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def stop(self) -> None:
+        """Close the port, and leave the fleet alone."""
+        keeper, self._keeper = self._keeper, None
+        if keeper is not None:
+            keeper.cancel()
+            await asyncio.wait([keeper])
+        for viewer in self.viewers:
+            viewer.end()
+        try:
+            for name in list(self._live):
+                await self._live.pop(name).stop()
+            await super().stop()
+        finally:
+            await self.view.stop()
+
+    def about(self) -> dict[str, Any]:
+        """Return what a page is told first, as JSON."""
+        return {"fleet": self.fleet.url, "control": self.control, "outlines": OUTLINES}
+
+    # ------------------------------------------------------------------ one camera
+
+    def live(self, name: str) -> WatchedCamera:
+        """Return what follows a camera for its own page; it is made where there is none.
+
+        Raises:
+            RefusedError: 404, no camera is called so; 503, there are :data:`MAX_CAMERAS` already.
+        """
+        known = self._live.get(name)
+        if known is None:
+            known = self._followed(name)
+        known.used_at = asyncio.get_running_loop().time()
+        return known
+
+    def _followed(self, name: str) -> WatchedCamera:
+        try:
+            camera = self.fleet[name]
+        except ConfigurationError as exc:
+            raise RefusedError(404, str(exc)[:300], "a camera of the fleet") from exc
+        if len(self._live) >= MAX_CAMERAS:
+            what = f"camera {MAX_CAMERAS + 1} on a page of its own"
+            raise RefusedError(503, what, f"{MAX_CAMERAS} at one time")
+        live = self._live[name] = WatchedCamera(camera, control=self.control)
+        row = self.view.rows.get(name)
+        live.start()
+        if row is not None and row.last is not None:
+            live.view.show(row.last)
+        return live
+
+    async def _keep(self) -> None:
+        """Leave cameras that nobody looks at, and follow those that became another object."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(KEEP_PERIOD)
+            for name, live in list(self._live.items()):
+                if not live.watched and loop.time() - live.used_at > LINGER:
+                    del self._live[name]
+                    await live.stop()
+                    continue
+                camera = live.view.camera
+                if (now := self.fleet[name]) is not camera:
+                    await live.view.follow(now, live.view.loss)
+
+
+# ---------------------------------------------------------------------- what calls do
+
+CALLS: Calls[FleetSite] = Calls()
+"""All calls."""
+
+
+@CALLS.add("GET", API)
+def _calls(_site: FleetSite, _call: CallRequest) -> object:
+    """These calls."""
+    return {"calls": CALLS.as_json()}
+
+
+@CALLS.add("GET", f"{API}/fleet")
+def _fleet(site: FleetSite, _call: CallRequest) -> object:
+    """The fleet: how many cameras are how, and the outcomes of the last ten minutes."""
+    about = {"fleet": site.fleet.url, "control": site.control, "agents": sorted(site.view.agents)}
+    return {**about, "totals": site.view.totals(), "bars": list(site.view.series)}
+
+
+@CALLS.add(
+    "GET",
+    f"{API}/cameras",
+    query=RowsInSight,
+    about="Some rows of the table: the query may have `first`, `count`, `search`, `filter`, "
+    "`sort`, `down`.",
+)
+async def _cameras(site: FleetSite, call: CallRequest) -> object:
+    sight: RowsInSight = call.query
+    names = (await site.view.ordered(sight.query)).names
+    found: list[dict[str, Any]] = []
+    for name in names[sight.first : sight.first + sight.count]:
+        row = site.view.rows.get(name)
+        if row is not None:  # it was not forgotten meanwhile
+            found.append(row.fields())
+            await asyncio.sleep(0)
+    return {"found": len(names), "cameras": found}
+
+
+@CALLS.add(
+    "GET",
+    f"{API}/table",
+    about="A WebSocket: what changed of the rows in sight, five times a second at most, the next "
+    "after each `next`; it is told as JSON, as in `/api/cameras`, which rows are in sight.",
+)
+async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
+    headers = call.request.headers
+    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", PROTOCOL).split(",")]
+    if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
+        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
+    if len(site.viewers) >= MAX_VIEWERS:
+        raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
+    viewer = FleetSocket(site.view, site.about(), call.request)
+    site.viewers.add(viewer)
+    try:
+        return await viewer.serve()
+    finally:
+        site.viewers.discard(viewer)
+
+
+def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:
+    """Return the handler that does it to the camera of the path."""
+
+    def handle(site: FleetSite, call: CallRequest) -> object:
+        return handler(site.live(call.path["camera"]), call)
+
+    return handle
+
+
+def _add_live_calls() -> None:
+    """Have the live page's calls for each camera."""
+    for row in LIVE_CALLS:
+        if row.path == API:
+            continue
+        rest = row.path.removeprefix(API).removeprefix("/camera")
+        CALLS.adopt(row, f"{API}/cameras/{{camera}}{rest}", _of_camera(row.handler))
+
+
+_add_live_calls()

@@ -1,0 +1,169 @@
+"""One who looks at the fleet's page: is told what changed of the rows in sight."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from smartcam.web._fleet_view import PERIOD, Filter, RowQuery, Sort
+from smartcam.web._sockets import PageSocket
+from smartcam.web._streams import SLOW
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from aiohttp import web
+
+    from smartcam.web._fleet_view import FleetView
+
+PROTOCOL: Final = "smartcam.fleet"
+"""Of the WebSockets."""
+
+MAX_ROWS: Final = 120
+"""Rows that may be in sight: three times those of a tall screen."""
+
+MAX_SEARCH: Final = 100
+"""Characters that are searched for."""
+
+LONGEST: Final = 1024
+"""Bytes of what a page may say."""
+
+ALIVE: Final = 5.0
+"""Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
+
+QUICK: Final = 0.05
+"""Seconds between two messages at least, to a page that looks here and there."""
+
+AT_ONCE: Final = 10
+"""Rows that are made JSON before everybody else has a turn."""
+
+TOTALS: Final = 1.0
+"""Seconds between two tellings of what is true of all cameras."""
+
+
+class RowsInSight(BaseModel):
+    """What a page has in sight."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+
+    first: int = Field(default=0, ge=0, le=1_000_000)
+    count: int = Field(default=40, ge=0, le=MAX_ROWS)
+    search: str = Field(default="", max_length=MAX_SEARCH)
+    filter: Filter = "all"
+    sort: Sort = "name"
+    down: bool = False
+
+    @property
+    def query(self) -> RowQuery:
+        """Which rows, in which order."""
+        return RowQuery(self.search, self.filter, self.sort, self.down)
+
+
+class FleetSocket(PageSocket):
+    """One who looks.
+
+    Args:
+        view: of the fleet.
+        about: is told first.
+        request: that asks for the WebSocket.
+    """
+
+    def __init__(self, view: FleetView, about: dict[str, Any], request: web.Request) -> None:
+        super().__init__(request, PROTOCOL, "row", heartbeat=SLOW, longest=LONGEST)
+        self._view = view
+        self._about = about
+        self._sight = RowsInSight()
+        self._moved = asyncio.Event()  # something else is in sight
+        self._looked = -1  # version of the view that was looked at
+        self._seen: dict[str, int] = {}  # versions of the rows that the page has
+        self._window: tuple[Any, ...] = ()  # that the page has: what is found, and which names
+        self._totals: dict[str, Any] = {}
+        self._totals_at = -TOTALS
+        self._bars = 0  # start of the last bar of outcomes that the page has
+
+    def _hear(self, said: str) -> bool:
+        try:
+            self._sight = RowsInSight.model_validate_json(said)
+        except ValidationError:
+            return False
+        self._moved.set()
+        return True
+
+    async def _show(self) -> None:
+        """Tell what changed, and wait until it is shown; TimeoutError: it is not."""
+        loop = asyncio.get_running_loop()
+        await self._send(json.dumps({**self._about, "now": time.time()}))
+        said_at = loop.time()
+        while not self._view.ended:
+            text = await self._news()
+            if text or loop.time() - said_at >= ALIVE:
+                await self._send(text or "{}")
+                said_at = loop.time()
+                await asyncio.sleep(QUICK)
+            try:
+                async with asyncio.timeout(PERIOD):
+                    await self._moved.wait()
+            except TimeoutError:
+                pass
+
+    async def _send(self, text: str) -> None:
+        self._shown.clear()
+        async with asyncio.timeout(SLOW):
+            await self._socket.send_str(text)
+            await self._shown.wait()
+
+    # ------------------------------------------------------------------ what is new
+
+    async def _news(self) -> str:
+        """Return what the page does not know yet; "" for nothing."""
+        moved = self._moved.is_set()
+        self._moved.clear()
+        parts = [*self._changed_totals()]
+        if moved or self._looked != self._view.version or self._view.is_late(self._sight.query):
+            self._looked = self._view.version
+            parts += [*await self._changed_rows(), *self._new_bars()]
+        return f'{{{",".join(parts)},"now":{time.time():.2f}}}' if parts else ""
+
+    def _changed_totals(self) -> Iterator[str]:
+        now = asyncio.get_running_loop().time()
+        if now - self._totals_at < TOTALS:
+            return
+        totals = self._view.totals()
+        if totals != self._totals:
+            self._totals, self._totals_at = totals, now
+            yield f'"totals":{json.dumps(totals)}'
+
+    async def _changed_rows(self) -> list[str]:
+        view, sight, parts = self._view, self._sight, list[str]()
+        ordered = await view.ordered(sight.query)
+        found = len(ordered.names)
+        first = max(0, min(sight.first, found - sight.count))
+        names = [one for one in ordered.names[first : first + sight.count] if one in view.rows]
+        window = (found, first, names)
+        if window != self._window:
+            self._window = window
+            parts.append(f'"found":{found},"first":{first},"names":{json.dumps(names)}')
+        seen, self._seen = self._seen, {}
+        changed: list[str] = []
+        for name in names:
+            row = view.rows.get(name)
+            if row is None:
+                continue  # it was forgotten
+            self._seen[name] = row.version
+            if seen.get(name) != row.version:
+                changed.append(row.as_json())
+                if len(changed) % AT_ONCE == 0:
+                    await asyncio.sleep(0)
+        if changed:
+            parts.append(f'"rows":[{",".join(changed)}]')
+        return parts
+
+    def _new_bars(self) -> Iterator[str]:
+        bars = [one for one in self._view.series if one[0] > self._bars]
+        if bars:
+            self._bars = bars[-1][0]
+            yield f'"bars":{json.dumps(bars)}'

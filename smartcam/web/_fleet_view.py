@@ -1,0 +1,365 @@
+"""What the fleet's page knows: follows a fleet once, however many look.
+
+One task looks five times a second at what rang, which costs nothing while nothing happens. Nobody
+who looks is waited for: they ask for rows in an order, and for what is newer than they know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import logging
+import time
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+
+from smartcam.fleet import AgentJoined, AgentLeft, CameraJoined, CameraLeft
+from smartcam.web._fleet_rows import MODES, OUTCOMES, RATE_SECONDS, FleetRow
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.fleet import Fleet, FleetEvent
+    from smartcam.streams import Subscription
+
+_log = logging.getLogger("smartcam.web")
+
+PERIOD: Final = 0.2
+"""Seconds between two looks, and between two updates of a page."""
+
+MAX_EVENTS: Final = 50_000
+"""Of cameras that come and go, between two looks; with more the fleet is looked at anew."""
+
+MAX_GONE: Final = 10_000
+"""Cameras that nobody shares any more and that are shown yet; those gone longest are forgotten."""
+
+AT_ONCE: Final = 50
+"""Rows or results that are dealt with before everybody else has a turn."""
+
+SIFTED: Final = 1000
+"""Rows that are searched before everybody else has a turn."""
+
+BUCKET: Final = 5
+"""Seconds of one bar of the outcomes."""
+
+SERIES: Final = 600
+"""Seconds of outcomes."""
+
+ORDERED: Final = 1.0
+"""Seconds that an order stays while what it goes by changes: rows that jump cannot be read."""
+
+MAX_ORDERS: Final = 64
+"""Orders that are kept for those who look."""
+
+Filter: TypeAlias = Literal["all", "connected", "errors", "busy", "stopped"]
+Sort: TypeAlias = Literal["name", "state", "rate", "last", "errors"]
+
+SORTS: Final[dict[str, Callable[[FleetRow], Any]]] = {
+    "state": lambda row: MODES.index(row.mode),
+    "rate": lambda row: row.rate,
+    "last": lambda row: row.last_at,
+    "errors": lambda row: row.errors,
+}
+"""What rows are sorted by, but their name."""
+
+
+class RowQuery(NamedTuple):
+    """Which rows, in which order."""
+
+    search: str = ""  # words that all must be in a row
+    filter: Filter = "all"
+    sort: Sort = "name"
+    down: bool = False  # the last one first
+
+
+class RowOrder(NamedTuple):
+    """Names in an order."""
+
+    names: list[str]
+    version: int  # of the view, when it was made
+    at: float
+
+
+class FleetView:
+    """Follows a fleet.
+
+    Args:
+        fleet: it, opened; closed by whoever made it.
+
+    Attributes:
+        rows: cameras by name.
+        version: of all rows; grows with each change.
+        series: outcomes that were counted: start of a bar, seconds since 1970, and how many passed,
+            failed, told neither, were errors. Bars of nothing are left out.
+        ended: it follows no more.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self.fleet: Fleet = fleet
+        self.rows: dict[str, FleetRow] = {}
+        self.version: int = 0
+        self.series: collections.deque[tuple[int, ...]] = collections.deque(maxlen=SERIES // BUCKET)
+        self.ended: bool = True
+        self.agents: set[str] = set()
+        self._names: list[str] = []  # sorted; empty: to be made anew
+        self._rang: dict[FleetRow, None] = {}
+        self._aging: set[FleetRow] = set()  # whose rate or mark of an error changes by itself
+        self._gone: dict[str, None] = {}  # the one gone longest first
+        self._flags: collections.Counter[str] = collections.Counter()
+        self._bar: collections.Counter[str] = collections.Counter()
+        self._bar_at = 0
+        self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
+        self._count = self._errors = 0
+        self._orders: collections.OrderedDict[RowQuery, RowOrder] = collections.OrderedDict()
+        self._events: Subscription[FleetEvent] | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    # ------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Begin: all cameras that are there are known when it returns."""
+        if self._task is None:
+            self.ended = False
+            await self._begin()
+            self._task = asyncio.create_task(self._run(), name="smartcam.web.fleet")
+
+    async def stop(self) -> None:
+        """End; harmless when done twice."""
+        task, self._task = self._task, None
+        self.ended = True
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+        if self._events is not None:
+            self._events.close()
+        for row in self.rows.values():
+            row.leave()
+
+    async def _run(self) -> None:
+        try:
+            ticks = 0
+            while True:
+                await asyncio.sleep(PERIOD)
+                ticks += 1
+                await self._hear()
+                await self._look()
+                if ticks * PERIOD >= 1.0:
+                    ticks = 0
+                    await self._age()
+        except Exception:
+            _log.exception("! the fleet's page follows no more: a fault of ours")
+            raise
+        finally:
+            self.ended = True
+
+    # ------------------------------------------------------------------ who is there
+
+    async def _begin(self) -> None:
+        """Learn who is there."""
+        if self._events is not None:
+            self._events.close()
+        self._events = stream = self.fleet.events(max_queue=MAX_EVENTS)
+        before = {row.name: set(row.agents) for row in self.rows.values()}
+        self.agents.clear()
+        for row in self.rows.values():
+            row.agents.clear()
+        await self._take(stream, stream.statistics().queued)
+        for name, agents in before.items():
+            if agents != self.rows[name].agents:
+                self.rows[name].stir()
+        await self._look()
+
+    async def _hear(self) -> None:
+        """Hear who came and who went."""
+        stream = self._events
+        if stream is None:
+            return
+        account = stream.statistics()
+        if account.dropped:
+            await self._begin()
+        else:
+            await self._take(stream, account.queued)
+
+    async def _take(self, stream: Subscription[FleetEvent], count: int) -> None:
+        for number in range(count):
+            self._on_event(await anext(stream))
+            if number % AT_ONCE == AT_ONCE - 1:
+                await asyncio.sleep(0)
+
+    def _on_event(self, event: FleetEvent) -> None:
+        match event:
+            case AgentJoined():
+                self.agents.add(event.agent)
+                self.version += 1
+            case AgentLeft():
+                self.agents.discard(event.agent)
+                self.version += 1
+            case CameraJoined():
+                self._join(event.camera, event.agent)
+            case CameraLeft():
+                row = self.rows.get(event.camera)
+                if row is not None:
+                    row.agents.discard(event.agent)
+                    row.stir()
+            case _:
+                pass
+
+    def _join(self, name: str, agent: str) -> None:
+        row = self.rows.get(name)
+        if row is None:
+            row = self.rows[name] = FleetRow(name, self._ring)
+            self._names = []
+        self.agents.add(agent)
+        row.agents.add(agent)
+        row.follow(self.fleet[name])
+        row.stir()
+
+    def _ring(self, row: FleetRow) -> None:
+        self._rang[row] = None
+
+    # ------------------------------------------------------------------ what they do
+
+    async def _look(self) -> None:
+        """Look at the rows that rang."""
+        loop, done = asyncio.get_running_loop(), 0
+        rang, self._rang = self._rang, {}
+        for row in rang:
+            if self.rows.get(row.name) is not row:
+                continue  # it was forgotten
+            before, now = row.count, loop.time()
+            outcomes = await row.take(now)
+            if row.stirred:
+                row.account(outcomes, now)
+            came = self._count_in(row, outcomes, row.count - before)
+            if row.stirred or outcomes["errors"]:
+                self._refresh(row, now)
+            done += 1 + came
+            if done >= AT_ONCE:
+                done = 0
+                await asyncio.sleep(0)
+
+    def _count_in(self, row: FleetRow, outcomes: collections.Counter[str], came: int) -> int:
+        """Count what came of a camera; return how many."""
+        if came:
+            self._bar.update(outcomes)
+            self._count += came
+            self._errors += outcomes["errors"]
+            self._aging.add(row)
+            self._change(row)
+        return came
+
+    def _change(self, row: FleetRow) -> None:
+        self.version += 1
+        row.version = self.version
+
+    def _refresh(self, row: FleetRow, now: float) -> None:
+        """Look how a camera is."""
+        flags = row.flags
+        changed, lost = row.refresh(now)
+        if lost:
+            self._errors += 1
+        if changed:
+            self._change(row)
+        if flags is not row.flags:
+            self._flags.subtract(flags)
+            self._flags.update(row.flags)
+        if row.error_at is not None or not row.agents or "connected" not in row.flags:
+            self._aging.add(row)  # why it is not connected changes without an event
+        if row.agents:
+            self._gone.pop(row.name, None)
+        elif row.name not in self._gone:
+            self._gone[row.name] = None
+            if len(self._gone) > MAX_GONE:
+                self._forget(next(iter(self._gone)))
+
+    def _forget(self, name: str) -> None:
+        row = self.rows.pop(name)
+        row.leave()
+        self._flags.subtract(row.flags)
+        self._aging.discard(row)
+        self._gone.pop(name, None)
+        self._names = []
+        self.version += 1
+
+    async def _age(self) -> None:
+        """Count rates, once a second, and look at what changes by itself."""
+        now, wall = asyncio.get_running_loop().time(), time.time()
+        aging, self._aging = self._aging, set()
+        for number, row in enumerate(aging):
+            if self.rows.get(row.name) is not row:
+                continue  # it was forgotten
+            before, rate = row.count, row.rate
+            outcomes: collections.Counter[str] = collections.Counter()
+            row.account(outcomes, now)
+            self._count_in(row, outcomes, row.count - before)
+            if row.mark() or row.error_at is not None:
+                self._aging.add(row)
+            if row.rate != rate:
+                self._change(row)
+            self._refresh(row, now)
+            if number % AT_ONCE == AT_ONCE - 1:
+                await asyncio.sleep(0)
+        self._marks.append(self._count)
+        bar = int(wall) // BUCKET * BUCKET
+        if bar != self._bar_at:
+            if self._bar.total() and self._bar_at:
+                self.series.append((self._bar_at, *(self._bar[name] for name in OUTCOMES)))
+                self.version += 1
+                self._bar.clear()
+            self._bar_at = bar
+
+    # ------------------------------------------------------------------ for those who look
+
+    def totals(self) -> dict[str, Any]:
+        """Return what is true of all cameras."""
+        rate = (self._marks[-1] - self._marks[0]) / max(1, len(self._marks) - 1)
+        counts = {name: self._flags[name] for name in ("connected", "errors", "busy", "stopped")}
+        return {
+            "cameras": len(self.rows),
+            "agents": len(self.agents),
+            **counts,
+            "rate": round(rate, 1),
+            "results": self._count,
+            "failures": self._errors,
+        }
+
+    async def ordered(self, query: RowQuery) -> RowOrder:
+        """Return the names of a query's rows; made once for all who ask the same.
+
+        Cancellation: safe.
+        """
+        now = asyncio.get_running_loop().time()
+        known = self._orders.get(query)
+        if known is not None and (known.version == self.version or now - known.at < ORDERED):
+            self._orders.move_to_end(query)
+            return known
+        if not self._names:
+            self._names = sorted(self.rows)
+        version = self.version
+        made = RowOrder(await self._sorted(query), version, now)
+        self._orders[query] = made
+        self._orders.move_to_end(query)
+        while len(self._orders) > MAX_ORDERS:
+            self._orders.popitem(last=False)
+        return made
+
+    def is_late(self, query: RowQuery) -> bool:
+        """Whether a query's order is of before the last change."""
+        known = self._orders.get(query)
+        return known is None or known.version != self.version
+
+    async def _sorted(self, query: RowQuery) -> list[str]:
+        words, found = query.search.lower().split(), list[FleetRow]()
+        names = self._names
+        for start in range(0, len(names), SIFTED):
+            rows = map(self.rows.get, names[start : start + SIFTED])
+            found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
+            await asyncio.sleep(0)
+        if query.sort in SORTS:
+            found.sort(key=SORTS[query.sort], reverse=query.down)
+        elif query.down:
+            found.reverse()
+        return [row.name for row in found]
+
+
+def _fits(row: FleetRow, wanted: str, words: list[str]) -> bool:
+    return wanted in row.flags and all(one in row.text for one in words)
