@@ -107,8 +107,16 @@ def _camera(opened: Fleet, name: str, known: CameraSummary | None) -> dict[str, 
         "application": known.application if known is not None and there else None,
         "status": known.status if known is not None and there else None,
         "url": opened.url_of(name),
-        "reason": f"{name}: its agent does not answer" if known is None else known.reason,
+        "reason": _reason(name, known),
     }
+
+
+def _reason(name: str, known: CameraSummary | None) -> str | None:
+    if known is None:
+        return f"{name}: its agent does not answer"
+    if known.reason is None:
+        return None
+    return f"{name}: the agent has no session with the camera: {known.reason}"
 
 
 def _row(value: dict[str, Any]) -> tuple[str, ...]:
