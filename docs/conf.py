@@ -40,6 +40,10 @@ from smartcam.fleet._file import (
     History,
     Retry,
 )
+from smartcam.fleet._operations_file import OperationsSection
+from smartcam.fleet._recording_file import RecordSection
+from smartcam.fleet._ros_file import RosCamera, RosSection
+from smartcam.fleet._standby_file import Standby
 from smartcam.protocols._base import POLICIES
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
 from smartcam.protocols._framed.dialect import MAX_SURPLUS
@@ -471,6 +475,31 @@ def fleet_history() -> str:
     return _fields(History)
 
 
+def fleet_operations() -> str:
+    """Return those of its ``operations``."""
+    return _fields(OperationsSection)
+
+
+def fleet_record() -> str:
+    """Return those of its ``record``."""
+    return _fields(RecordSection)
+
+
+def fleet_standby() -> str:
+    """Return those of its ``standby``."""
+    return _fields(Standby)
+
+
+def fleet_ros2() -> str:
+    """Return those of its ``ros2``."""
+    return _fields(RosSection)
+
+
+def fleet_ros2_camera() -> str:
+    """Return those of a camera's ``ros2``."""
+    return _fields(RosCamera)
+
+
 def access_rights() -> str:
     """Return who may what in a fleet, and with which keys."""
     rows = [
@@ -582,6 +611,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, settings, transitions, policies, layers, limits),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
+        *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
         access_rights,
     )
 }

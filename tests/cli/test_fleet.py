@@ -374,7 +374,7 @@ def test_fleet_list_shows_cameras_and_their_agents(fleet: str) -> None:
     out = run("fleet", "list", fleet, "line1/lost").done().out.splitlines()
     assert out[0].split() == ["camera", "agent", "application", "status", "url"]
     assert out[1].split() == ["line1/lost", "north", "not", "connected", f"{fleet}/line1/lost"]
-    assert out[2].startswith("line1/lost: no session with bvs://")
+    assert out[2].startswith("line1/lost: the agent has no session with the camera: ")
     assert (
         run("fleet", "list", fleet, "line9/*").done().out == "no camera of the fleet is line9/*\n"
     )
