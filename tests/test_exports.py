@@ -111,11 +111,11 @@ def test_reference_has_each_public_name_and_nothing_else() -> None:
     assert len(smartcam.__all__) <= MOST_AT_THE_TOP
 
 
-MOST_PUBLIC = 480
+MOST_PUBLIC = 490
 """Names in all, a name that stands in two places counted once. A third of them are words: messages,
 faults of a camera, rules of a link, errors."""
 
-MOST_AT_THE_TOP = 68
+MOST_AT_THE_TOP = 69
 
 
 def test_top_level_exports_are_pinned() -> None:

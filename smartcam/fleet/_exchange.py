@@ -33,7 +33,7 @@ MOST_AGENTS = 1000
 """Agents whose bundles are known by their numbers."""
 
 
-class _Place(Handle):
+class _BusPlace(Handle):
     """Somebody who is given what is said under one key."""
 
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
@@ -61,7 +61,7 @@ class Exchange(Bus):
     def __init__(self, bus: Bus, keys: Callable[[], Keys]) -> None:
         self._bus, self._keys = bus, keys
         self.local = bus.local
-        self._places: dict[str, dict[str, list[_Place]]] = {}  # of a kind, by their keys
+        self._places: dict[str, dict[str, list[_BusPlace]]] = {}  # of a kind, by their keys
         self._covers: dict[str, Handle] = {}
         self._present: dict[str, set[str]] = {}  # presences that are there, by the camera's name
         self._bundles: dict[str, tuple[int, int]] = {}  # of agents: epoch, the number to come next
@@ -107,9 +107,11 @@ class Exchange(Bus):
         first, _, rest = tail.partition("/")
         return f"{first}/{rest.partition('/')[0]}" if first == "presence" else first
 
-    def _enter(self, key: str, call: Callable[..., None], declare: Callable[[], Handle]) -> _Place:
+    def _enter(
+        self, key: str, call: Callable[..., None], declare: Callable[[], Handle]
+    ) -> _BusPlace:
         kind = self._kind(key)
-        place = _Place(self, key, call)
+        place = _BusPlace(self, key, call)
         self._places.setdefault(kind, {}).setdefault(self._name(key), []).append(place)
         if kind not in self._covers:
             place.own = declare()
@@ -119,7 +121,7 @@ class Exchange(Bus):
         """Return by what a place is found: a presence's has the agent in its key, any one."""
         return key.split("/", 5)[5] if "/presence/camera/" in key else key
 
-    def drop(self, place: _Place) -> None:
+    def drop(self, place: _BusPlace) -> None:
         """Nobody is there any more."""
         kind, name = self._kind(place.key), self._name(place.key)
         there = self._places[kind]

@@ -179,7 +179,7 @@ def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
 # ---------------------------------------------------------------------- of its cameras
 
 
-class _Kind(NamedTuple):
+class _MetricKind(NamedTuple):
     """A family of numbers that each camera has.
 
     Attributes:
@@ -216,7 +216,7 @@ def _has_frames(one: CameraNumbers) -> bool:
 
 _LATENCY = ("smartcam_camera_trigger_latency_seconds", "From a trigger to its result, by camera")
 
-_SUMMARY = _Kind(
+_SUMMARY = _MetricKind(
     "Summary",
     *_LATENCY,
     (),
@@ -225,7 +225,7 @@ _SUMMARY = _Kind(
 )
 
 _KINDS = (
-    _Kind(
+    _MetricKind(
         "Gauge",
         "smartcam_connected",
         "Whether there is a session",
@@ -233,7 +233,7 @@ _KINDS = (
         lambda one: [((), (float(one.connected),))],
         1,
     ),
-    _Kind(
+    _MetricKind(
         "Counter",
         "smartcam_sessions",
         "Sessions that were made",
@@ -241,7 +241,7 @@ _KINDS = (
         lambda one: [((), (one.account.sessions,))],
         1,
     ),
-    _Kind(
+    _MetricKind(
         "Counter",
         "smartcam_results",
         "Results by fate",
@@ -249,7 +249,7 @@ _KINDS = (
         lambda one: [((fate,), (getattr(one.account, fate),)) for fate in FATES],
         6,
     ),
-    _Kind(
+    _MetricKind(
         "Counter",
         "smartcam_triggers",
         "Triggers of programs by outcome",
@@ -257,7 +257,7 @@ _KINDS = (
         lambda one: [((word,), (n,)) for word, n in {RESULT: 0, **one.triggers}.items()],
         3,
     ),
-    _Kind(
+    _MetricKind(
         "Gauge",
         "smartcam_frame_viewers",
         "Streams of frames",
@@ -266,7 +266,7 @@ _KINDS = (
         1,
         _has_frames,
     ),
-    _Kind(
+    _MetricKind(
         "Counter",
         "smartcam_frames",
         "Frames that came",
@@ -275,7 +275,7 @@ _KINDS = (
         1,
         _has_frames,
     ),
-    _Kind(
+    _MetricKind(
         "Counter",
         "smartcam_frames_lost",
         "Frames that never came",
@@ -284,7 +284,7 @@ _KINDS = (
         1,
         _has_frames,
     ),
-    _Kind(
+    _MetricKind(
         "Histogram",
         *_LATENCY,
         (),
