@@ -45,11 +45,10 @@ class Partner:
 
 
 @contextlib.asynccontextmanager
-async def partner(*arguments: str) -> AsyncIterator[Partner]:
-    """Give one that is ready."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "tests.fleet.partner", *arguments, stdout=subprocess.PIPE
-    )
+async def partner(*arguments: str, within: tuple[str, ...] = ()) -> AsyncIterator[Partner]:
+    """Give one that is ready; ``within`` is a command that runs it elsewhere."""
+    command = (*within, sys.executable, "-m", "tests.fleet.partner", *arguments)
+    process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
     try:
         assert process.stdout is not None
         async with asyncio.timeout(PATIENCE):
