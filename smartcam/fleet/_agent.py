@@ -273,6 +273,24 @@ class Agent:
         self._shared[name] = bus.be_present(keys.camera(self.name, name)), running
         return host
 
+    async def want(
+        self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None
+    ) -> None:
+        """Share one more camera, or stand by for it.
+
+        Raises:
+            ConfigurationError: an option of it cannot work; or another agent has it.
+        """
+        if frames_of is not None:
+            self._frames[name] = frames_of
+        await self._claims.want(name, settings)
+
+    async def drop(self, name: str) -> None:
+        """Share a camera no more, nor stand by for it; bounded."""
+        self._claims.drop(name)
+        if name in self.hosts:
+            await self.unshare(name)
+
     async def unshare(self, name: str) -> None:
         """End the session with a camera, and share it no more; bounded."""
         host = self.hosts.pop(name)

@@ -81,6 +81,32 @@ class Claims:
             else:
                 self._agent.share(name, settings)
 
+    async def want(self, name: str, settings: CameraSettings) -> None:
+        """Have one more camera, at once or when no other agent has it.
+
+        Raises:
+            ConfigurationError: another one has it, and this one does not stand by.
+        """
+        self._wanted[name] = settings
+        for key in await self._bus.present(self._keys.camera("*", name), ASK):
+            self._note(key, True)
+        others = self._others.get(name)
+        if not others:
+            self._agent.share(name, settings)
+        elif self._standby is not None:
+            self._consider(name)
+        else:
+            self.drop(name)
+            raise ConfigurationError(
+                f"{name}: the agent {min(others)} has this camera, which serves one"
+            )
+
+    def drop(self, name: str) -> None:
+        """Want a camera no more."""
+        self._wanted.pop(name, None)
+        self._others.pop(name, None)
+        self.given_up.pop(name, None)
+
     def close(self) -> None:
         """Claim nothing more. Idempotent."""
         self._wanted.clear()

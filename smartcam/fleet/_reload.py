@@ -273,7 +273,7 @@ class Reloader:
                 logger.error("%s ! it is not shared: a program has added one meanwhile", name)
                 continue
             try:
-                agent.share(name, source.settings, source.frames)
+                await agent.want(name, source.settings, source.frames)
             except SmartCamError:
                 logger.exception("%s ! it is not shared", name)
             await asyncio.sleep(0)
@@ -281,8 +281,7 @@ class Reloader:
     async def _end(self, agent: Agent, name: str) -> None:
         source = self.sources.pop(name, None)
         try:
-            if name in agent.hosts:
-                await agent.unshare(name)
+            await agent.drop(name)
         finally:
             if source is not None:
                 await source.emulator.aclose()

@@ -88,6 +88,7 @@ async def test_a_node_goes_with_its_agent_and_comes_with_it() -> None:
             )
             async with smartcam.fleet.serve(file):
                 await until(lambda: "/cam" in viewer.graph.nodes())
+                await until(lambda: "/cam/trigger" in viewer.graph.services())
                 assert viewer.graph.services()["/cam/trigger"] == [TRIGGER]
             await until(lambda: viewer.graph.nodes() == ["/viewer"])
             assert "/cam/trigger" not in viewer.graph.services()
