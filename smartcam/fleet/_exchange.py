@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.fleet._bus import BusQuestion, Data, Publisher
+    from smartcam.fleet._certificates import Identity
     from smartcam.fleet._keys import Keys
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
@@ -212,6 +213,15 @@ class Exchange(Bus):
     @property
     def reached(self) -> bool:
         return self._bus.reached
+
+    @property
+    def waiting_bytes(self) -> int:
+        return self._bus.waiting_bytes
+
+    @property
+    def identity(self) -> Identity | None:  # type: ignore[override]
+        """Whose certificate the end shows."""
+        return self._bus.identity
 
     async def open(self, timeout: float) -> Self:
         await self._bus.open(timeout)

@@ -238,6 +238,17 @@ async def a_cut(node: RosbridgeNode, peer: Program, proxy: Proxy) -> dict[str, A
     }
 
 
+async def _graph(peer: Program) -> Any:
+    """Return what there is, once the second camera is there as well; or what there is by then."""
+    found: Any = {}
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(60):
+            while "/cam4/trigger" not in found.get("services", ()):
+                found = await peer.ask("state")
+                await asyncio.sleep(0.1)
+    return found
+
+
 async def cameras(peer: Program) -> dict[str, Any]:
     """Return what rospy has of the cameras of the command."""
     camera = "/line1/cam3"
@@ -254,7 +265,7 @@ async def cameras(peer: Program) -> dict[str, Any]:
     }
     while not poses.done():  # who subscribes takes a moment
         await peer.ask("sure", f"{camera}/trigger", TRIGGER, {})
-    return {**found, "poses": await poses, "graph": await peer.ask("state")}
+    return {**found, "poses": await poses, "graph": await _graph(peer)}
 
 
 async def main(folder: Path, command: list[str]) -> dict[str, Any]:
