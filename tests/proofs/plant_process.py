@@ -36,6 +36,9 @@ PAUSE = 0.15
 """Mean seconds between two of one of them."""
 
 PATIENT = 10
+QUEUE = 8
+"""Results of a camera that a program has room for: who is stopped for long has more to read."""
+
 LOOK = 0.2
 SAMPLE = 2.0
 
@@ -119,10 +122,9 @@ class Program:
 
     async def run(self) -> None:
         """Be at work until it is told to end."""
-        results = self._fleet.results(max_queue=100)
+        results = self._fleet.results(max_queue=QUEUE)
         beside = [
-            asyncio.create_task(one)
-            for one in (self._read(results), self._look(), self._sample())
+            asyncio.create_task(one) for one in (self._read(results), self._look(), self._sample())
         ]
         work = [asyncio.create_task(self._work()) for _ in range(AT_ONCE)]
         await told_to_end()
@@ -182,6 +184,11 @@ class Program:
                 elif outcome == "NotRunningError":
                     await camera.start()
 
+    def _number(self, camera: str) -> int:
+        """Return that of the last result that was read."""
+        heard = self._heard.get(camera)
+        return 0 if heard is None else heard.number
+
     async def _last(self, camera: Any) -> str:
         """Trigger once more, now that nothing is wrong; return what went wrong all the same."""
         token = next(self._tokens)
@@ -198,7 +205,7 @@ class Program:
             if result.value.token != token:
                 return f"{camera.name}: call {token} got the result of {result.value.token}"
             async with asyncio.timeout(LAST):
-                while (self._heard.get(camera.name) or Heard()).number < result.number:
+                while self._number(camera.name) < result.number:  # noqa: ASYNC110 - it is read
                     await asyncio.sleep(LOOK)
         except (SmartCamError, TimeoutError) as error:
             return f"{camera.name}: the last call: {type(error).__name__}: {error}"

@@ -29,7 +29,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, Self
 
 from smartcam._zenoh import LEASE
 from smartcam.fleet._authority import make_certificates
@@ -48,7 +48,10 @@ PORT = 7447
 TOKENS = 1_000_000
 """That each program has for itself."""
 
-DISK = 4 << 20
+DISK = 16 << 20
+CALLS = 30
+"""That end while a disk is full."""
+
 MARGIN = 2.0
 """Seconds beyond the lease, for processes that share two cores."""
 
@@ -65,7 +68,8 @@ FLEET = """\
 agent: host{number}
 connect: tls/{hub}:{port}
 certificates: {keys}/host{number}
-record: {{folder: {disk}, size: 0.3 MB, keep: 1 MB}}
+history: {{results: 12}}
+record: {{folder: {disk}, size: 0.3 MB, keep: 4 MB}}
 cameras:
 """
 
@@ -161,9 +165,7 @@ class Part:
             while True:
                 await self.start()
                 ready = asyncio.create_task(self.ready.wait())
-                await asyncio.wait(
-                    {ready, self._reading[0]}, return_when=asyncio.FIRST_COMPLETED
-                )
+                await asyncio.wait({ready, self._reading[0]}, return_when=asyncio.FIRST_COMPLETED)
                 if self.ready.is_set():
                     return
                 ready.cancel()
@@ -224,6 +226,7 @@ class Site:
         self.changed = asyncio.Event()
         self.accounts: dict[int, Any] = {}
         self.kills: Counter[int] = Counter()  # of agents
+        self.recording: dict[int, bool] = {}  # what agents told last, if they did
         self.clocks = FAKETIME.exists()
         self.boxes: dict[int, Part] = {}
         self.agents: dict[int, Part] = {}
@@ -248,7 +251,7 @@ class Site:
 
     # ------------------------------------------------------------------ life
 
-    async def __aenter__(self) -> Site:
+    async def __aenter__(self) -> Self:
         try:
             await self._open()
         except BaseException:
@@ -334,6 +337,8 @@ class Site:
         elif "account" in said:
             self.accounts[host] = said["account"]
             storm.figures.violations += [f"program {host}: {text}" for text in said["ends"]]
+        elif "recordings" in said:
+            self.recording[host] = said["recording"]
         elif "executed" in said:
             storm.figures.executed += said["executed"]
             for token, count in said["twice"].items():
@@ -387,9 +392,7 @@ class Site:
     async def account(self) -> None:
         """Have all end, and judge what they say."""
         self._sampling.cancel()
-        ends = await asyncio.gather(
-            *(one.ask_to_end(4 * START) for one in self.programs.values())
-        )
+        ends = await asyncio.gather(*(one.ask_to_end(4 * START) for one in self.programs.values()))
         for part, code in zip(self.programs.values(), ends, strict=True):
             if code != 0:
                 self.storm.complain(f"{part.name} ended with {code}: {[*part.last]}")
@@ -512,9 +515,17 @@ async def program_stopped(site: Site, host: int, seconds: float) -> None:
 
 async def disk_full(site: Site, host: int, seconds: float) -> None:
     ballast = site.disk(host) / "ballast"
+    begun = time.monotonic()
+    site.recording.pop(host, None)
     await asyncio.to_thread(fill, ballast)
-    await asyncio.sleep(seconds)
+    if await site.until(lambda: site.recording.get(host) is False, START) is None:
+        site.storm.complain(f"disk of host {host} full: the agent did not say so")
+    seen = site.storm.figures.calls
+    await asyncio.sleep(begun + seconds - time.monotonic())
+    await site.until(lambda: site.storm.figures.calls > seen + CALLS, START)
     ballast.unlink()
+    if await site.until(lambda: site.recording.get(host) is True, START) is None:
+        site.storm.complain(f"disk of host {host} cleared: it does not record again")
 
 
 async def certificate_expired(site: Site, host: int, seconds: float) -> None:
