@@ -578,7 +578,7 @@ QUIET = 1.0
 SHORT: tuple[tuple[tuple[str, int, float], ...], ...] = (
     (("cable cut", 2, 1.0), ("disk full", 1, 1.5)),
     (("agent killed", 3, 0.0), ("packets 200 ms late", 1, 2.0)),
-    (("program stopped", 2, 1.5), ("5 % of packets lost", 3, 2.0)),
+    (("program stopped", 2, 5.0), ("5 % of packets lost", 3, 2.0)),
     (("router killed", 4, 0.5),),
     (("certificate expired", 1, 10.0),),
 )

@@ -31,6 +31,7 @@ async def test_plant_in_a_storm_mixes_up_nothing_and_loses_nothing_unseen(
     assert {*storm.done} == {name for faults in SHORT for name, _, _ in faults}
     assert storm.figures.outcomes["result"] > 50
     assert storm.accounts["taken"] > 150
+    assert storm.accounts["missed"] > 0  # of who was stopped for longer than agents remember
     assert switch.carried > 1000
     assert switch.lost > 10
 
