@@ -105,7 +105,9 @@ class BusLink:
             "transport/shared_memory/enabled": False,
             "transport/link/tx/lease": int(1e3 * LEASE),
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-            "transport/unicast/open_timeout": max(1, int(1e3 * timeout)),
+            # of each later try, too: of one that began while a cable was cut the system repeats
+            # the packets ever more seldom, so who stays with it for long is back that much later
+            "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE))),
         }
         for queue in ("control", "data", "interactive_high", "data_low"):
             found[f"transport/link/tx/queue/size/{queue}"] = 16
@@ -244,6 +246,7 @@ class ZenohSession:
                 raise ConfigurationError(
                     f"{self._what}: the engine refuses {path}: {value!r}"
                 ) from exc
+        begun = loop.time()
         opening = loop.run_in_executor(None, zenoh.open, config)
         try:
             async with asyncio.timeout(timeout):
@@ -252,7 +255,9 @@ class ZenohSession:
             opening.add_done_callback(_close_late)
             raise self._failed(f"no answer within {timeout:g} s") from exc
         except zenoh.ZError as exc:
-            raise self._failed(_reason(exc)) from exc
+            silent = loop.time() - begun >= LEASE
+            why = f"no answer within {LEASE:g} s" if silent else _reason(exc)
+            raise self._failed(why) from exc
         except asyncio.CancelledError:
             opening.add_done_callback(_close_late)
             raise
