@@ -110,9 +110,9 @@ class Host:
         self.name = name
         self.frames = frames
         self.settings = settings
-        self.gate = Gate()
-        self.results = AgentLog(*history)
-        self.states = AgentLog(MOST_STATES, MOST_STATE_BYTES)
+        self.gate: Gate = Gate()
+        self.results: AgentLog = AgentLog(*history)
+        self.states: AgentLog = AgentLog(MOST_STATES, MOST_STATE_BYTES)
         self.outcomes: dict[Owner, list[bytes]] = {}
         self.failure: SmartCamError | None = None
         self.triggers: collections.Counter[str] = collections.Counter()

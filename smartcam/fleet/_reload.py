@@ -150,7 +150,7 @@ class Reloader:
         now: LoadedFleet,
         make: Callable[[Planned, Path], Awaitable[CameraSource]],
     ) -> None:
-        self.now = now
+        self.now: LoadedFleet = now
         self.sources: dict[str, CameraSource] = {}
         self.last: FleetChanges | SmartCamError | None = None
         self.outcomes: dict[str, int] = {"done": 0, "refused": 0}

@@ -49,7 +49,8 @@ class Topics:
 
     def __init__(self, agent: str, epoch: int, keys: Keys, bus: Bus) -> None:
         self.who: dict[str, str] = {"agent": agent, "epoch": str(epoch)}
-        self.keys, self.bus = keys, bus
+        self.keys: Keys = keys
+        self.bus: Bus = bus
         self._any: dict[Kind, Publisher] = {}
         self._made: dict[tuple[Kind, str], Publisher] = {}
 
@@ -150,10 +151,11 @@ class CameraTopics:
 
     def __init__(self, host: Host, topics: Topics) -> None:
         self._host, self._topics = host, topics
-        self.trouble = ""
+        self.trouble: str = ""
         self.status_out: Publisher | None = None
         self.results_out: Publication | None = None
-        self.statuses = self.events = 1
+        self.statuses: int = 1
+        self.events: int = 1
         self._before: Status | None = None
         self.interpret(host.settings.interpret_as)
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._line_codec import LineCodec
+    from smartcam.protocols._base import Protocol
     from smartcam.recording._form import Item
     from smartcam.recording._reader import Recording
 
@@ -129,8 +130,9 @@ class ReplayedLines(LineCamera):
         known = recording.camera(camera)
         self._kind = kind
         self._address = parse_address(known.url)
-        self.protocol = load_protocol(known.protocol)
-        self.max_links, self.write_limit = kind.max_links, kind.write_limit
+        self.protocol: Protocol = load_protocol(known.protocol)
+        self.max_links: int = kind.max_links
+        self.write_limit: int = kind.write_limit
         super().__init__(**{"name": known.name, **options})
         if recording.since is not None:
             raise ConfigurationError(

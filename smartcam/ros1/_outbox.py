@@ -26,10 +26,11 @@ class Lane:
 
     def __init__(self, depth: int, *, latched: bool) -> None:
         self.latched = latched
-        self.dropped = self.sent = 0
+        self.dropped: int = 0
+        self.sent: int = 0
         self._depth = depth
         self._waiting: collections.deque[tuple[Part, ...]] = collections.deque()
-        self.waiting_bytes = 0
+        self.waiting_bytes: int = 0
         self._last: tuple[Part, ...] | None = None  # of a latched topic, for a bridge to come
 
     def __bool__(self) -> bool:

@@ -28,9 +28,10 @@ class RosbridgePublisher:
     """
 
     def __init__(self, node: RosbridgeNode, name: str, kind: MessageType, qos: QoS) -> None:
-        self.name, self.type = name, kind
-        self.lane = Lane(qos.kept, latched=qos.latched)
-        self.exists = ros1_name(kind.name) is not None
+        self.name: str = name
+        self.type: MessageType = kind
+        self.lane: Lane = Lane(qos.kept, latched=qos.latched)
+        self.exists: bool = ros1_name(kind.name) is not None
         self.subscribed = True  # or it is not known
         self._node = node
 

@@ -49,10 +49,12 @@ class RosbridgeService:
         handler: Callable[[Any], Awaitable[Any]],
         timeout: float,
     ) -> None:
-        self.name, self.type = name, kind
-        self.ready = False
-        self.exists = ros1_name(kind.name) is not None
-        self.calls = self.failed = 0
+        self.name: str = name
+        self.type: ServiceType = kind
+        self.ready: bool = False
+        self.exists: bool = ros1_name(kind.name) is not None
+        self.calls: int = 0
+        self.failed: int = 0
         self._node, self._handler, self._timeout = node, handler, timeout
         self._tasks: set[asyncio.Task[None]] = set()
         self._responded = float("-inf")

@@ -68,7 +68,9 @@ class CameraResults:
 
     def __init__(self, camera: Camera[Any], node: Any, *, frame_id: str | None = None) -> None:
         self.active: bool = True
-        self.taken = self.failed = self.refused = 0
+        self.taken: int = 0
+        self.failed: int = 0
+        self.refused: int = 0
         self._camera, self._node = camera, node
         calibration = camera.settings.calibration
         self._messages = ResultMessages(

@@ -63,7 +63,8 @@ class RosEnd:
     def __init__(
         self, context: RosContext, entity: Entity, on_close: Callable[[RosEnd], None]
     ) -> None:
-        self._context, self.entity, self._on_close = context, entity, on_close
+        self.entity: Entity = entity
+        self._context, self._on_close = context, on_close
         self._declared: list[ZenohDeclared] = []
         self._closed = False
 

@@ -26,7 +26,7 @@ class RosMessage:
 
     __slots__: tuple[str, ...] = ()
     __msgtype__: ClassVar[str] = ""
-    __hash__ = None  # type: ignore[assignment]
+    __hash__: ClassVar[None]  # type: ignore[assignment]  # equal ones may change
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, RosMessage) or other.__msgtype__ != self.__msgtype__:

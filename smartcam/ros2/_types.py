@@ -73,10 +73,10 @@ class MessageType:
     def __init__(
         self, definition: Definition, nested: Mapping[str, MessageType], types: RosTypes
     ) -> None:
-        self.name = definition.name
-        self.dds = dds_name(definition.name)
+        self.name: str = definition.name
+        self.dds: str = dds_name(definition.name)
         self.fields: tuple[MessageField, ...] = definition.fields
-        self.constants = dict(definition.constants)
+        self.constants: dict[str, Any] = dict(definition.constants)
         self.nested = nested
         self.cls: type[RosMessage] = message_class(definition)
         self._definition = definition
@@ -215,9 +215,9 @@ class ServiceType:
 
     def __init__(self, name: str, types: RosTypes) -> None:
         self.name = name
-        self.dds = dds_name(name)
-        self.request = types.message_of(f"{name}_Request")
-        self.response = types.message_of(f"{name}_Response")
+        self.dds: str = dds_name(name)
+        self.request: MessageType = types.message_of(f"{name}_Request")
+        self.response: MessageType = types.message_of(f"{name}_Response")
         self._types = types
 
     def __repr__(self) -> str:
