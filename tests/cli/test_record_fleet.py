@@ -42,7 +42,7 @@ def numbers(path: Path) -> list[int]:
 
 def test_folder_goes_on_after_a_kill_and_is_played_as_a_fleet(tmp_path: Path) -> None:
     with emulators(tmp_path, (), (), ()) as urls:
-        for end in (signal.SIGKILL, signal.SIGTERM):
+        for file, end in enumerate((signal.SIGKILL, signal.SIGTERM)):
             with serving(tmp_path, urls) as agent:
                 shown = agent.read_until(b"\n", count=3).split()
                 assert [url.split("/", 3)[3] for url in shown] == [
@@ -53,7 +53,7 @@ def test_folder_goes_on_after_a_kill_and_is_played_as_a_fleet(tmp_path: Path) ->
                 run("trigger", shown[1], "--count", "3").done()
                 run("watch", shown[0], "--count", "40").done()
                 run("status", shown[2]).done()
-                _until_written(files(tmp_path, "line1/text")[-1], 3)
+                _until_written(tmp_path, 3, file)
                 agent.send_signal(end)
                 outcome = agent.wait()
         outcome.done()
@@ -76,8 +76,11 @@ def test_folder_goes_on_after_a_kill_and_is_played_as_a_fleet(tmp_path: Path) ->
         assert played.wait().code == 0
 
 
-def _until_written(path: Path, count: int) -> None:
-    while load_recording(path).counts.results < count:
+def _until_written(folder: Path, count: int, file: int) -> None:
+    """Wait until file number ``file`` of ``line1/text`` is there and has ``count`` results."""
+    while len(files(folder, "line1/text")) <= file:
+        time.sleep(0.02)
+    while load_recording(files(folder, "line1/text")[file]).counts.results < count:
         time.sleep(0.02)
 
 

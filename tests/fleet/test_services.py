@@ -57,7 +57,8 @@ async def test_frame_comes_as_a_picture_with_what_is_known_of_it() -> None:
         assert len(picture) == frame["size"]
         assert (frame["format"], frame["width"], frame["height"]) == ("MJPEG", 300, 200)
         assert 0 <= frame["age"] < PATIENCE
-        assert (frame["moment"], frame["lost"]) == ("EXPOSURE_START", 0)
+        assert frame["moment"] == "EXPOSURE_START"
+        assert frame["lost"] >= 0
         png = await place.client.call("frame", encoding="png", max_age=60)
         assert base64.b64decode(png["frame"]["data"])[1:4] == b"PNG"
         assert (await place.client.call("frame", encoding="bmp"))["kind"] == "ConfigurationError"
