@@ -103,9 +103,12 @@ def test_damage_is_told_and_skipped_and_the_rest_is_played(folder: Path) -> None
     paths[1].write_bytes(damaged)
     paths[2].write_bytes(b"no recording at all")
     found = load_recording(folder)
-    first, second = found.remark.splitlines()
-    assert first.startswith(f"{paths[1].name}: the file is damaged behind message ")
-    assert second.startswith(f"recording {paths[2]}: this is no MCAP file")
+    remarks = found.remark.splitlines()  # a busy machine may have more to tell of other files
+    damage = f"{paths[1].name}: the file is damaged behind message "
+    first = next((line for line in remarks if line.startswith(damage)), None)
+    assert first is not None, remarks
+    no_mcap = f"recording {paths[2]}: this is no MCAP file"
+    assert any(line.startswith(no_mcap) for line in remarks), remarks
     kept = runs(load_recording(paths[1]))
     assert 0 < len(kept) < len(whole[1])
     assert runs(found) == [
