@@ -20,7 +20,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -42,6 +43,14 @@ LOADED = (
 """What commands import, mostly when it is used."""
 
 LARGEST = 1 << 16
+
+
+def wait_until(true: Callable[[], object]) -> None:
+    """Wait until it is so; a test that waits in vain fails."""
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end, "what was waited for has not come"
+        time.sleep(0.02)
 
 
 def printed_by(python: str) -> str:

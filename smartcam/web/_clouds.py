@@ -17,10 +17,9 @@ import numpy as np
 
 from smartcam.depth import Cloud, voxel_grid
 from smartcam.exceptions import ConfigurationError
-from smartcam.web._errors import RefusedError, shown
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._site import API, Site
-from smartcam.web._sockets import PageSocket
+from smartcam.web._sockets import PageSocket, check_websocket
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -261,11 +260,5 @@ def _cloud(site: CloudSite, _call: CallRequest) -> object:
     "many bytes follow; then these in parts: x, y, z as float32, red, green, blue as uint8.",
 )
 async def _clouds(site: CloudSite, call: CallRequest) -> web.StreamResponse:
-    headers = call.request.headers
-    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", PROTOCOL).split(",")]
-    if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
-        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
-        raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
-    if len(site.viewers) >= MAX_VIEWERS:
-        raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
+    check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)
     return await CloudViewer(site, call.request).serve()

@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.web._errors import RefusedError, shown
+from smartcam.web._errors import RefusedError
 from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, RowsInSight
 from smartcam.web._fleet_view import FleetView
 from smartcam.web._live import CALLS as LIVE_CALLS
@@ -15,6 +15,7 @@ from smartcam.web._pictures import FILES
 from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._shapes import OUTLINES
 from smartcam.web._site import API, Site
+from smartcam.web._sockets import check_websocket
 
 if TYPE_CHECKING:
     from aiohttp import web
@@ -210,13 +211,7 @@ async def _cameras(site: FleetSite, call: CallRequest) -> object:
     "after each `next`; it is told as JSON, as in `/api/cameras`, which rows are in sight.",
 )
 async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
-    headers = call.request.headers
-    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", PROTOCOL).split(",")]
-    if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
-        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
-        raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
-    if len(site.viewers) >= MAX_VIEWERS:
-        raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
+    check_websocket(call.request, PROTOCOL, len(site.viewers), MAX_VIEWERS)
     viewer = FleetSocket(site.view, site.about(), call.request)
     site.viewers.add(viewer)
     try:

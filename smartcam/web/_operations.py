@@ -16,9 +16,9 @@ from smartcam.fleet._metric_families import exposition, require_client
 from smartcam.fleet._metrics import read_numbers
 from smartcam.fleet._operations_file import OperationsSection
 from smartcam.settings import validated
-from smartcam.web._connections import KEEP_ALIVE, visitor_of
+from smartcam.web._connections import visitor_of
 from smartcam.web._guard import HEADERS
-from smartcam.web._site import FAREWELL, OpenPort, calm, listening
+from smartcam.web._site import OpenPort, open_port
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -85,27 +85,13 @@ class OperationsSite(Server):
         application.on_response_prepare.append(_add_headers)
         for path, handler in self._pages().items():
             application.router.add_get(path, handler)
-        runner = web.AppRunner(
-            application,
-            access_log=None,
-            shutdown_timeout=FAREWELL,
-            keepalive_timeout=KEEP_ALIVE,
-            logger=calm(_log),
-        )
         try:
-            listener = await listening(self._host, self._port)
+            opened = await open_port(application, self._host, self._port)
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(
                 f"operations.listen: cannot listen on {self._host}:{self._port}: {exc}"
             ) from exc
-        try:
-            await runner.setup()
-        except BaseException:
-            listener.close()
-            await runner.cleanup()
-            raise
-        self._port = listener.getsockname()[1]
-        self._open = OpenPort(runner, listener)
+        self._port, self._open = opened.port, opened
 
     async def stop(self) -> None:
         """Close the port and every connection; does nothing if stopped. Bounded."""

@@ -24,9 +24,8 @@ from smartcam.exceptions import (
     LocalProtocolError,
     UnsupportedError,
 )
-from smartcam.web._errors import RefusedError, shown
 from smartcam.web._jpeg import jpeg
-from smartcam.web._sockets import PageSocket
+from smartcam.web._sockets import PageSocket, check_websocket
 from smartcam.web._streams import SLOW
 
 if TYPE_CHECKING:
@@ -164,14 +163,7 @@ class SitePictures:
         Raises:
             RefusedError: it is no WebSocket, or there are :data:`MAX_VIEWERS` already.
         """
-        headers = request.headers
-        given = headers.get("Sec-WebSocket-Protocol", PROTOCOL)
-        offered = [one.strip() for one in given.split(",")]
-        if headers.get("Upgrade", "").lower() != "websocket" or PROTOCOL not in offered:
-            what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
-            raise RefusedError(400, what, f"a WebSocket of {PROTOCOL}")
-        if len(self.viewers) >= MAX_VIEWERS:
-            raise RefusedError(503, f"viewer {MAX_VIEWERS + 1}", f"{MAX_VIEWERS} at one time")
+        check_websocket(request, PROTOCOL, len(self.viewers), MAX_VIEWERS)
         return await Viewer(self, place, request).serve()
 
 

@@ -115,25 +115,13 @@ class Site(Server):
         if self._open is not None:
             return
         self.streams = Streams()
-        runner = web.AppRunner(
-            self._application(),
-            access_log=None,
-            shutdown_timeout=FAREWELL,
-            keepalive_timeout=KEEP_ALIVE,
-            logger=calm(_log),
-        )
         try:
-            listener = await listening(self.host, self._port, local=self.token is None)
+            opened = await open_port(
+                self._application(), self.host, self._port, local=self.token is None
+            )
         except (OSError, ValueError, OverflowError) as exc:
             raise ConfigurationError(f"web: cannot listen on {self.api}: {exc}") from exc
-        try:
-            await runner.setup()
-        except BaseException:
-            listener.close()
-            await runner.cleanup()
-            raise
-        self._port = listener.getsockname()[1]
-        self._open = OpenPort(runner, listener)
+        self._port, self._open = opened.port, opened
 
     async def stop(self) -> None:
         """Close the port, every stream and every connection; does nothing if stopped.
@@ -179,6 +167,7 @@ class OpenPort:
         self.places: Places = Places(runner.server)
         self._runner = runner
         self._listener = listener
+        self.port: int = listener.getsockname()[1]
         self._acceptor = Acceptor(self.places, _log, name="smartcam.web")
         self._acceptor.open(listener)
 
@@ -219,7 +208,34 @@ def _file(name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
     return serve
 
 
-async def listening(host: str, port: int, *, local: bool = False) -> socket.socket:
+async def open_port(
+    application: web.Application, host: str, port: int, *, local: bool = False
+) -> OpenPort:
+    """Return the port on which an application is served from now on.
+
+    Raises:
+        OSError, ValueError, OverflowError: it cannot be had, or it is not ``local``.
+
+    Cancellation: leaves nothing open.
+    """
+    runner = web.AppRunner(
+        application,
+        access_log=None,
+        shutdown_timeout=FAREWELL,
+        keepalive_timeout=KEEP_ALIVE,
+        logger=calm(_log),
+    )
+    listener = await _listening(host, port, local=local)
+    try:
+        await runner.setup()
+    except BaseException:
+        listener.close()
+        await runner.cleanup()
+        raise
+    return OpenPort(runner, listener)
+
+
+async def _listening(host: str, port: int, *, local: bool) -> socket.socket:
     """Return a listening socket.
 
     Raises:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from smartcam.web._errors import RefusedError, shown
 from smartcam.web._site import FAREWELL
 
 if TYPE_CHECKING:
@@ -18,6 +19,21 @@ _log = logging.getLogger("smartcam.web")
 
 LONGEST_WORD: Final = 64
 """Bytes of what a page may say: that it wants the next one."""
+
+
+def check_websocket(request: web.Request, protocol: str, viewers: int, most: int) -> None:
+    """See that a request asks for a WebSocket of ``protocol``, and that there is room for it.
+
+    Raises:
+        RefusedError: 400, it does not; 503, ``most`` look already.
+    """
+    headers = request.headers
+    offered = [one.strip() for one in headers.get("Sec-WebSocket-Protocol", protocol).split(",")]
+    if headers.get("Upgrade", "").lower() != "websocket" or protocol not in offered:
+        what = f"Upgrade {shown(headers.get('Upgrade'))}, protocols {shown(offered)}"
+        raise RefusedError(400, what, f"a WebSocket of {protocol}")
+    if viewers >= most:
+        raise RefusedError(503, f"viewer {most + 1}", f"{most} at one time")
 
 
 class PageSocket(ABC):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Process
+from tests.processes import PATIENCE, Process, wait_until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -68,8 +68,7 @@ def test_live_with_control_triggers(url: str) -> None:
     with Process("smartcam", "live", url, "--control", "--json", *told) as live:
         page = json.loads(live.read_until(b"\n"))["page"]
         assert wait_for(page, "connected")["control"] is True
-        while ask(f"{page}api/camera")["application"] != 8:
-            time.sleep(0.05)
+        wait_until(lambda: ask(f"{page}api/camera")["application"] == 8)
         assert ask(f"{page}api/trigger", {"timeout": PATIENCE})["number"] == 1
         (result,) = ask(f"{page}api/results")["results"]
         live.send_signal(signal.SIGTERM)

@@ -17,7 +17,7 @@ from mcap.stream_reader import StreamReader
 from smartcam.models import Connected, Reconnected
 from smartcam.recording import load_recording
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Process
+from tests.processes import PATIENCE, Process, wait_until
 from tests.wireshark import TSHARK, needs_tshark
 
 SESSIONS = (Connected, Reconnected)
@@ -98,10 +98,7 @@ def test_record_killed_has_what_was_written(url: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Process("smartcam", "record", url, "-o", str(path), "--application", "5") as process:
         process.read_until(b"\n")
-        end = time.monotonic() + PATIENCE
-        while load_recording(path).counts.results < 100:
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        wait_until(lambda: load_recording(path).counts.results >= 100)
         process.send_signal(signal.SIGKILL)
         process.wait()
     recording = load_recording(path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import shutil
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,7 @@ from smartcam.recording import _folder_writer as folder_writer
 from smartcam.recording import load_recording
 from tests.cli.commandline import emulators, run
 from tests.fleet.fleetkit import NumberedCamera
-from tests.processes import Process
+from tests.processes import Process, wait_until
 from tests.recording.folderkit import files, recording, runs
 from tests.recording.folderkit import until as until_true
 
@@ -78,10 +77,9 @@ def test_folder_goes_on_after_a_kill_and_is_played_as_a_fleet(tmp_path: Path) ->
 
 def _until_written(folder: Path, count: int, file: int) -> None:
     """Wait until file number ``file`` of ``line1/text`` is there and has ``count`` results."""
-    while len(files(folder, "line1/text")) <= file:
-        time.sleep(0.02)
-    while load_recording(files(folder, "line1/text")[file]).counts.results < count:
-        time.sleep(0.02)
+    wait_until(lambda: len(files(folder, "line1/text")) > file)
+    path = files(folder, "line1/text")[file]
+    wait_until(lambda: load_recording(path).counts.results >= count)
 
 
 @pytest.fixture
@@ -154,8 +152,7 @@ def test_from_and_until_choose_what_is_played(folder: Path) -> None:
 def test_serve_says_where_it_cannot_record_and_goes_on(tmp_path: Path) -> None:
     with emulators(tmp_path, (), (), ()) as urls, serving(tmp_path, urls) as agent:
         shown = agent.read_until(b"\n", count=3).split()
-        while not files(tmp_path, "line1/text"):
-            time.sleep(0.02)
+        wait_until(lambda: files(tmp_path, "line1/text"))
         shutil.rmtree(tmp_path / "rec")
         run("trigger", shown[1], "--count", "2").done()
         said = agent.read_until(b"until it is better", stream="stderr")

@@ -6,7 +6,6 @@ import contextlib
 import json
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from mcap.stream_reader import StreamReader
 from smartcam.calibration import fit_plane
 from smartcam.recording import load_recording
 from tests.cli.commandline import closed_port, emulators, run
-from tests.processes import PATIENCE, Process
+from tests.processes import Process, wait_until
 from tests.recording.bagkit import on, read, read_by_rosbags, read_raw
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
@@ -162,10 +161,7 @@ def test_record_bag_killed_has_what_was_written(url: str, tmp_path: Path) -> Non
     command = ["record", url, "--bag", str(tmp_path / "bag"), "--application", "5"]
     with Process("smartcam", *command, "--interpret-as", "n: int32 @sequence") as process:
         process.read_until(b"\n")
-        end = time.monotonic() + PATIENCE
-        while len(numbers(tmp_path / "bag/bag_0.mcap")) < 100:
-            assert time.monotonic() < end
-            time.sleep(0.05)
+        wait_until(lambda: len(numbers(tmp_path / "bag/bag_0.mcap")) >= 100)
         process.send_signal(signal.SIGKILL)
         process.wait()
     found = numbers(tmp_path / "bag/bag_0.mcap")
