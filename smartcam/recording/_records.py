@@ -1,7 +1,8 @@
 """The records of an MCAP file, within bounds: a file may lie about everything in it.
 
 What is compressed is inflated piece by piece and never beyond a bound, lengths are held against
-what is there, and what nobody needs (indexes, statistics, attachments) is skipped unread.
+what is there, and what nobody needs (indexes, attachments) is skipped unread. A file that says how
+many messages it has must have as many: damage can make a chunk look like what is skipped.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ PIECE = 1 << 18
 MAGIC = b"\x89MCAP0\r\n"
 
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
-_METADATA, _DATA_END, _FOOTER = 0x0C, 0x0F, 0x02
+_STATISTICS, _METADATA, _DATA_END, _FOOTER = 0x0B, 0x0C, 0x0F, 0x02
+_NONE = 0x00
 
 _HEAD = struct.Struct("<BQ")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -96,6 +98,7 @@ class RecordReader:
     def __post_init__(self) -> None:
         self.place: int = 0  # bytes read so far
         self._count = 0  # records read
+        self._messages = 0  # of these
         self._unpacked = 0  # bytes that chunks unpacked to
         self._crc = 0
 
@@ -124,9 +127,16 @@ class RecordReader:
                 said = _Body(memoryview(self._read(_small(length)))).number(4)
                 if said not in {0, crc}:
                     raise ValueError(f"the data's checksum is {crc:08x}, expected {said:08x}")
+            elif opcode == _STATISTICS:
+                said = _Body(memoryview(self._read(_small(length)))).number(8)
+                if said != self._messages:
+                    raise ValueError(f"of {said} messages {self._messages} are there")
+            elif opcode == _NONE:
+                raise ValueError("a record of the kind 0, which there is not")
             elif opcode == _METADATA:
                 yield _metadata(_Body(memoryview(self._read(_small(length)))))
             elif opcode in _PARSERS:
+                self._messages += opcode == _MESSAGE
                 yield _PARSERS[opcode](memoryview(self._read(length)))
             else:
                 self._skip(length)
@@ -144,6 +154,7 @@ class RecordReader:
                 raise ValueError(f"a record of {length} bytes in the last {len(data) - place}")
             self._count_one()
             if opcode in _PARSERS:
+                self._messages += opcode == _MESSAGE
                 yield _PARSERS[opcode](data[place : place + length])
             place += length
 

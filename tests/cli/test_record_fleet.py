@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from smartcam.recording import _folder_writer as folder_writer
+from smartcam.recording import _recorder as recorder
 from smartcam.recording import load_recording
 from tests.cli.commandline import emulators, run
 from tests.fleet.fleetkit import NumberedCamera
@@ -86,6 +87,7 @@ def _until_written(folder: Path, count: int, file: int) -> None:
 async def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Give a folder with four files or more of a camera that runs free."""
     monkeypatch.setattr(folder_writer, "INTERVAL", 0.01)
+    monkeypatch.setattr(recorder, "CHUNK", 1000)  # many to a file, however slow the machine is
     async with NumberedCamera(rate=400) as box, recording(tmp_path, box.url, size=6000):
         await until_true(lambda: len(files(tmp_path)) >= 5)
     return tmp_path / "rec"
@@ -97,7 +99,7 @@ def test_damage_is_told_and_skipped_and_the_rest_is_played(folder: Path) -> None
     whole = [runs(load_recording(path)) for path in paths]
     damaged = bytearray(paths[1].read_bytes())
     middle = len(damaged) // 3
-    damaged[middle : middle + 200] = bytes(200)
+    damaged[middle : middle + 400] = bytes(400)  # more than there is between two chunks
     paths[1].write_bytes(damaged)
     paths[2].write_bytes(b"no recording at all")
     found = load_recording(folder)
