@@ -184,7 +184,7 @@ async def _read(reader: frames.FrameReader, seconds: float) -> Way:
             sizes.append(len(frame.data))
             shown = await codecs.decode(frame) if frame.format.compressed else frame
             _note(latencies, shown.grey())
-            if time.monotonic() > begin + seconds:
+            if latencies and time.monotonic() > begin + seconds:
                 break
         return Way(latencies, sizes, _percent(cpu, begin))
 

@@ -236,7 +236,24 @@ class ZenohSession:
         return self
 
     async def _open(self, timeout: float) -> None:
-        loop, zenoh = self._loop, self._zenoh
+        loop = self._loop
+        try:
+            async with asyncio.timeout(timeout):
+                while True:
+                    begun = loop.time()
+                    try:
+                        self._session = await self._opened(timeout)
+                        return
+                    except self._zenoh.ZError as exc:
+                        # who is silent is given up after a lease: there may be time for another
+                        if loop.time() - begun < 0.9 * min(timeout, LEASE):
+                            raise self._failed(_reason(exc)) from exc
+        except TimeoutError as exc:
+            raise self._failed(f"no answer within {timeout:g} s") from exc
+
+    async def _opened(self, timeout: float) -> Any:
+        """Return a session; one that comes after all when nobody waits any more is closed."""
+        zenoh = self._zenoh
         config = zenoh.Config()
         settings = {**self._link.settings(timeout), **self._more}
         for path, value in settings.items():
@@ -246,18 +263,9 @@ class ZenohSession:
                 raise ConfigurationError(
                     f"{self._what}: the engine refuses {path}: {value!r}"
                 ) from exc
-        begun = loop.time()
-        opening = loop.run_in_executor(None, zenoh.open, config)
+        opening = self._loop.run_in_executor(None, zenoh.open, config)
         try:
-            async with asyncio.timeout(timeout):
-                self._session = await asyncio.shield(opening)
-        except TimeoutError as exc:
-            opening.add_done_callback(_close_late)
-            raise self._failed(f"no answer within {timeout:g} s") from exc
-        except zenoh.ZError as exc:
-            silent = loop.time() - begun >= LEASE
-            why = f"no answer within {LEASE:g} s" if silent else _reason(exc)
-            raise self._failed(why) from exc
+            return await asyncio.shield(opening)
         except asyncio.CancelledError:
             opening.add_done_callback(_close_late)
             raise

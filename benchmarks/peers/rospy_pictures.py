@@ -23,6 +23,9 @@ RATE = 30
 PYTHON = "/usr/bin/python3"
 """The system's."""
 
+LIMIT = 20.0
+"""Seconds until a subscriber that hears nothing is an error."""
+
 ROS = "rospy, sensor_msgs.msg"
 
 
@@ -83,7 +86,7 @@ def subscribe(how: str, seconds: float) -> None:
     rospy.init_node("far", disable_signals=True)
     rospy.Subscriber("pictures", Image if how == "raw" else CompressedImage, heard, queue_size=1)
     end = time.monotonic() + seconds + 3.0
-    while time.monotonic() < end:
+    while not sizes or time.monotonic() < end:  # `main` ends it if none ever comes
         time.sleep(0.1)
     print(*latencies)
     print(*sizes)
@@ -131,7 +134,8 @@ def main(how: str, seconds: float) -> None:
                         break
                 time.sleep(0.1)
             started.append(subprocess.Popen([*here, "publish", how], env=environment))
-            subprocess.run([*here, "subscribe", how, str(seconds)], env=environment, check=True)
+            subscriber = [*here, "subscribe", how, str(seconds)]
+            subprocess.run(subscriber, env=environment, check=True, timeout=seconds + LIMIT)
         finally:
             for process in reversed(started):
                 process.terminate()
