@@ -35,7 +35,7 @@ HOLD_OFF = 0.2
 ASK = 0.5
 """Seconds for another agent's answer, and between two looks at what it has."""
 
-RETURN = 2.0
+RETURN = 4.0
 """Seconds for others to be back on a bus that was away, before what they had is taken over."""
 
 
