@@ -111,12 +111,14 @@ async def test_the_device_streams_while_somebody_hears() -> None:
 async def test_two_hear_all_that_is_offered_and_only_the_last_one_ends_it() -> None:
     async with pictures() as (driver, _, here, there):
         one = there.subscribe(f"{CAM}/image_raw", IMAGE)
-        async with Node("other", context=here.context) as node:
+        await given(driver, frame(1))
+        assert (await soon(anext(one))).data[0] == 1
+        async with Node("other", context=here.context) as node:  # which is on the driver's session
             two = node.subscribe(f"{CAM}/image_raw", IMAGE)
-            await given(driver, frame(1))
-            assert (await soon(anext(one))).data[0] == (await soon(anext(two))).data[0] == 1
-        driver.give(frame(2))
-        assert (await soon(anext(one))).data[0] == 2
+            driver.give(frame(2))
+            assert (await soon(anext(one))).data[0] == (await soon(anext(two))).data[0] == 2
+        driver.give(frame(3))
+        assert (await soon(anext(one))).data[0] == 3
         one.close()
         await soon(driver.rests())
 
