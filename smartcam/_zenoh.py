@@ -593,11 +593,18 @@ def direct(call: Callable[[Any], None]) -> Any:
 
 
 def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
-    """Do something at the engine; a session that ends meanwhile is no error of the caller's."""
+    """Do something at the engine; a session that ends meanwhile is no error of the caller's.
+
+    What a thread is at when it is taken back ends with its last reference, which that thread has.
+    """
     try:
         call(*arguments, **named)
     except engine().ZError as exc:
         logger.debug("the engine: %s", exc)
+    except RuntimeError as exc:
+        if "borrowed" not in str(exc):
+            raise
+        logger.debug("the engine: %s, in another thread", exc)
 
 
 def _close_late(opening: asyncio.Future[Any]) -> None:
