@@ -192,11 +192,12 @@ class Agent:
         Raises:
             ConnectFailedError: there is no bus within ``timeout`` seconds.
             ConfigurationError: an option of a camera cannot work, or another agent has it and
-                neither stands by.
+                neither stands by; or another agent has this one's name.
         """
         await self._bus.open(timeout)
         keys, bus, declared = self._keys, self._bus, self._declared
         try:
+            await self._claims.refuse_namesake(timeout)
             declared.append(bus.watch(keys.program("*"), self._on_program))
             for command in (True, False):
                 key = keys.call(self.name, "**", command=command)

@@ -61,6 +61,22 @@ class Claims:
         self._watch: Handle | None = None
         self.given_up: dict[str, ConnectionTakenError] = {}
 
+    async def refuse_namesake(self, timeout: float) -> None:
+        """Raise where an agent of this name is there; before anything is said under it.
+
+        Raises:
+            ConfigurationError: one is there, and stays for longer than one that has died would.
+        """
+        loop, name = asyncio.get_running_loop(), self._agent.name
+        patience = loop.time() + LEASE + 1.0
+        while await self._bus.present(self._keys.agent(name), timeout):
+            if loop.time() > patience:
+                raise ConfigurationError(
+                    f"an agent named {name} is in fleet {self._keys.fleet} already; each has a "
+                    "name of its own: `agent:` in its fleet file"
+                )
+            await asyncio.sleep(ASK)
+
     async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
         """Have the cameras that no other agent has.
 

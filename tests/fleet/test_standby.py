@@ -374,6 +374,25 @@ async def test_agent_that_says_nothing_is_named() -> None:
             await pair.start("north", None)
 
 
+async def test_name_of_an_agent_that_goes_is_free() -> None:
+    async with Pair() as pair:
+        end = pair.bus.end()
+        await end.open(1.0)
+        token = end.be_present(Keys(FLEET).agent("north"))
+        asyncio.get_running_loop().call_later(0.7, token.close)
+        await pair.start("north", None)
+        assert pair.having() == ["north"]
+
+
+@pytest.mark.long
+async def test_two_agents_of_one_name_are_one_too_many() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        with pytest.raises(ConfigurationError, match="an agent named north is in fleet plant"):
+            await pair.start("north")
+        assert pair.having() == ["north"]
+
+
 @pytest.mark.parametrize(
     ("said", "found"),
     [(True, STANDS_BY), (False, None), ({"preference": 2}, Standby(preference=2)), ({}, STANDS_BY)],
