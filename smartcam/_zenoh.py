@@ -239,11 +239,10 @@ class ZenohSession:
         loop = self._loop
         try:
             async with asyncio.timeout(timeout):
-                while True:
+                while self._session is None:
                     begun = loop.time()
                     try:
                         self._session = await self._opened(timeout)
-                        return
                     except self._zenoh.ZError as exc:
                         # who is silent is given up after a lease: there may be time for another
                         if loop.time() - begun < 0.9 * min(timeout, LEASE):
