@@ -13,12 +13,12 @@ from __future__ import annotations
 import abc
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from smartcam.fleet._keys import meets
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from typing import Self
 
     from smartcam.fleet._certificates import Identity
@@ -173,17 +173,61 @@ class MemoryBus:
         return MemoryEnd(self)
 
 
+class _Patterned(Protocol):
+    pattern: str
+
+
+P = TypeVar("P", bound=_Patterned)
+
+
+class _Place(Generic[P]):
+    """What an end has of one kind, by pattern: of thousands, those that a key means."""
+
+    def __init__(self) -> None:
+        self._exact: dict[str, dict[P, None]] = {}
+        self._wild: dict[P, None] = {}
+
+    def __iter__(self) -> Iterator[P]:
+        for same in (*self._exact.values(), self._wild):
+            yield from tuple(same)
+
+    def __contains__(self, one: P) -> bool:
+        return one in self._wild or one in self._exact.get(one.pattern, ())
+
+    def add(self, one: P) -> None:
+        same = self._wild if "*" in one.pattern else self._exact.setdefault(one.pattern, {})
+        same[one] = None
+
+    def remove(self, one: P) -> None:
+        self._wild.pop(one, None)
+        same = self._exact.get(one.pattern, {})
+        same.pop(one, None)
+        if not same:
+            self._exact.pop(one.pattern, None)
+
+    def clear(self) -> None:
+        self._exact.clear()
+        self._wild.clear()
+
+    def meeting(self, pattern: str) -> list[P]:
+        """Return what a pattern, or a key, means."""
+        if "*" in pattern:
+            return [one for one in self if meets(one.pattern, pattern)]
+        wild = [one for one in self._wild if meets(one.pattern, pattern)]
+        return [*self._exact.get(pattern, ()), *wild]
+
+
 class _MemoryDeclared(Handle):
     """What an end has declared under a pattern."""
 
     def __init__(
-        self, place: list[_MemoryDeclared], pattern: str, call: Callable[..., None]
+        self, place: _Place[_MemoryDeclared], pattern: str, call: Callable[..., None]
     ) -> None:
         self.pattern = pattern
         self.call = call
         self._place = place
         self._after: Callable[[], None] = _nothing
-        place.append(self)
+        place.add(self)
 
     def then(self, after: Callable[[], None]) -> Self:
         """Have ``after`` called once it is closed."""
@@ -208,12 +252,12 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.heard_parts: list[_MemoryDeclared] = []
-        self.heard: list[_MemoryDeclared] = []
-        self.answered: list[_MemoryDeclared] = []
-        self.watched: list[_MemoryDeclared] = []
-        self.present_here: list[_MemoryDeclared] = []
-        self.publishers: list[_MemoryPublisher] = []
+        self.heard_parts = _Place[_MemoryDeclared]()
+        self.heard = _Place[_MemoryDeclared]()
+        self.answered = _Place[_MemoryDeclared]()
+        self.watched = _Place[_MemoryDeclared]()
+        self.present_here = _Place[_MemoryDeclared]()
+        self.publishers = _Place[_MemoryPublisher]()
 
     @property
     def attached(self) -> bool:
@@ -240,23 +284,23 @@ class MemoryEnd(Bus):
         if not self.attached:
             self._bus.ends.append(self)
             self._tell_presence(True)
-            self._tell_heard()
+            self._tell_heard("**")
 
     def detach(self) -> None:
         """Be cut off from it, as by a broken cable: both sides see the other go."""
         if self.attached:
             self._tell_presence(False)
             self._bus.ends.remove(self)
-            self._tell_heard()
+            self._tell_heard("**")
 
     def put(self, key: str, payload: bytes) -> None:
         for end in self._others():
-            for one in end.matching(end.heard, key):
+            for one in end.heard.meeting(key):
                 self._loop.call_soon(_call, one, key, payload)
 
     def put_part(self, key: str, head: bytes, data: Data) -> None:
         for end in self._others():
-            for one in end.matching(end.heard_parts, key):
+            for one in end.heard_parts.meeting(key):
                 self._loop.call_soon(_call, one, key, head, data)
 
     def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
@@ -268,9 +312,9 @@ class MemoryEnd(Bus):
         return _MemoryPublisher(self, self.publishers, key, on_heard)
 
     def subscribe(self, pattern: str, hear: Callable[[str, bytes], None]) -> Handle:
-        made = _MemoryDeclared(self.heard, pattern, hear).then(self._tell_heard)
-        self._tell_heard()
-        return made
+        made = _MemoryDeclared(self.heard, pattern, hear)
+        self._tell_heard(pattern)
+        return made.then(lambda: self._tell_heard(pattern))
 
     def answer(self, pattern: str, answer: Callable[[BusQuestion], None]) -> Handle:
         return _MemoryDeclared(self.answered, pattern, answer)
@@ -279,8 +323,7 @@ class MemoryEnd(Bus):
         questions = [
             (one, _MemoryQuestion(pattern, payload))
             for end in self._others()
-            for one in end.answered
-            if meets(one.pattern, pattern)
+            for one in end.answered.meeting(pattern)
         ]
         for one, question in questions:
             self._loop.call_soon(_call, one, question)
@@ -296,15 +339,13 @@ class MemoryEnd(Bus):
         return made.then(lambda: self._tell(key, False))
 
     async def present(self, pattern: str, timeout: float) -> list[str]:
-        found = [one for end in self._others() for one in end.present_here]
-        return [one.pattern for one in found if meets(pattern, one.pattern)]
+        return [one.pattern for end in self._others() for one in end.present_here.meeting(pattern)]
 
     def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
         made = _MemoryDeclared(self.watched, pattern, see)
         for end in self._others():
-            for one in end.present_here:
-                if meets(made.pattern, one.pattern):
-                    self._loop.call_soon(_call, made, one.pattern, True)
+            for one in end.present_here.meeting(pattern):
+                self._loop.call_soon(_call, made, one.pattern, True)
         return made
 
     # ------------------------------------------------------------------ among ends
@@ -318,43 +359,40 @@ class MemoryEnd(Bus):
         for end in self._others():
             for one in end.present_here:
                 if end is not self:
-                    for watch in self.matching(self.watched, one.pattern):
+                    for watch in self.watched.meeting(one.pattern):
                         self._loop.call_soon(_call, watch, one.pattern, present)
         for one in self.present_here:
             self._tell(one.pattern, present)
 
     def _tell(self, key: str, present: bool) -> None:
         for end in self._others():
-            for one in end.matching(end.watched, key):
+            for one in end.watched.meeting(key):
                 self._loop.call_soon(_call, one, key, present)
 
-    def _tell_heard(self) -> None:
+    def _tell_heard(self, pattern: str) -> None:
+        """Have whoever says what a pattern means see whether anybody hears."""
         for end in self._bus.ends:
-            for one in end.publishers:
+            for one in end.publishers.meeting(pattern):
                 one.look()
 
     def is_heard(self, key: str) -> bool:
         """Whether anybody hears what this end says under ``key``."""
-        return any(end.matching(end.heard, key) for end in self._others())
-
-    @staticmethod
-    def matching(place: list[_MemoryDeclared], key: str) -> list[_MemoryDeclared]:
-        """Return what of ``place`` is meant by ``key``."""
-        return [one for one in place if meets(one.pattern, key)]
+        return any(end.heard.meeting(key) for end in self._others())
 
 
 class _MemoryPublisher(Publisher):
     def __init__(
         self,
         end: MemoryEnd,
-        place: list[_MemoryPublisher],
+        place: _Place[_MemoryPublisher],
         key: str,
         on_heard: Callable[[bool], None] | None,
     ) -> None:
-        self._end, self._place, self._key = end, place, key
+        self.pattern = key
+        self._end, self._place = end, place
         self._on_heard = on_heard
         self._heard = False
-        place.append(self)
+        place.add(self)
         self.look()
 
     @property
@@ -363,18 +401,17 @@ class _MemoryPublisher(Publisher):
 
     def look(self) -> None:
         """See whether anybody hears."""
-        heard = self._end.is_heard(self._key)
+        heard = self._end.is_heard(self.pattern)
         if heard != self._heard:
             self._heard = heard
             if self._on_heard is not None:
                 self._on_heard(heard)
 
     def put(self, payload: bytes) -> None:
-        self._end.put(self._key, payload)
+        self._end.put(self.pattern, payload)
 
     def close(self) -> None:
-        if self in self._place:
-            self._place.remove(self)
+        self._place.remove(self)
 
 
 class _MemoryQuestion(BusQuestion):
