@@ -57,6 +57,9 @@ if TYPE_CHECKING:
     from smartcam.observers import Observer
     from smartcam.settings import CameraSettings
 
+ASK_AGAIN = 2.0
+"""Seconds for the answer to a question that waits; then it is asked again until its deadline."""
+
 REACH_TIMEOUT = 0.5
 """Seconds that what was said before a reply is waited for; it comes before, unless it was lost."""
 
@@ -262,22 +265,31 @@ class FleetCamera(Camera[ValueT]):
         loop = asyncio.get_running_loop()
         queue: asyncio.Queue[Status | LinkError] = asyncio.Queue()
         self._watching.add(queue)
+        why: object = "there was none yet"
         try:
             async with asyncio.timeout_at(deadline + grace(timeout)):
                 while True:
                     if self._closed is not None:
                         raise self._closed.with_traceback(None)
-                    if self.connected:
-                        with contextlib.suppress(ConnectionLostError):
-                            # what the agent restores, or goes back to, is done then
-                            await self._do("wait_connected", max(0.0, deadline - loop.time()))
-                            return
-                    else:
+                    if not self.connected:
                         await queue.get()
+                        continue
+                    left = max(0.0, deadline - loop.time())
+                    try:
+                        # what the agent restores, or goes back to, is done then
+                        await self._do("wait_connected", min(left, ASK_AGAIN))
+                    except ConnectionLostError:
+                        continue
+                    except ResponseTimeoutError as exc:  # or it was lost on the way
+                        why = exc
+                        if left <= ASK_AGAIN:
+                            raise TimeoutError from exc
+                    else:
+                        return
         except TimeoutError as exc:
             raise ResponseTimeoutError(
                 f"{self.name}: no session within {timeout:g} s; the last one: "
-                f"{self._trouble or 'there was none yet'}",
+                f"{self._trouble or why}",
                 waited=timeout,
             ) from exc
         finally:

@@ -58,6 +58,7 @@ class Claims:
         self._others: dict[str, set[str]] = {}  # agents that have a camera of ours
         self._settling: set[str] = set()
         self._again: set[str] = set()
+        self._back: dict[str, asyncio.Event] = {}  # another one's presence that is waited for
         self._watch: Handle | None = None
         self.given_up: dict[str, ConnectionTakenError] = {}
 
@@ -175,6 +176,8 @@ class Claims:
 
     def _on_presence(self, key: str, present: bool) -> None:
         if name := self._note(key, present):
+            if present and name in self._back:
+                self._back[name].set()
             self._consider(name)
 
     def on_event(self, event: CameraEvent) -> None:
@@ -208,7 +211,8 @@ class Claims:
         await asyncio.sleep(HOLD_OFF * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:
-                await asyncio.sleep(RETURN)
+                if await self._is_back(name):
+                    return  # should it go again, that is another matter
                 away = False
             else:
                 away = True
@@ -219,6 +223,21 @@ class Claims:
         logger.warning("%s = the agent %s takes it over", name, self._agent.name)
         self.given_up.pop(name, None)
         self._agent.share(name, settings)
+
+    async def _is_back(self, name: str) -> bool:
+        """Wait until another agent that has a camera is back on the bus; bounded."""
+        if self._others.get(name):
+            return True
+        back = self._back[name] = asyncio.Event()
+        try:
+            async with asyncio.timeout(RETURN):
+                await back.wait()
+        except TimeoutError:
+            return False
+        else:
+            return True
+        finally:
+            del self._back[name]
 
     async def _defend(self, name: str) -> None:
         """Keep a camera that another agent says it has, too, as long as it serves this one."""

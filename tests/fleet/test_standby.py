@@ -20,7 +20,7 @@ from smartcam.exceptions import (
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import MemoryBus, MemoryEnd
 from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._claims import ASK, HOLD_OFF
+from smartcam.fleet._claims import ASK, HOLD_OFF, RETURN
 from smartcam.fleet._file import FleetFile
 from smartcam.fleet._fleet import Fleet
 from smartcam.fleet._keys import Keys
@@ -339,6 +339,34 @@ async def test_bus_that_was_away_is_no_reason_to_take_over() -> None:
         await asyncio.sleep(10.0)
         assert (pair.having(), pair.sharing()) == (["north"], ["north"])
         assert pair.agents["north"].hosts[NAME].camera.statistics().sessions == 1
+
+
+async def test_who_is_back_with_the_bus_and_then_ends_is_replaced_at_once() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        for end in pair.ends.values():
+            end.detach()
+        await asyncio.sleep(2 * ASK)
+        for end in pair.ends.values():
+            end.attach()
+        await asyncio.sleep(ASK)  # south waits for those who are not back yet
+        await pair.agents.pop("north").close()
+        await until(lambda: pair.having() == ["south"], SOON)
+
+
+async def test_who_is_not_back_with_the_bus_is_replaced_after_a_while() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        for end in pair.ends.values():
+            end.detach()
+        await pair.agents.pop("north").close()
+        await asyncio.sleep(2 * ASK)
+        pair.ends["south"].attach()
+        await asyncio.sleep(RETURN - ASK)
+        assert pair.sharing() == []
+        await until(lambda: pair.having() == ["south"], 2 * ASK + SOON)
 
 
 def hosts(pair: Pair) -> list[Any]:

@@ -16,6 +16,15 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+SITES = range(1, 4)
+"""Hosts with cameras, an agent and a program."""
+
+HUB = 4
+"""The router's host."""
+
+LINE = 5
+"""The host of the cameras that two agents can reach; it is the last one."""
+
 TUN = (0x400454CA, 0x1001)  # TUNSETIFF; IFF_TUN and IFF_NO_PI
 NETWORK = "10.79.0."
 MOST_PACKETS = 10_000
@@ -49,11 +58,13 @@ class Switch:
     Attributes:
         spaces: their names, by the number of the host, from 1 on.
         cables: of the hosts.
+        apart: pairs of hosts of which nothing of the one arrives at the other.
     """
 
     def __init__(self, spaces: dict[int, str], ends: dict[int, int], seed: int) -> None:
         self.spaces = spaces
         self.cables = {number: Cable() for number in spaces}
+        self.apart: set[frozenset[int]] = set()
         self.carried = self.lost = 0
         self._ends, self._seed = ends, seed
         self._over, self._wake = os.pipe()
@@ -91,6 +102,7 @@ class Switch:
                         continue
                     cables = [one for one in way if one is not None]
                     lost = any(one.cut or chance.random() < one.loss for one in cables)
+                    lost = lost or frozenset((packet[SOURCE], packet[TARGET])) in self.apart
                     if lost or len(waiting) >= MOST_PACKETS:
                         self.lost += 1
                         continue

@@ -1,7 +1,7 @@
 """The processes of a plant: its cameras, its router, a program that uses all of it.
 
-``python -m tests.proofs.plant_process cameras COUNT``, ``... router PLACE CERTIFICATES``,
-``... program URL FIRST CAMERAS SEED``, ``... visitor URL``: each says on stdout, as lines of JSON,
+``python -m tests.proofs.plant_process cameras COUNT [ADDRESS]``, ``... router PLACE CERTIFICATES``,
+``... program URL FIRST SEED``, ``... visitor URL SECONDS``: each says on stdout, as lines of JSON,
 what it sees, and goes on until a line comes on stdin.
 """
 
@@ -13,21 +13,25 @@ import gc
 import itertools
 import json
 import sys
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
 import smartcam.fleet
-from smartcam import Result
+from smartcam import Disconnected, Reconnected, Result
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import InputContainerError, SmartCamError
 from smartcam.fleet import Fleet
 from smartcam.fleet._access import access_control
+from smartcam.fleet._camera import FleetCamera
 from smartcam.fleet._zenoh import ZenohEnd
 from tests.fleet.fleetkit import FAST, LAYOUT, PATIENCE, NumberedCamera
 from tests.proofs.chaos_soak import resident
 from tests.proofs.fleet_storm import WITH_INPUT, call
+from tests.proofs.plant_pace import Pace
+from tests.proofs.plant_pair import PAIRED
 
 AT_ONCE = 3
 """Calls of a program that are under way at a time."""
@@ -44,6 +48,9 @@ SAMPLE = 2.0
 
 GRACE = 2.0
 """Seconds after its deadline that a call may take on a computer that has much to do."""
+
+LATELY = 5.0
+"""Seconds for which this computer's pace is asked."""
 
 LAST = 30.0
 """Seconds of a call at the end, when nothing is wrong any more."""
@@ -62,12 +69,45 @@ async def told_to_end() -> None:
     await reader.readline()
 
 
-async def cameras(count: int) -> None:
+class ToldCamera(NumberedCamera):
+    """A camera that says at which host its session is.
+
+    Args:
+        number: of the camera.
+        **options: as a numbered camera has them.
+    """
+
+    def __init__(self, number: int, **options: Any) -> None:
+        super().__init__(**options)
+        self._place, self._had = number, [""]
+
+    def received(self, link: Any, message: Any) -> None:
+        """Hear a message, and say whose the session is, if that has changed."""
+        super().received(link, message)
+        self._tell()
+
+    def lost(self, link: Any) -> None:
+        """Lose a link; the same."""
+        super().lost(link)
+        self._tell()
+
+    def _tell(self) -> None:
+        if self.sessions != self._had:
+            self._had = self.sessions
+            host = None
+            if self._had:
+                host = int(self._had[0].rpartition(":")[0].rpartition(".")[2])
+            say(session=[self._place, host])
+
+
+async def cameras(count: int, host: str = "127.0.0.1") -> None:
     """Be so many cameras; say in the end which token was executed how often, and the runs."""
     async with contextlib.AsyncExitStack() as stack:
         boxes = [
-            await stack.enter_async_context(NumberedCamera(active=WITH_INPUT, time=0.005))
-            for _ in range(count)
+            await stack.enter_async_context(
+                ToldCamera(number, active=WITH_INPUT, time=0.005, host=host)
+            )
+            for number in range(count)
         ]
         say(urls=[box.url for box in boxes])
         await told_to_end()
@@ -110,21 +150,63 @@ class Heard:
         self.last = run
 
 
+class Shared:
+    """A camera that two agents have in turn, as a program sees it: one and the same throughout.
+
+    Args:
+        camera: of the program's.
+    """
+
+    def __init__(self, camera: FleetCamera[Any]) -> None:
+        self.camera = camera
+        self.told = 0  # how often it was lost
+        self.wrong: set[str] = set()
+        self._events = camera.events()
+        self._there = camera.connected
+
+    async def hear(self) -> None:
+        """Hear of it."""
+        async for event in self._events:
+            if isinstance(event, (Disconnected, Reconnected)):
+                there = isinstance(event, Reconnected)
+                if there == self._there:
+                    self.wrong.add(f"{type(event).__name__} twice in a row")
+                self._there = there
+                self.told += not there
+
+    def look(self, now: FleetCamera[Any]) -> None:
+        """Look what it is now."""
+        if now is not self.camera:
+            self.wrong.add("it is another object")
+        if now.ended:
+            self.wrong.add("it has ended")
+
+
 class Program:
     """Reads the results of all cameras, triggers one after the other, and says who is there."""
 
-    def __init__(self, fleet: Fleet, first: int, expected: int, seed: int) -> None:
-        self._fleet, self._expected = fleet, expected
+    def __init__(self, fleet: Fleet, first: int, seed: int) -> None:
+        self._fleet = fleet
         self._tokens = itertools.count(first)
         self._chance = Random(f"{seed} {first}")  # noqa: S311
         self._heard: dict[str, Heard] = {}
+        self._shared: dict[str, Shared] = {}
+        self._pace = Pace()
         self._ending = False
 
     async def run(self) -> None:
         """Be at work until it is told to end."""
         results = self._fleet.results(max_queue=QUEUE)
+        self._shared = {name: Shared(self._fleet[name]) for name in PAIRED}
         beside = [
-            asyncio.create_task(one) for one in (self._read(results), self._look(), self._sample())
+            asyncio.create_task(one)
+            for one in (
+                self._read(results),
+                self._look(),
+                self._sample(),
+                self._pace.run(),
+                *(one.hear() for one in self._shared.values()),
+            )
         ]
         work = [asyncio.create_task(self._work()) for _ in range(AT_ONCE)]
         await told_to_end()
@@ -143,7 +225,10 @@ class Program:
                 }
                 for name, heard in self._heard.items()
             },
-            ends=[one for one in ends if one],
+            ends=[
+                *(one for one in ends if one),
+                *(f"{name}: {text}" for name, one in self._shared.items() for text in one.wrong),
+            ],
         )
         for task in beside:
             if task.done():
@@ -157,8 +242,15 @@ class Program:
 
     async def _look(self) -> None:
         """Say who is there, again and again, for it may be asked since when that is so."""
+        fleet, shared = self._fleet, self._shared
         while True:
-            say(here=sorted(one.name for one in self._fleet.cameras() if one.connected))
+            for name, one in shared.items():
+                one.look(fleet[name])
+            say(
+                here=sorted(one.name for one in fleet.cameras() if one.connected),
+                having={name: fleet.agents(name) for name in shared},
+                told={name: one.told for name, one in shared.items()},
+            )
             await asyncio.sleep(LOOK)
 
     async def _sample(self) -> None:
@@ -176,7 +268,8 @@ class Program:
                 continue
             camera = self._chance.choice(there)
             token = next(self._tokens)
-            outcome, got = await call(camera, token, self._chance, grace=GRACE)
+            grace = GRACE * self._pace.since(time.monotonic() - LATELY)
+            outcome, got = await call(camera, token, self._chance, grace=grace)
             say(call=[token, outcome, got])
             with contextlib.suppress(SmartCamError):
                 if outcome == "InputContainerError":
@@ -212,11 +305,11 @@ class Program:
         return ""
 
 
-async def program(url: str, first: int, expected: int, seed: int) -> None:
+async def program(url: str, first: int, seed: int) -> None:
     """Be a program."""
     options: Any = {"interpret_as": LAYOUT, "reconnect": FAST}
     async with smartcam.fleet.open(url, connect_timeout=PATIENCE, **options) as fleet:
-        await Program(fleet, first, expected, seed).run()
+        await Program(fleet, first, seed).run()
 
 
 async def visitor(url: str, seconds: float) -> None:
@@ -234,7 +327,7 @@ async def visitor(url: str, seconds: float) -> None:
 if __name__ == "__main__":
     kind, *given = sys.argv[1:]
     if kind == "cameras":
-        asyncio.run(cameras(int(given[0])))
+        asyncio.run(cameras(int(given[0]), *given[1:]))
     elif kind == "router":
         asyncio.run(router(*given))
     elif kind == "program":
