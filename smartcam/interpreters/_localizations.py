@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 from itertools import repeat
@@ -71,30 +72,19 @@ class LocalizationsInterpreter(PlainInterpreter):
 
     def __init__(self, layout: Layout | None = None) -> None:
         super().__init__(layout)
-        fields = {field.name: field for field in self.layout.fields}
+        names = {field.name for field in self.layout.fields}
         for name in ("x", "y"):
-            if name not in fields:
+            if name not in names:
                 raise ConfigurationError(
                     f"interpreter localizations: expected a field {name!r} in the layout, "
                     f"got '{self.layout}'"
                 )
-        for field in fields.values():
-            _check(field)
-        missing = [name for name in _DEFAULTS if name not in fields]
-        names = [*fields, *missing]
-        places = [names.index(name) for name in _DEFAULTS]
-        values = tuple(_DEFAULTS[name] for name in missing)
-        self._missing = repeat(values) if values else None
-        self._pick: Callable[[Any], Any] | None = None  # where they stand in another order
-        if places != [*range(len(names))]:
-            self._pick = operator.itemgetter(*places)
-        self._z = [*fields].index("z") if "z" in fields else None  # which is rare
-        self._scales = _scales(fields)
-        # what is not used must be a text or a bool nevertheless
-        self._checks = any(
-            field.type in {"string", "bool"} and field.name != "feature_id"
-            for field in fields.values()
-        )
+        use = _use_of(self.layout.fields)
+        self._missing = repeat(use.missing) if use.missing else None
+        self._pick = use.pick
+        self._z = use.z
+        self._scales = use.scales
+        self._checks = use.checks
         self._empty = bytes(self.layout.size)
 
     def read(self, data: bytes, context: Context) -> list[Localization]:
@@ -179,6 +169,46 @@ def _wrong(field: Field, value: float) -> str:
         percent = field.unit is None and 1.0 < value <= 100.0
         return "0 to 1" + (" (its unit may be percent)" if percent else "")
     return ""
+
+
+class _Use(NamedTuple):
+    """How the fields of a record are used.
+
+    Attributes:
+        missing: what stands for those that it has not; goes behind the others.
+        pick: puts them into the order of use, None where they are in it.
+        z: the place of ``z``, which is rare; None without it.
+        scales: what turns them into SI.
+        checks: what is not used must be a text or a bool nevertheless.
+    """
+
+    missing: tuple[Any, ...]
+    pick: Callable[[Any], Any] | None
+    z: int | None
+    scales: _Scales | None
+    checks: bool
+
+
+@functools.lru_cache(maxsize=64)
+def _use_of(layout: tuple[Field, ...]) -> _Use:
+    """Return how the fields of a layout's record are used.
+
+    Raises:
+        ConfigurationError: a field has a type or a unit that its name cannot have.
+    """
+    fields = {field.name: field for field in layout}
+    for field in layout:
+        _check(field)
+    missing = [name for name in _DEFAULTS if name not in fields]
+    names = [*fields, *missing]
+    places = [names.index(name) for name in _DEFAULTS]
+    return _Use(
+        tuple(_DEFAULTS[name] for name in missing),
+        None if places == [*range(len(names))] else operator.itemgetter(*places),
+        [*fields].index("z") if "z" in fields else None,
+        _scales(fields),
+        any(one.type in {"string", "bool"} and one.name != "feature_id" for one in layout),
+    )
 
 
 class _Scales(NamedTuple):

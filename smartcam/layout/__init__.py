@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.layout._classes import read_class
 from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
-from smartcam.layout._text import Field, misfit, parse_text, to_text
+from smartcam.layout._compiled import compile_text
+from smartcam.layout._text import Field, misfit
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,32 +52,24 @@ class Layout:
     """
 
     __slots__ = (
-        *("_codecs", "_lenient", "_model", "_spec", "_text"),
+        *("_codecs", "_compiled", "_lenient", "_model", "_spec", "_text"),
         *("_fixed", "_is_list", "_record_word", "_sequence_index", "_to_end"),
         *("_frombuffer", "_tables", "_views"),
     )
 
     def __init__(self, text: str, *, lenient: bool = False, start: int = 0) -> None:
-        spec = parse_text(text, start)
-        self._spec = spec
-        self._text = to_text(spec)
+        made = compile_text(text, start, lenient=lenient)
+        self._compiled = made  # others find it as long as this one lives
+        self._spec = made.spec
+        self._text = made.text
         self._lenient = lenient
-        orders: tuple[ByteOrder, ByteOrder] = ("little", "big")
-        self._codecs = {
-            order: (
-                RecordCodec(spec.head, order, lenient=lenient),
-                RecordCodec(spec.fields, order, lenient=lenient),
-            )
-            for order in orders
-        }
-        # what does not depend on a container is worked out here, once
-        repeat = 1 if spec.repeat is None else spec.repeat
-        self._fixed: int | None = repeat if isinstance(repeat, int) else None  # number of records
-        self._to_end = repeat == "*" and not spec.head  # records, and nothing else
-        self._is_list = spec.is_list
-        self._record_word = "" if spec.repeat is None else "record"  # what an error calls one
-        fields = (*spec.head, *spec.fields)
-        self._sequence_index = next((i for i, f in enumerate(fields) if f.sequence), None)
+        self._codecs = made.codecs
+        self._fixed = made.fixed
+        self._to_end = made.to_end
+        self._is_list = made.is_list
+        self._record_word = made.record_word
+        self._sequence_index = made.sequence_index
+        # each layout has its own of these: a user may change a model, or the names of a dtype
         self._model: type[BaseModel] | None = None
         self._tables: dict[ByteOrder, TableCodec] = {}
         # where a table is the payload and nothing else: its dtype, and what makes it

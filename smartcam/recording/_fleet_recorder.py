@@ -18,7 +18,7 @@ from smartcam.protocols.messages import ResultContainer
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folder_files import Limits
 from smartcam.recording._folder_writer import FolderWriter
-from smartcam.recording._form import RecordedError, load_extra
+from smartcam.recording._form import RecordedError, load_compress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -102,7 +102,7 @@ class FleetRecorder(Server):
         writer = FolderWriter(
             RecordingFolder(self.path),
             Limits(section.size, section.age, section.keep),
-            load_extra("mcap.writer"),
+            load_compress(),
             self._tell,
             self._clock,
         )

@@ -47,14 +47,18 @@ class FolderFiles:
     Args:
         folder: that they are in.
         limits: of files.
-        mcap: the library's module ``mcap.writer``.
+        compress: packs a chunk.
         clock: seconds, for the files' age.
     """
 
     def __init__(
-        self, folder: RecordingFolder, limits: Limits, mcap: Any, clock: Callable[[], float]
+        self,
+        folder: RecordingFolder,
+        limits: Limits,
+        compress: Callable[[bytes], bytes],
+        clock: Callable[[], float],
     ) -> None:
-        self._folder, self._limits, self._mcap, self._clock = folder, limits, mcap, clock
+        self._folder, self._limits, self._compress, self._clock = folder, limits, compress, clock
         self._looked = -math.inf  # when it was looked what is in the folder
         self._stuck: set[str] = set()  # files that could not be deleted
 
@@ -140,7 +144,7 @@ class FolderFiles:
             self._folder.look()
             self._looked = now
         path = self._folder.next_path(track.camera, _time_of(first))
-        file = RecordingFile(opened(path, overwrite=False), self._mcap, path)
+        file = RecordingFile(opened(path, overwrite=False), self._compress, path)
         try:
             file.start()
             file.add(Description(track.facts))

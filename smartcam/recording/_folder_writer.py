@@ -74,7 +74,7 @@ class FolderWriter:
     Args:
         folder: that the files are in.
         limits: of files.
-        mcap: the library's module ``mcap.writer``.
+        compress: packs a chunk.
         tell: called in the thread with why nothing is written, and with None when it is again.
         clock: seconds, for the files' age and delays.
 
@@ -86,12 +86,12 @@ class FolderWriter:
         self,
         folder: RecordingFolder,
         limits: Limits,
-        mcap: Any,
+        compress: Callable[[bytes], bytes],
         tell: Callable[[RecordingError | None], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder, self._tell, self._clock = folder, tell, clock
-        self._files = FolderFiles(folder, limits, mcap, clock)
+        self._files = FolderFiles(folder, limits, compress, clock)
         self._more = threading.Condition()
         self._waiting = _DiskQueue()
         self._closing = False

@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 from smartcam.exceptions import MissingExtraError
@@ -27,6 +27,7 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import TraceEntry
+from smartcam.recording._json import frame_text, object_text, result_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -99,7 +100,7 @@ class Kind(NamedTuple):
     about: str  # what it is, for the schema
     properties: Mapping[str, Any]  # the schema's, by field
     required: tuple[str, ...]  # fields that are always there
-    to_json: Callable[[Any], dict[str, Any]]  # makes the object of an item
+    to_text: Callable[[Any], str]  # makes the message of an item, in ASCII
     # makes the item of an object; raises whatever comes where it does not fit
     from_json: Callable[[dict[str, Any]], Item]
 
@@ -131,9 +132,17 @@ def load_extra(name: str) -> Any:
         ) from exc
 
 
+def load_compress() -> Callable[[bytes], bytes]:
+    """Return what packs a chunk; raises as :func:`load_extra`."""
+    compress: Callable[[bytes], bytes] = load_extra("zstandard").compress
+    return compress
+
+
 def nanoseconds(at: datetime) -> int:
     """Return a time as MCAP has it: nanoseconds since 1970, UTC; never negative."""
-    return max(0, (at - EPOCH) // timedelta(microseconds=1) * 1000)
+    since = at - EPOCH
+    seconds = since.days * 86_400 + since.seconds
+    return max(0, seconds * 1_000_000_000 + since.microseconds * 1000)
 
 
 def count_values(data: bytes) -> int:
@@ -148,6 +157,18 @@ def count_values(data: bytes) -> int:
     if values > MAX_VALUES:
         raise ValueError(f"a message of {values} values, expected {MAX_VALUES} at most")
     return values
+
+
+def message_of(kind: str, item: Item) -> bytes:
+    """Return an item's message.
+
+    Raises:
+        ValueError: nobody could read it back.
+    """
+    data = KINDS[kind].to_text(item).encode()
+    if len(data) > min(MAX_MESSAGE, MAX_VALUES):  # a shorter one has fewer values
+        count_values(data)
+    return data
 
 
 def message_fields(data: bytes) -> dict[str, Any]:
@@ -176,13 +197,17 @@ def _object(value: object) -> dict[str, Any]:
     return {name: field for name, field in fields.items() if field is not None}
 
 
-def _event_object(event: CameraEvent) -> dict[str, Any]:
+def _event_text(event: CameraEvent) -> str:
     fields = _object(event)
     previous = fields.pop("previous", None)
     if previous is not None:
         name = "previous_status" if isinstance(event, StatusChanged) else "previous_application"
         fields[name] = previous
-    return {"event": type(event).__name__, **fields}
+    return object_text({"event": type(event).__name__, **fields})
+
+
+def _error_text(error: RecordedError) -> str:
+    return object_text(_object(error))
 
 
 # ---------------------------------------------------------------------- from JSON
@@ -376,7 +401,7 @@ KINDS: dict[str, Kind] = {
             "hex": _text("the bytes"),
         },
         ("at", "camera", "direction", "message", "hex"),
-        _object,
+        frame_text,
         _frame,
     ),
     "results": Kind(
@@ -394,7 +419,7 @@ KINDS: dict[str, Kind] = {
             "raw": _text("the container's bytes behind the application id, as hex"),
         },
         ("camera", "application", "number", "received_at", "raw"),
-        _object,
+        result_text,
         _result,
     ),
     "events": Kind(
@@ -419,7 +444,7 @@ KINDS: dict[str, Kind] = {
             "previous_application": _integer("ApplicationChanged: id of the one before"),
         },
         ("event", "camera", "at"),
-        _event_object,
+        _event_text,
         _event,
     ),
     "errors": Kind(
@@ -437,7 +462,7 @@ KINDS: dict[str, Kind] = {
             "records": _integer("RecordingGap: how many were not written"),
         },
         ("camera", "at", "error", "text"),
-        _object,
+        _error_text,
         _error,
     ),
 }

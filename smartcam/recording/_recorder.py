@@ -18,7 +18,7 @@ import stat
 import threading
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import IO, TYPE_CHECKING, NamedTuple, Protocol
 
 import smartcam
 from smartcam._locks import try_lock
@@ -32,14 +32,16 @@ from smartcam.recording._form import (
     KINDS,
     PROFILE,
     RecordedError,
-    count_values,
-    load_extra,
+    load_compress,
+    message_of,
     nanoseconds,
     topic_of,
 )
+from smartcam.recording._mcap import McapWriter
 from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import TracebackType
     from typing import Self
 
@@ -47,7 +49,7 @@ if TYPE_CHECKING:
 
 INTERVAL = 0.5
 """Seconds that anything waits for its chunk: a crash loses at most a second, writing included. The
-index of the chunks is kept in memory until the end: about 100 MB for a day without a pause."""
+index of the chunks is kept in memory until the end: about 25 MB for a day without a pause."""
 
 CHUNK = 1 << 20
 """Bytes that wait before a chunk is written sooner; also the largest chunk."""
@@ -154,7 +156,7 @@ class Recorder(Observer):
 
     def _make_file(self) -> _Written:
         """Make the file; raises as :meth:`open`."""
-        writer = load_extra("mcap.writer")
+        compress = load_compress()
         try:
             stream = opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
@@ -167,7 +169,7 @@ class Recorder(Observer):
         except (OSError, ValueError) as exc:
             reason = exc.strerror if isinstance(exc, OSError) else exc
             raise ConfigurationError(f"recording {self.path}: {reason}") from exc
-        return RecordingFile(stream, writer, self.path)
+        return RecordingFile(stream, compress, self.path)
 
     def close(self) -> None:
         """Write what waits and end the file; idempotent.
@@ -337,14 +339,14 @@ class RecordingFile:
 
     Args:
         stream: it, open.
-        mcap: the library's module ``mcap.writer``.
+        compress: packs a chunk; of :func:`load_compress`.
         path: where it is.
     """
 
-    def __init__(self, stream: IO[bytes], mcap: Any, path: Path) -> None:
+    def __init__(self, stream: IO[bytes], compress: Callable[[bytes], bytes], path: Path) -> None:
         self.path = path
         self._stream = stream  # closed at the end
-        self._writer = mcap.Writer(stream, chunk_size=CHUNK)
+        self._writer = McapWriter(stream, compress, CHUNK)
         self._on_disk = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
@@ -354,7 +356,7 @@ class RecordingFile:
 
     def start(self) -> None:
         """Write what stands first."""
-        self._writer.start(PROFILE, library=f"smartcam {smartcam.__version__}")
+        self._writer.start(PROFILE, f"smartcam {smartcam.__version__}")
         began = datetime.now(UTC).isoformat()
         facts = {"format": FORMAT, "version": smartcam.__version__, "began": began}
         self._writer.add_metadata(FILE_METADATA, facts)
@@ -363,12 +365,12 @@ class RecordingFile:
     def add(self, item: Item | Description) -> None:
         """Write one thing; it is on the disk after the next :meth:`flush`."""
         match item:
-            case Description(facts):
-                self._describe(facts)
             case TraceEntry():
                 self._message("frames", item.camera, item.at, item)
             case Result():
                 self._message("results", item.camera, item.received_at, item)
+            case Description(facts):
+                self._describe(facts)
             case RecordedError():
                 self._message("errors", item.camera, item.at, item)
             case _:
@@ -427,9 +429,7 @@ class RecordingFile:
         channel = self._channel(camera, kind)
         when = nanoseconds(at)
         self._numbers[channel] = number = self._numbers[channel] + 1
-        data = json.dumps(KINDS[kind].to_json(item), separators=(",", ":")).encode()
-        count_values(data)
-        self._writer.add_message(channel, when, data, when, number & 0xFFFFFFFF)
+        self._writer.add_message(channel, when, message_of(kind, item), number & 0xFFFFFFFF)
 
     def _channel(self, camera: str, kind: str) -> int:
         known = self._channels.get((camera, kind))
@@ -440,7 +440,7 @@ class RecordingFile:
             self._schemas[kind] = self._writer.register_schema(
                 KINDS[kind].schema, "jsonschema", schema
             )
-        channel: int = self._writer.register_channel(
+        channel = self._writer.register_channel(
             topic_of(camera, kind), "json", self._schemas[kind], {"camera": camera}
         )
         self._channels[camera, kind] = channel

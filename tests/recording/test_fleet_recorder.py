@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import importlib
 import itertools
 import json
 import logging
@@ -29,7 +28,7 @@ from smartcam.recording import _folder_writer as folder_writer
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folder_files import FolderFiles, Limits
 from smartcam.recording._folder_track import CameraTrack
-from smartcam.recording._form import GAP
+from smartcam.recording._form import GAP, load_compress
 from smartcam.recording._schedule import plan_replay
 from smartcam.recording._state import RecordedState
 from tests.fleet.fleetkit import NumberedCamera
@@ -156,9 +155,9 @@ async def test_file_is_over_when_it_is_old_also_of_a_silent_camera(tmp_path: Pat
 def test_names_sort_also_where_the_clock_goes_back(tmp_path: Path) -> None:
     folder, ages = tmp_path / "rec", itertools.count(step=100)
     for seconds in ((100.0, 50.0, 50.0), (60.0,)):
-        mcap = importlib.import_module("mcap.writer")
+        compress = load_compress()
         files_of = RecordingFolder(folder)
-        writer = FolderFiles(files_of, Limits(1e9, 60.0, 1e9), mcap, ages.__next__)
+        writer = FolderFiles(files_of, Limits(1e9, 60.0, 1e9), compress, ages.__next__)
         writer.enter()
         track = CameraTrack(NAME, lambda given: iter([given]))
         for one in seconds:
@@ -175,9 +174,9 @@ def test_names_sort_also_where_the_clock_goes_back(tmp_path: Path) -> None:
 
 
 def test_trigger_behind_which_a_file_is_damaged_gets_no_others_result(tmp_path: Path) -> None:
-    mcap = importlib.import_module("mcap.writer")
+    compress = load_compress()
     folder = RecordingFolder(tmp_path / "rec")
-    writer = FolderFiles(folder, Limits(1e9, 1e9, 1e9), mcap, lambda: 0.0)
+    writer = FolderFiles(folder, Limits(1e9, 1e9, 1e9), compress, lambda: 0.0)
     writer.enter()
     track = CameraTrack(NAME, lambda given: iter([given]))
 

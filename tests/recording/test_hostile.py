@@ -23,7 +23,7 @@ from smartcam.recording import _form as forms
 from smartcam.recording import _reader as reader
 from smartcam.recording import _records as bounds
 from smartcam.recording import _schedule as plans
-from smartcam.recording._form import FORMAT, KINDS, MAX_VALUES
+from smartcam.recording._form import FORMAT, KINDS, MAX_VALUES, message_fields, message_of
 from tests.recording.recordingkit import frame, session, status, write
 
 RESULT = {
@@ -202,11 +202,11 @@ WRONG: list[object] = [
 def messages() -> list[tuple[int, dict[str, Any]]]:
     """Return channel and body of each kind of message, as a recorder writes them."""
     events = session()
-    frames = [KINDS["frames"].to_json(one) for one in events[:-1]]
+    frames = [message_fields(message_of("frames", one)) for one in events[:-1]]
     container = frame(1, "< ResultContainer", application=5, data="00")
     switch = frame(1, "> SwitchApplication", application=5)
     answer = frame(1, "< SwitchAnswer", application=5, code=0)
-    frames += [KINDS["frames"].to_json(one) for one in (container, switch, answer)]
+    frames += [message_fields(message_of("frames", one)) for one in (container, switch, answer)]
     at, camera = events[0].at, "left"
     told = [
         Connected(camera=camera, at=at, url="bvs://h:36701?dialect=handbook"),
@@ -218,7 +218,7 @@ def messages() -> list[tuple[int, dict[str, Any]]]:
     result = {**RESULT, "triggered_at": when, "latency": 0.1, "sequence": 3, "value": [1]}
     return [
         *((2, one) for one in frames),
-        *((3, KINDS["events"].to_json(one)) for one in told),
+        *((3, message_fields(message_of("events", one))) for one in told),
         (1, result),
         (4, error),
     ]

@@ -218,9 +218,9 @@ def test_recorder_opened_twice_is_refused(tmp_path: Path) -> None:
 def test_recorder_without_the_library_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    monkeypatch.setitem(sys.modules, "zstandard", None)
     with pytest.raises(
-        MissingExtraError, match=r'need mcap: pip install "smartcam\[record\]"'
+        MissingExtraError, match=r'need zstandard: pip install "smartcam\[record\]"'
     ) as told:
         Recorder(tmp_path / "run.mcap").open()
     assert told.value.extra == "record"

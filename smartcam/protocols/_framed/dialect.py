@@ -136,12 +136,13 @@ class Codec:
         message_id: its id.
         size: of the fields that have one, bytes.
         has_data: whether every byte behind them is a field.
+        names: of all its fields.
     """
 
     __slots__ = (
         *("_body", "_code", "_data", "_fields", "_fill", "_header_size"),
         *("_known", "_meaning", "_omitted", "_status"),
-        *("has_data", "message_id", "size", "type"),
+        *("has_data", "message_id", "names", "size", "type"),
     )
 
     def __init__(self, row: MessageRow, dialect: FramedDialect) -> None:
@@ -149,6 +150,7 @@ class Codec:
         codes = {Wire.WORD: dialect.word, Wire.UINT32: "I"}
         self.type: type[Message] = row.type
         self.message_id: int = row.message_id
+        self.names: tuple[str, ...] = tuple(name for name, _ in fields)
         self._header_size = dialect.header.size
         self._status = dialect.status_bits if row.type is StatusReport else None
         self._fields = tuple(name for name, wire in fields if wire is not Wire.DATA)
@@ -400,10 +402,8 @@ class FramedDialect(Dialect):
 
     def fields(self, message_type: type[Message]) -> tuple[str, ...]:
         """Return the names of the fields that a message has on the wire."""
-        for row in self.table:
-            if row.type is message_type:
-                return tuple(name for name, _ in row.fields)
-        return ()
+        codec = self._encoders.get(message_type)
+        return codec.names if codec is not None else ()
 
     def message_id(self, message: Message | type[Message]) -> int:
         """Return the id of a message in this dialect.

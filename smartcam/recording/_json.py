@@ -1,0 +1,208 @@
+"""Frames and results as JSON, put together: they are nearly all that is in a recording.
+
+The text is that of ``json.dumps(jsonable(item))`` without white space and without what is None,
+character for character. What is not of the types that a client makes goes that way itself.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from datetime import UTC, datetime
+from json.encoder import encode_basestring_ascii
+from typing import TYPE_CHECKING, Any
+
+from smartcam.models import (
+    Header,
+    Localization,
+    Pose,
+    Position,
+    Quaternion,
+    Result,
+    jsonable,
+)
+from smartcam.observers import TraceEntry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+LONG = 1024
+"""Characters of a text from which on it pays to look whether it is nothing but hex, which needs no
+quoting: that takes most of the time of a large container."""
+
+NULL = "null"
+
+_HEX = b"0123456789abcdef"
+EPOCH = datetime.fromtimestamp(0, UTC)
+_PLAIN = frozenset({str, int, float, bool, type(None)})
+_FLOAT = frozenset({float})
+_COLUMNS = frozenset("iufbS")
+"""Kinds of a table's columns whose values numpy gives as Python's."""
+
+_quoted: Callable[[str], str] = encode_basestring_ascii
+_encode = json.JSONEncoder(separators=(",", ":")).encode
+_encode_finite = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
+_FRAME = tuple(f'"{name}":' for name in TraceEntry._fields)
+_RESULT = tuple(f'"{name}":' for name in Result._fields)
+
+_HEADER = '{"seq":%s,"stamp":%s,"frame_id":%s}'
+_PART = (
+    '{"feature_id":%s,"quality":%r,"photo_index":%d,"pose":{"header":%s,'
+    '"position":{"x":%r,"y":%r,"z":%r},"orientation":{"x":%r,"y":%r,"z":%r,"w":%r}}}'
+)
+
+
+def object_text(fields: dict[str, Any]) -> str:
+    """Return the text of an object of plain values."""
+    return _encode(fields)
+
+
+def frame_text(entry: TraceEntry) -> str:
+    """Return a frame's text."""
+    at, camera, direction, message_id, message, fields, data = entry
+    texts = (
+        *(_text(at), _text(camera), _text(direction), _text(message_id), _text(message)),
+        _fields_text(fields, data) if type(fields) is dict else _text(fields),
+        _hex_text(data) if type(data) is str else _text(data),
+    )
+    return _object_of(_FRAME, texts)
+
+
+def result_text(result: Result[Any]) -> str:
+    """Return a result's text; where the value is ``raw`` itself it is turned to hex once."""
+    raw, value = result.raw, result.value
+    raw_text = f'"{raw.hex()}"' if type(raw) is bytes else _text(raw)
+    value_text = raw_text if value is raw else _value_text(value)
+    return _object_of(_RESULT, (*map(_text, result[:-2]), raw_text, value_text))
+
+
+def _object_of(names: tuple[str, ...], texts: tuple[str, ...]) -> str:
+    pairs = zip(names, texts, strict=True)
+    return f"{{{','.join([name + text for name, text in pairs if text != NULL])}}}"
+
+
+def _text(value: object) -> str:
+    kind = type(value)
+    if kind is str:
+        return _quoted(value)  # type: ignore[arg-type]
+    if kind is int:
+        return repr(value)
+    if value is None:
+        return NULL
+    if kind is datetime:
+        return _time_text(value)  # type: ignore[arg-type]
+    return _value_text(value)
+
+
+_latest: list[tuple[datetime, str]] = [(EPOCH, f'"{EPOCH.isoformat()}"')]
+"""The time that was written last, and its text: a result and its parts have the same one."""
+
+
+def _time_text(at: datetime) -> str:
+    known, text = _latest[0]
+    if known is not at:
+        text = f'"{at.isoformat()}"'
+        _latest[0] = at, text
+    return text
+
+
+def _fields_text(fields: Mapping[str, Any], data: str) -> str:
+    """Return a frame's fields; ``data``: all of its bytes, as hex."""
+    texts: list[str] = []
+    for name, value in fields.items():
+        # the container is the end of its frame, which is looked through by itself
+        same = type(value) is str and len(value) > LONG and data.endswith(value)
+        text = _hex_text(value) if same else _text(value)
+        texts.append(f"{_quoted(str(name))}:{text}")
+    return f"{{{','.join(texts)}}}"
+
+
+def _hex_text(text: str) -> str:
+    if len(text) > LONG and text.isascii() and not text.encode().translate(None, _HEX):
+        return f'"{text}"'
+    return _quoted(text)
+
+
+def _value_text(value: object) -> str:
+    kind = type(value)
+    if kind is list:
+        text = _parts_text(value)  # type: ignore[arg-type]
+        if text is not None:
+            return text
+    try:
+        return _encode_finite(_plain(value))
+    except (TypeError, ValueError):  # NaN, infinity, or what numpy knows and Python does not
+        return _encode(jsonable(value))
+
+
+def _parts_text(value: list[object]) -> str | None:
+    """Return the text of localizations; None where it is to be made in another way."""
+    texts: list[str] = []
+    header: object = None
+    header_text = ""
+    for part in value:
+        if type(part) is not Localization:
+            return None
+        feature_id, quality, photo_index, pose = part
+        if type(pose) is not Pose or type(feature_id) is not str or type(photo_index) is not int:
+            return None
+        of, position, orientation = pose
+        if type(position) is not Position or type(orientation) is not Quaternion:
+            return None
+        numbers = quality, *position, *orientation
+        if not _FLOAT.issuperset(map(type, numbers)) or not math.isfinite(sum(numbers)):
+            return None  # a sum is not finite where one of them is not
+        if of is not header:  # they have the same one
+            if type(of) is not Header:
+                return None
+            header, header_text = of, _HEADER % (*map(_text, of),)
+        front = _quoted(feature_id), quality, photo_index, header_text
+        texts.append(_PART % (*front, *numbers[1:]))
+    return f"[{','.join(texts)}]"
+
+
+def _plain(value: Any) -> Any:
+    """Return what :func:`~smartcam.models.jsonable` does, but floats as they are."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind is list or kind is tuple:
+        return value if _PLAIN.issuperset(map(type, value)) else [_plain(one) for one in value]
+    if kind is dict:
+        return {str(name): _plain(one) for name, one in value.items()}
+    if issubclass(kind, tuple) and hasattr(value, "_asdict"):
+        fields: dict[str, Any] = value._asdict()
+        if _PLAIN.issuperset(map(type, fields.values())):
+            return fields
+        return {name: _plain(one) for name, one in fields.items()}
+    numpy = sys.modules.get("numpy")
+    if numpy is not None and kind is numpy.ndarray:
+        rows = _rows(value)
+        if rows is not None:
+            return rows
+    return jsonable(value)
+
+
+def _rows(table: Any) -> Any:
+    """Return a table's rows; None where they are not simple."""
+    names, fields = table.dtype.names, table.dtype.fields
+    kinds = [fields[name][0].kind for name in names or ()]
+    if table.ndim != 1 or not kinds or not _COLUMNS.issuperset(kinds):
+        return None
+    texts = [place for place, kind in enumerate(kinds) if kind == "S"]
+    rows: list[Any] = table.tolist()
+    if texts:
+        columns = [*zip(*rows, strict=True)]
+        for place in texts if columns else ():
+            columns[place] = tuple(map(_text_or_hex, columns[place]))
+        rows = [*zip(*columns, strict=True)]
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _text_or_hex(data: bytes) -> str:
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data.hex()

@@ -1,0 +1,184 @@
+"""What a recorder writes, character for character that of the standard library."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+import struct
+from collections import namedtuple
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from smartcam.interpreters import Context, resolve
+from smartcam.layout import Layout
+from smartcam.models import (
+    Header,
+    Localization,
+    Pose,
+    Position,
+    Quaternion,
+    Result,
+    Status,
+    jsonable,
+)
+from smartcam.observers import TraceEntry
+from smartcam.recording._form import message_of, nanoseconds
+from smartcam.recording._json import LONG
+from tests.recording.recordingkit import at
+
+if TYPE_CHECKING:
+    from smartcam.recording._form import Item
+
+Pair = namedtuple("Pair", "left right")  # noqa: PYI024 - as somebody's plug-in has it
+
+
+def plainly(item: Item) -> bytes:
+    """Return an item's message as the slow way makes it."""
+    fields = {name: field for name, field in jsonable(item).items() if field is not None}
+    return json.dumps(fields, separators=(",", ":")).encode()
+
+
+def result(value: Any, **fields: Any) -> Result[Any]:
+    made: Result[Any] = Result("left", 5, None, 1, None, at(0), None, b"\x00\xff", value)
+    return made._replace(**fields)
+
+
+FLOATS = st.floats() | st.sampled_from([0.0, -0.0, 1e300, math.nan, math.inf])
+LEAVES = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | FLOATS
+    | st.text()
+    | st.binary()
+    | st.datetimes(timezones=st.just(UTC))
+)
+VALUES = st.recursive(
+    LEAVES,
+    lambda some: (
+        st.lists(some)
+        | st.tuples(some, some)
+        | st.builds(Pair, some, some)
+        | st.dictionaries(st.text() | st.integers() | st.booleans(), some)
+    ),
+    max_leaves=8,
+)
+HEADERS = st.builds(Header, st.integers(), st.just(at(1)), st.text() | st.none())
+LOCALIZATIONS = st.builds(
+    Localization,
+    st.text(),
+    FLOATS,
+    st.integers(),
+    st.builds(
+        Pose,
+        HEADERS,
+        st.builds(Position, FLOATS, FLOATS, FLOATS),
+        st.builds(Quaternion, FLOATS, FLOATS, FLOATS, FLOATS),
+    ),
+)
+PART: Any = Localization("a", 1.0, 0, Pose(Header(1, at(1), "x"), Position(1, 2, 3), Quaternion()))
+
+
+@given(VALUES | st.lists(LOCALIZATIONS) | st.lists(VALUES | LOCALIZATIONS))
+@example([PART])  # integers where there are floats otherwise
+@example([PART._replace(quality=np.float32(0.5))])
+@example([PART._replace(quality=True)])
+@example([PART._replace(pose=None)])
+@example([PART._replace(photo_index="first")])
+def test_result_is_written_as_the_slow_way_writes_it(value: Any) -> None:
+    assert message_of("results", result(value)) == plainly(result(value))
+
+
+@given(
+    st.tuples(st.text(), st.integers(), st.none() | st.integers(), st.integers()),
+    st.none() | st.datetimes(timezones=st.just(UTC)),
+    st.none() | FLOATS,
+    st.binary(),
+)
+def test_result_fields_are_written_as_the_slow_way_writes_them(
+    first: tuple[Any, ...], triggered_at: datetime | None, latency: float | None, raw: bytes
+) -> None:
+    received_at = at(0).astimezone(timezone(timedelta(hours=2)))
+    one: Result[Any] = Result._make((*first, triggered_at, received_at, latency, raw, raw))
+    assert message_of("results", one) == plainly(one)
+
+
+TABLE = np.array(
+    [(1, 0.5, b"a1", True), (2, 1.5, b"\xff\xfe", False)],
+    dtype=[("n", "<i4"), ("x", "<f4"), ("code", "S4"), ("ok", "?")],
+)
+
+
+class Colour(enum.Enum):
+    RED = "red"
+
+
+@dataclass
+class Found:
+    colour: Colour
+    at: float
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        TABLE,
+        TABLE[:0],
+        TABLE.reshape(1, 2),
+        np.array([(math.nan,)], dtype=[("x", "<f8")]),
+        np.array([((1, 2),)], dtype=[("p", [("x", "<i2"), ("y", "<i2")])]),
+        np.array([([1, 2],)], dtype=[("p", "<i2", 2)]),
+        np.array([("äöü",)], dtype=[("t", "U3")]),
+        np.array([[1.0, math.inf]]),
+        np.float64(0.1),
+        {"a": np.int16(3), 4: [np.bool_(True)]},
+        [Found(Colour.RED, 0.5), Pair(1, [Pair(2, b"\x01")])],
+        Status.RUNNING | Status.WAITING_FOR_TRIGGER,
+        [Status.RUNNING],
+        Layout("passed: bool, x: real32 mm, code: string[4]").parse(
+            b"\xff" + struct.pack("<f4s", 12.5, b"A1")
+        ),
+        resolve("localizations").read(  # type: ignore[attr-defined]
+            struct.pack("<50sfifff", b"part", 0.97, 0, 0.1, 0.2, 0.5) * 3, Context(camera="left")
+        ),
+        object(),
+        {1, 2},
+        memoryview(b"\x01\x02"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_result_value_of_any_kind_is_written_as_the_slow_way_writes_it(value: Any) -> None:
+    assert message_of("results", result(value)) == plainly(result(value))
+
+
+LONG_HEX = bytes(range(256)).hex() * (LONG // 256)
+
+
+@given(
+    st.none() | st.integers(),
+    st.text(),
+    st.none() | st.dictionaries(st.text(), VALUES),
+    st.text() | st.binary().map(bytes.hex) | st.text(min_size=LONG + 1, max_size=LONG + 20),
+)
+@example(32, "ResultContainer", {"application": 5, "data": LONG_HEX}, "00" + LONG_HEX)
+@example(32, "ResultContainer", {"data": LONG_HEX + '"'}, "00" + LONG_HEX + '"')
+@example(32, "ResultContainer", {"data": LONG_HEX + "é"}, "00" + LONG_HEX + "é")
+@example(32, "ResultContainer", {"data": LONG_HEX + "\n"}, "00")
+def test_frame_is_written_as_the_slow_way_writes_it(
+    message_id: int | None, message: str, fields: dict[str, Any] | None, data: str
+) -> None:
+    entry = TraceEntry(at(0), "left", "<", message_id, message, fields, data)
+    assert message_of("frames", entry) == plainly(entry)
+
+
+@given(st.datetimes(timezones=st.just(UTC)) | st.just(at(0).astimezone(timezone(timedelta(1 / 3)))))
+def test_nanoseconds_are_exact_and_never_negative(when: datetime) -> None:
+    since = when - datetime(1970, 1, 1, tzinfo=UTC)
+    assert nanoseconds(when) == max(0, since // timedelta(microseconds=1) * 1000)
