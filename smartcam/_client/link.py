@@ -19,6 +19,7 @@ from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._client.doorbell import Doorbell
+from smartcam._datagrams import read_no_more_than_needed
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import TraceEntry
 from smartcam.protocols._base import Dialect, Role, Transport
@@ -253,6 +254,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """asyncio: the link is open."""
         self._transport = transport
         links[self._loop] = links.get(self._loop, 0) + 1
+        if self.machine.transport is Transport.UDP:
+            read_no_more_than_needed(transport)
         sock = transport.get_extra_info("socket")
         if sock is not None and self.machine.transport is Transport.TCP:
             # the camera sets it and advises it (SC manual p. 40: published)

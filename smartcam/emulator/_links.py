@@ -15,6 +15,7 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from smartcam._accepting import Acceptor
+from smartcam._datagrams import read_no_more_than_needed
 from smartcam.emulator._client_link import ClientLink
 from smartcam.protocols._base import Transport
 from smartcam.protocols._framed.machine import State
@@ -29,6 +30,14 @@ FAREWELL = 1.0
 
 _NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
 
+LEAST_READ = 1 << 10
+"""Bytes that one read of a connection takes at most, at first: what a client says is short, and
+hundreds of cameras may have a buffer each. It doubles each time that a read took so many, as input
+data may; a read that took fewer makes it small again."""
+
+MOST_READ = 1 << 16
+"""Bytes that one read takes at most in the end."""
+
 REFUSED = "refuse"
 """Kind of the fault that closes the port for a time."""
 
@@ -40,7 +49,7 @@ def _peer_text(address: Any) -> str:
 # ---------------------------------------------------------------------- TCP
 
 
-class _TcpLink(ClientLink, asyncio.Protocol):
+class _TcpLink(ClientLink, asyncio.BufferedProtocol):
     """A connection. All that one step causes goes out in one write (SC manual p. 40)."""
 
     _transport: asyncio.Transport
@@ -50,6 +59,7 @@ class _TcpLink(ClientLink, asyncio.Protocol):
         self._listener = listener
         self._farewell: asyncio.TimerHandle | None = None
         self._end_waits = False
+        self._room = bytearray(LEAST_READ)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
@@ -65,7 +75,16 @@ class _TcpLink(ClientLink, asyncio.Protocol):
             transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._owner.arrived(self)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._room
+
+    def buffer_updated(self, nbytes: int) -> None:
+        room, size = self._room, len(self._room)
+        data = bytes(memoryview(room)[:nbytes])
+        if nbytes == size < MOST_READ:
+            self._room = bytearray(2 * size)
+        elif nbytes < size > LEAST_READ:
+            self._room = bytearray(LEAST_READ)
         if self.closed:  # it says farewell
             return
         with self._owner.step():
@@ -323,6 +342,10 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         self._close_socket()
         for link in self.all_links:
             link.close("the camera is down")
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """asyncio: the endpoint is there."""
+        read_no_more_than_needed(transport)
 
     def _close_socket(self) -> None:
         transport, self._transport = self._transport, None

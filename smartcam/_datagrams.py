@@ -1,0 +1,24 @@
+"""Datagrams on asyncio, for whoever has an endpoint: the client's links and the emulator."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import asyncio
+
+LARGEST_DATAGRAM = 1 << 16
+"""Bytes that one read makes room for: UDP's length field, 16 bits, cannot say more."""
+
+
+def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
+    """Have an endpoint make room for one datagram at each read, not for asyncio's 256 KiB.
+
+    So much the C library takes from the system and gives back every time, until it has learned
+    better; in a young process that costs more than the rest of the read. The attribute is asyncio's
+    own, of both its loops, and not documented: a transport without it, such as uvloop's, is left as
+    it is.
+    """
+    size = getattr(transport, "max_size", None)
+    if isinstance(size, int) and size > LARGEST_DATAGRAM:
+        transport.max_size = LARGEST_DATAGRAM  # type: ignore[attr-defined]
