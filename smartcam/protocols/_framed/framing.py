@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar
 
 from smartcam.exceptions import FrameError, hex_excerpt
 
@@ -29,6 +29,8 @@ LARGE = 1 << 12
 """Bytes of a frame from which on its rest is collected in a buffer of its own. Below it an
 unfinished frame is copied in front of the next chunk, which costs less."""
 
+
+T = TypeVar("T")
 
 Buffer: TypeAlias = bytes | memoryview
 Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
@@ -251,6 +253,21 @@ class Framer:
     def take(self, begin: int, end: int) -> bytes:
         """Return the bytes at a place that :meth:`cut` told."""
         return bytes(self.buffer[begin:end])
+
+    def familiar(self, known: Mapping[bytes, T], size: int) -> list[T]:
+        """Return what is known of the frames that come next, as long as one is known.
+
+        ``known``: by their bytes, ``size`` each, header included.
+        """
+        buffer, start = self.buffer, self._start
+        found: list[T] = []
+        if isinstance(buffer, memoryview):
+            return found
+        while (one := known.get(buffer[start : start + size])) is not None:
+            found.append(one)
+            start += size
+        self._start = start
+        return found
 
     def following(self, read: Read, like: int, size: int) -> list[bytes]:
         """Return the payloads of the whole frames that come next and are of the same kind.

@@ -40,6 +40,10 @@ MANY_FRAMES = 512
 the receive task takes in a turn, so that reading would have to pause after each."""
 
 
+MAX_FAMILIAR = 64
+"""Statuses that are known by their frames: a camera has a handful, and a peer could send any."""
+
+
 class State(enum.Enum):
     """Where a link is."""
 
@@ -317,6 +321,8 @@ class Machine:
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
         self._sender, self._sends = role.receives, role.sends
         self._decoders: dict[int, Codec] = {}
+        # whole frames of statuses that came before, and what they are; of this state only
+        self._familiar: dict[bytes, Message] = {}
         self._take_up(dialect)
         self.state = State.IDLE
 
@@ -340,8 +346,12 @@ class Machine:
         result = dialect.encoder(m.ResultContainer)
         self._burst_size = result.size
         self._burst_reader = dialect.header.reader(result.size)
-        plain = self.role is Role.CLIENT and self._trace is None
-        self._takes_bursts = plain and result.size > 0
+        status = dialect.encoder(m.StatusReport)
+        self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
+        self._constant = dialect.constant
+        self._familiar = {}
+        self._plain = self.role is Role.CLIENT and self._trace is None
+        self._takes_bursts = self._plain and result.size > 0
 
     @property
     def state(self) -> State:
@@ -354,6 +364,7 @@ class Machine:
         self._deaf = state is State.FAILED or state is State.CLOSED
         self._may_come = _SAID[state, self._sender]
         self._may_go = _SAID[state, self._sends]
+        self._familiar = {}
 
     # ------------------------------------------------------------------ bytes in
 
@@ -448,7 +459,7 @@ class Machine:
                 f"{type(message).__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant = self.dialect.constant.get(type(message))
+        constant = self._constant.get(type(message))
         if constant is not None:
             data, message_id, owed = constant
         else:
@@ -481,7 +492,9 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _receive_frames(self) -> None:
+        """Make events of the whole frames that are there."""
         framer = self._framer
+        self._receive_familiar()
         while True:
             try:
                 found = framer.cut()
@@ -492,9 +505,29 @@ class Machine:
                 continue
             if found is None:
                 return
-            self._receive_frame(*found)
+            message = self._receive_frame(*found)
             if self._deaf:
                 return
+            if self._receive_familiar() or not self._takes_bursts:
+                continue
+            if isinstance(message, m.ResultContainer) and self._receive_burst(message, found[1]):
+                self._receive_familiar()
+
+    def _receive_familiar(self) -> bool:
+        """Take the statuses that come next and came before, byte for byte; say whether any did.
+
+        A camera has few of them, and sends two around each result.
+        """
+        if not self._familiar:
+            return False
+        found = self._framer.familiar(self._familiar, self._status_size)
+        if not found:
+            return False
+        self._events += found
+        self.counters.frames_received += len(found)
+        if self._open:
+            self._open.discard(self._status_id)
+        return True
 
     def _is_overdue(self, now: float) -> bool:
         """Return whether the frame that is begun will not become whole; then it is rejected."""
@@ -532,33 +565,21 @@ class Machine:
             self._receive_frame(*found)
         framer.clear()
 
-    def _receive_frame(self, message_id: int, begin: int, end: int) -> None:
-        """Make a message of a frame whose payload is at a place of the framer's."""
-        counters, framer = self.counters, self._framer
+    def _receive_frame(self, message_id: int, begin: int, end: int) -> Message | None:
+        """Make a message of a frame whose payload is at a place of the framer's; None: dropped."""
+        counters, framer, size = self.counters, self._framer, end - begin
         counters.frames_received += 1
-        if len(self.kin) > 1 and self._state is State.CONNECTING:
-            self._narrow(message_id, end - begin)
+        if self._state is State.CONNECTING and len(self.kin) > 1:
+            self._narrow(message_id, size)
         if self._trace is not None:
             self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
         codec = self._decoders.get(message_id)
-        surplus = 0
         message: Message
         try:
-            if codec is None:
-                payload = framer.take(begin, end)
-                message = m.UnknownMessage(message_id=message_id, payload=payload)
-            elif self._policy.tells and not codec.fits(end - begin):
-                payload = framer.take(begin, end)
-                message = m.MalformedMessage(message_id=message_id, payload=payload)
+            if codec is not None and (size == codec.size or (codec.has_data and size > codec.size)):
+                message, surplus = codec.decode(framer.buffer, begin, end), 0
             else:
-                if not codec.has_data:
-                    surplus = end - begin - codec.size
-                if surplus > 0 and self._policy.exact_length:
-                    raise MessageError(
-                        f"message {message_id:#04x} is {surplus} bytes too long",
-                        data=framer.take(begin, end),
-                    )
-                message = codec.decode(framer.buffer, begin, end)
+                message, surplus = self._read_odd(codec, message_id, begin, end)
             kind = type(message)
             following = self._may_come.get(kind)
             if following is None:
@@ -569,18 +590,50 @@ class Machine:
                 )
         except RemoteProtocolError as error:
             self._reject(error)
-            return
+            return None
         if surplus > 0:
             counters.long_bodies += 1
+        elif kind is m.StatusReport:
+            self._note_familiar(message, end)
         if following is not self._state:
             self.state = following
         if kind in _BY_ITSELF:
-            self._open.discard(message_id)  # asked for, in a dialect or by a raw request
+            if self._open:  # asked for, in a dialect or by a raw request
+                self._open.discard(message_id)
         elif self.role is Role.CLIENT and not self._wanted(message_id, known=codec is not None):
-            return
+            return None
         self._events.append(message)
-        if self._takes_bursts and isinstance(message, m.ResultContainer) and framer.buffered:
-            self._receive_burst(message, begin)
+        return message
+
+    def _read_odd(
+        self, codec: Codec | None, message_id: int, begin: int, end: int
+    ) -> tuple[Message, int]:
+        """Return the message of a frame without a name, or of another length than documented.
+
+        And the bytes that it is too long, where that is accepted.
+
+        Raises:
+            MessageError: it is too short, or too long.
+        """
+        payload = self._framer.take(begin, end)
+        if codec is None:
+            return m.UnknownMessage(message_id=message_id, payload=payload), 0
+        if self._policy.tells:
+            return m.MalformedMessage(message_id=message_id, payload=payload), 0
+        surplus = len(payload) - codec.size
+        if surplus > 0 and self._policy.exact_length:
+            raise MessageError(
+                f"message {message_id:#04x} is {surplus} bytes too long", data=payload
+            )
+        return codec.decode(payload, 0, len(payload)), surplus
+
+    def _note_familiar(self, status: Message, end: int) -> None:
+        """Know a status by its frame from now on, as long as this state lasts; the frame ends here.
+
+        Not where each frame is to be traced, nor for the camera, to which no client sends one.
+        """
+        if self._plain and len(self._familiar) < MAX_FAMILIAR:
+            self._familiar[self._framer.take(end - self._status_size, end)] = status
 
     def _narrow(self, message_id: int, size: int) -> None:
         """Leave out the kin that have no such message, or another length of it."""
@@ -594,18 +647,23 @@ class Machine:
             self.kin = fitting
             self._take_up(fitting[0])
 
-    def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
-        """Take the result containers of the same application that come next in these bytes."""
+    def _receive_burst(self, first: m.ResultContainer, begin: int) -> bool:
+        """Take the result containers of the same application that come next; say whether any do.
+
+        ``begin``: of the payload of the first, which is the last event.
+        """
         like = begin - self.dialect.header.size
         framer = self._framer
         before = framer.buffered
         more = framer.following(self._burst_reader, like, self._burst_size)
-        if more:
-            self.counters.frames_received += len(more)
-            size = before - framer.buffered - len(more) * (begin - like + self._burst_size)
-            size += len(first.data)
-            more.insert(0, first.data)
-            self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
+        if not more:
+            return False
+        self.counters.frames_received += len(more)
+        size = before - framer.buffered - len(more) * (begin - like + self._burst_size)
+        size += len(first.data)
+        more.insert(0, first.data)
+        self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
+        return True
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
         """Return whether the client sees it: an answer that nothing asked for is counted only."""
