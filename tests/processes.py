@@ -33,9 +33,13 @@ MAINS = {"smartcam": "main", "smartcam-emulator": "emulator_main"}
 
 LOADED = (
     *(
+        "smartcam._cli.running",
         "smartcam._cli.smartcam",
         "smartcam._cli.smartcam_emulator",
+        "smartcam.connecting",
+        "smartcam.emulator._camera",
         "smartcam.emulator._insight.camera",
+        "smartcam.emulator._scenario.file",
     ),
     *("smartcam.calibration.wizards._plane", "smartcam.recording", "smartcam.web", "mcap.writer"),
     "scipy.special",
@@ -293,6 +297,7 @@ def serve(calls: socket.socket) -> None:
     """Fork for each call; returns in a fork, which is the command then, and at the end."""
     for name in LOADED:
         importlib.import_module(name)
+    list(sys.modules["smartcam._cli.smartcam"].command.commands.values())  # imports them
     gc.freeze()  # what no fork looks at need not be copied for it
     while True:
         order, streams, _, _ = socket.recv_fds(calls, LARGEST, 4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import sys
 
 
@@ -20,8 +21,11 @@ def _run(program: str, module: str) -> None:
     try:
         try:
             importlib.import_module("click")
-            importlib.import_module("yaml")
         except ModuleNotFoundError:
+            sys.exit(_missing(program))
+        # PyYAML is a package, which a module of the same name is not
+        yaml = importlib.util.find_spec("yaml")
+        if yaml is None or yaml.submodule_search_locations is None:
             sys.exit(_missing(program))
         command = importlib.import_module(f"smartcam._cli.{module}").command
     except KeyboardInterrupt:  # Ctrl-C while still importing

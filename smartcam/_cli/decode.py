@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.options import OUTPUT, Options, from_hex, option, runs
 from smartcam._cli.texts import table_text, value_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
 from smartcam.interpreters._base import Context, Interpreter, Reader, resolve, run
@@ -21,14 +21,6 @@ if TYPE_CHECKING:
     from smartcam.models import ByteOrder
     from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols._framed.framing import Frame
-
-
-def from_hex(text: str, where: str) -> bytes:
-    """Return the bytes of hex text (ConfigurationError: it is none); spaces are allowed."""
-    try:
-        return bytes.fromhex(text)
-    except ValueError as exc:
-        raise ConfigurationError(f"{where}: {text[:64]!r} is no hex: {exc}") from exc
 
 
 @click.command(

@@ -11,7 +11,7 @@ import click
 
 from smartcam._cli.options import OUTPUT, Options, option, runs
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import JsonErrors
+from smartcam._cli.usage import JsonErrors
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.decode import from_hex
 from smartcam._cli.fleet_certificates import certificates
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import OUTPUT, Options, from_hex, runs
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import JsonErrors, error_json, exit_code, first
+from smartcam._cli.running import exit_code, first
 from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import result_text, table_text
+from smartcam._cli.usage import JsonErrors, error_json
 from smartcam.backoff import Backoff
 from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConnectFailedError, SmartCamError

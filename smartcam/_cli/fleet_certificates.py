@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
-from smartcam._cli.running import JsonErrors
 from smartcam._cli.texts import table_text
+from smartcam._cli.usage import JsonErrors
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -16,7 +16,7 @@ from smartcam._cli.frame_measure import measure, measured_text
 from smartcam._cli.frame_sources import TIMEOUT, opened
 from smartcam._cli.frames_serve import serve, show
 from smartcam._cli.options import OUTPUT, Options, option, runs
-from smartcam._cli.running import JsonErrors
+from smartcam._cli.usage import JsonErrors
 from smartcam.exceptions import (
     ConfigurationError,
     FrameSourceError,

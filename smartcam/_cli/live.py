@@ -45,11 +45,11 @@ async def serve_page(
     """Serve the page until the end; a camera that cannot be used at all ends it."""
     from smartcam.web import LiveSite
 
-    with contextlib.suppress(TimeoutError):  # --seconds are over
-        async with asyncio.timeout(options.seconds):
-            with options.cameras(url, reconnect=Backoff()) as make:
-                camera = make()
-                options.remark(camera)
+    with options.cameras(url, reconnect=Backoff()) as make:
+        camera = make()
+        options.remark(camera)
+        with contextlib.suppress(TimeoutError):  # --seconds are over
+            async with asyncio.timeout(options.seconds):
                 async with LiveSite(camera, control=control, **web.place) as site:
                     options.show({"page": site.url}, f"page: {site.url}")
                     await _have_open(camera, make, site)

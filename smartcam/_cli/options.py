@@ -3,29 +3,25 @@
 from __future__ import annotations
 
 import functools
-import json
 import math
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from smartcam._cli.running import run
-from smartcam._client.handshake import remarks
-from smartcam.connecting import connect
-from smartcam.doctor._context import FrameObserver
+from smartcam._cli.usage import INTERRUPTED, importing
 from smartcam.exceptions import ConfigurationError, UnsupportedError
-from smartcam.models import jsonable
-from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping
 
     from smartcam.calibration._files.load import AnyCalibration
     from smartcam.camera import Camera
-    from smartcam.observers import TraceEntry
+    from smartcam.observers import Observer, TraceEntry
+
+DIALECTS = ("handbook", "thesis", "b16", "bid")
+"""Those of ``bvs``, the default first."""
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -113,7 +109,7 @@ def option(name: str, **changes: Any) -> Callable[[F], F]:
 
 
 def runs(
-    *names: str, program: str = "smartcam", interrupted: int = 130, terminated: int = 143
+    *names: str, program: str = "smartcam", interrupted: int = INTERRUPTED, terminated: int = 143
 ) -> Callable[[Callable[..., Coroutine[Any, Any, None]]], Callable[..., None]]:
     """Make a coroutine function a command's: it gets the shared ones of its options as ``options``.
 
@@ -125,6 +121,9 @@ def runs(
     def decorate(main: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
         @functools.wraps(main)
         def start(*args: Any, **given: Any) -> None:
+            with importing():
+                from smartcam._cli.running import run
+
             common = {one.name for one in fields(Options)} & given.keys()
             options = Options(**{name: given.pop(name) for name in common})
             has_page = "web" in given and given["web"].wanted
@@ -151,6 +150,14 @@ def naming(what: str) -> Iterator[None]:
         yield
     except OSError as exc:
         raise ConfigurationError(f"{what}: {exc.strerror}") from exc
+
+
+def from_hex(text: str, where: str) -> bytes:
+    """Return the bytes of hex text (ConfigurationError: it is none); spaces are allowed."""
+    try:
+        return bytes.fromhex(text)
+    except ValueError as exc:
+        raise ConfigurationError(f"{where}: {text[:64]!r} is no hex: {exc}") from exc
 
 
 def application(text: str) -> int | str:
@@ -212,10 +219,13 @@ class Options:
         CalibrationError: the calibration's file is damaged, newer, or holds something else;
         ConfigurationError: a file cannot be opened, or an option cannot work.
         """
+        from smartcam.connecting import connect
+        from smartcam.settings import is_fleet
+
         with self.tracing(url) as trace:
             options: dict[str, Any] = {
                 **self.reading(fleet=is_fleet(url)),
-                "observers": [FrameObserver(trace)] if trace is not None else [],
+                "observers": self._observers(trace),
                 "reconnect": None,
                 "name": self.name or "",
                 "application": self.application,
@@ -223,6 +233,14 @@ class Options:
                 "switch_timeout": self.step(10.0),
             }
             yield functools.partial(connect, url, **{**options, **other})
+
+    @staticmethod
+    def _observers(trace: Callable[[TraceEntry], None] | None) -> list[Observer]:
+        if trace is None:
+            return []
+        from smartcam.doctor._context import FrameObserver
+
+        return [FrameObserver(trace)]
 
     def reading(self, *, fleet: bool) -> dict[str, Any]:
         """Return the options that say how results are read.
@@ -254,6 +272,12 @@ class Options:
         if self.trace is None:
             yield None
             return
+        import json
+        from pathlib import Path
+
+        from smartcam.models import jsonable
+        from smartcam.settings import is_fleet
+
         if is_fleet(url):
             raise UnsupportedError(
                 f"--trace: frames of {url} are between the camera and its agent; a trace wants the "
@@ -283,12 +307,18 @@ class Options:
 
     def remark(self, camera: Camera) -> None:
         """Say on stderr what who asks this camera for results should know."""
+        from smartcam._client.handshake import remarks
+
         for text in remarks(camera.settings.address):
             click.echo(f"note: {text}", err=True)
 
     def show(self, value: object, text: str | Callable[[Any], str]) -> None:
         """Print ``value`` as a line of JSON, or for people ``text`` (of it); flushed."""
         if self.as_json:
+            import json
+
+            from smartcam.models import jsonable
+
             click.echo(json.dumps(jsonable(value)))
         else:
             click.echo(text if isinstance(text, str) else text(value))

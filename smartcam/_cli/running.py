@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
-import json
 import logging
 import os
 import signal
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import click
 
 from smartcam._cli.terminal import tinted
+from smartcam._cli.usage import error_json
 from smartcam.exceptions import (
     CalibrationError,
     CameraFaultError,
@@ -33,10 +33,9 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
-from smartcam.models import jsonable
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterable, Iterator
+    from collections.abc import Coroutine, Iterable
 
 EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (ConfigurationError, 2),
@@ -138,49 +137,6 @@ async def first(jobs: Iterable[Coroutine[Any, Any, None]], seconds: float | None
             task.cancel()
         # what a second one raised is the same loss again, and is not to be complained about
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def error_json(error: Exception, text: str, code: int, **more: str) -> str:
-    """Return an error as JSON: its class, its text, the exit code, and its public attributes.
-
-    ``more``: what stands in front.
-    """
-    said = {name: value for name, value in vars(error).items() if not name.startswith("_")}
-    if isinstance(error, click.ClickException):
-        said = {}  # click's own, with its context
-    value = {**more, "error": type(error).__name__, "text": text, "exit_code": code, **said}
-    return json.dumps(jsonable(value))
-
-
-class JsonErrors(click.Command):
-    """A command that tells a wrong use as JSON where ``--json`` is given."""
-
-    def make_context(
-        self,
-        info_name: str | None,
-        args: list[str],
-        parent: click.Context | None = None,
-        **extra: Any,
-    ) -> click.Context:
-        """Parse."""
-        with _told_as_json("--json" in args):
-            return super().make_context(info_name, args, parent, **extra)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run."""
-        with _told_as_json("--json" in ctx.args or bool(ctx.params.get("as_json"))):
-            return super().invoke(ctx)
-
-
-@contextlib.contextmanager
-def _told_as_json(wanted: bool) -> Iterator[None]:
-    try:
-        yield
-    except click.ClickException as exc:
-        if not wanted:
-            raise
-        sys.stderr.write(error_json(exc, exc.format_message(), exc.exit_code) + "\n")
-        raise click.exceptions.Exit(exc.exit_code) from exc
 
 
 def _one_line(error: Exception) -> str:

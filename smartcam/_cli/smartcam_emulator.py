@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import json
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
 from click.core import ParameterSource
 
 import smartcam
-from smartcam._cli.options import OUTPUT, Options, runs
+from smartcam._cli.options import DIALECTS, OUTPUT, Options, runs
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.running import JsonErrors
 from smartcam._cli.texts import camera_value
-from smartcam.emulator import Scenario, load_scenarios, scenario_schema
-from smartcam.emulator._generators import find_generator
-from smartcam.emulator._makes import emulated_class
+from smartcam._cli.usage import JsonErrors
 from smartcam.exceptions import ConfigurationError
-from smartcam.layout._yamls import BadYamlError, load
-from smartcam.protocols._bvs import BVS
-from smartcam.registry import GENERATORS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+    from contextlib import AsyncExitStack
 
-    from smartcam.emulator import WireCamera
+    from smartcam.emulator import Scenario, WireCamera
 
-DIALECTS = tuple(BVS.dialects)
+PROTOCOL = "bvs"
+"""Whose cameras they are where nothing else is said."""
 
 SHOWN = 7
 """The application that runs where a page shows a camera of no scenario."""
@@ -56,7 +49,7 @@ _SAID = {
     "--protocol",
     metavar="NAME",
     help="Whose cameras: a name of `smartcam protocols`, where it brings an emulated camera; "
-    f"default what the scenario says, else {BVS.name}.",
+    f"default what the scenario says, else {PROTOCOL}.",
 )
 @click.option(
     "--dialect",
@@ -117,11 +110,20 @@ async def command(
     9 (free-running), and is offline at first. With --web and without a scenario 7 runs at once.
     """
     if schema:
+        import json
+
+        from smartcam.emulator import scenario_schema
+
         click.echo(json.dumps(scenario_schema(), indent=2))
         return
     if generators:
         _list_generators(options)
         return
+    import asyncio
+    from contextlib import AsyncExitStack
+
+    from smartcam.emulator._makes import emulated_class
+
     plans = _scenarios(scenario, protocol, dialect, cameras, shown=web.wanted)
     for plan in plans:
         _refuse_what_does_not_fit(context, plan)
@@ -138,7 +140,7 @@ async def command(
         )
         for index, plan in enumerate(plans)
     ]
-    async with contextlib.AsyncExitStack() as stack:
+    async with AsyncExitStack() as stack:
         for emulator in emulators:
             await stack.enter_async_context(emulator)
         address = await _open_page(web, stack, emulators)
@@ -149,6 +151,9 @@ async def command(
 
 def _list_generators(options: Options) -> None:
     """Print a line for each generator; a broken plug-in costs only its own."""
+    from smartcam.emulator._generators import find_generator
+    from smartcam.registry import GENERATORS
+
     for info in GENERATORS.available():
         try:
             about = (find_generator(info.name).__doc__ or "").partition("\n")[0]
@@ -159,7 +164,7 @@ def _list_generators(options: Options) -> None:
 
 
 async def _open_page(
-    web: PageOptions, stack: contextlib.AsyncExitStack, cameras: Iterable[WireCamera]
+    web: PageOptions, stack: AsyncExitStack, cameras: Iterable[WireCamera]
 ) -> str | None:
     """Serve the page until the stack ends, print its address to stderr and return it."""
     if not web.wanted:
@@ -180,7 +185,9 @@ def _scenarios(
     Raises ConfigurationError: the file is wrong, or copies are wanted of several cameras;
     MissingExtraError: PyYAML is not installed.
     """
-    plain = _plain(protocol or BVS.name, shown=shown)
+    from smartcam.emulator import load_scenarios
+
+    plain = _plain(protocol or PROTOCOL, shown=shown)
     loaded = (plain,) if path is None else load_scenarios(path, dialect=dialect)
     for plan in loaded:
         if protocol not in {None, plan.protocol}:
@@ -202,6 +209,9 @@ def _scenarios(
 
 def _plain(protocol: str, *, shown: bool) -> Scenario:
     """Return a camera without a scenario; one with a page has something to show."""
+    from smartcam.emulator import Scenario
+    from smartcam.emulator._makes import emulated_class
+
     if not (shown and emulated_class(protocol).state_options(SHOWN, running=True)):
         return Scenario(protocol=protocol)
     return Scenario(protocol=protocol, active=SHOWN, running=True)
@@ -211,6 +221,8 @@ def _quirk(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         return name, True
+    from smartcam.layout._yamls import BadYamlError, load
+
     try:
         return name, load(value, what="--quirk NAME=VALUE")
     except BadYamlError as exc:
@@ -219,6 +231,8 @@ def _quirk(text: str) -> tuple[str, Any]:
 
 def _refuse_what_does_not_fit(context: click.Context, plan: Scenario) -> None:
     """Refuse what a camera of this protocol does not take; click.UsageError names what it does."""
+    from smartcam.emulator._makes import emulated_class
+
     takes = emulated_class(plan.protocol).takes
     for name, text in _SAID.items():
         given = context.get_parameter_source(name) is ParameterSource.COMMANDLINE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import sys
@@ -57,6 +56,8 @@ class CountingLine:
 
     async def run(self) -> None:
         """Show it until cancelled."""
+        import asyncio
+
         loop = asyncio.get_running_loop()
         seen, last = self._camera.statistics().received, loop.time()
         while True:
@@ -83,6 +84,8 @@ async def counting(camera: Camera[Any]) -> AsyncIterator[CountingLine]:
     if not sys.stderr.isatty() or os.environ.get("TERM") == "dumb":
         yield line
         return
+    import asyncio
+
     task = asyncio.create_task(line.run(), name="smartcam.counting")
     try:
         yield line

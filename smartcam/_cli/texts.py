@@ -7,14 +7,13 @@ import shlex
 from typing import TYPE_CHECKING, Any
 
 from smartcam.exceptions import NotRunningError, hex_excerpt
-from smartcam.models import Localization, Result, jsonable
-from smartcam.protocols.messages import UNNAMED_APPLICATION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.camera import Camera
     from smartcam.emulator import WireCamera
+    from smartcam.models import Localization, Result
 
 
 DIGITS = 6
@@ -67,6 +66,8 @@ def camera_value(emulator: WireCamera) -> dict[str, Any]:
 
 def application_text(application: int | None) -> str:
     """Return the application in words; a job of a camera may have none of the ids."""
+    from smartcam.protocols.messages import UNNAMED_APPLICATION
+
     if application == UNNAMED_APPLICATION:
         return "application without an id"
     return f"application {application}"
@@ -92,6 +93,8 @@ def result_text(result: Result) -> str:
 
 def value_text(value: Any) -> str:
     """Return an interpreter's value as text."""
+    from smartcam.models import Localization, jsonable
+
     if isinstance(value, bytes):
         return f"  {hex_excerpt(value)}"
     if isinstance(value, list) and value and all(isinstance(v, Localization) for v in value):

@@ -139,7 +139,7 @@ def test_trigger_calibration_changed_by_hand_is_refused(seven: list[str], table:
 
 def test_trigger_without_calibration_does_not_import_it() -> None:
     code = (
-        "import sys, smartcam._cli.smartcam, smartcam._client.interpretation; "
+        "import sys, smartcam._cli.camera, smartcam._client.interpretation; "
         "print([name for name in sys.modules if name.startswith('smartcam.calibration')])"
     )
     done = subprocess.run(  # noqa: S603 - our own interpreter

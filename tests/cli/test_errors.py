@@ -366,10 +366,17 @@ def test_status_interrupted_during_connect_says_disconnect() -> None:
     assert outcome == (130, "", "")
 
 
-def test_command_interrupted_during_import_exits_130(tmp_path: Path) -> None:
-    (tmp_path / "click.py").write_text("raise KeyboardInterrupt\n", encoding="utf-8")
+@pytest.mark.parametrize(
+    ("name", "command"),
+    [("click", "protocols"), ("construct", "decode"), ("asyncio", "status"), ("pydantic", "probe")],
+)
+def test_command_interrupted_during_import_exits_130(
+    tmp_path: Path, name: str, command: str
+) -> None:
+    (tmp_path / f"{name}.py").write_text("raise KeyboardInterrupt\n", encoding="utf-8")
     env = {"PYTHONPATH": str(tmp_path)}
-    with Process("smartcam", "protocols", env=env, fresh=True) as process:
+    given = [] if command == "protocols" else ["00"]
+    with Process("smartcam", command, *given, env=env, fresh=True) as process:
         assert process.wait() == (130, "", "")
 
 

@@ -12,12 +12,15 @@ from click.testing import CliRunner
 
 import smartcam
 from smartcam._cli.dissector import dissector
-from smartcam._cli.smartcam import TOPICS
+from smartcam._cli.options import DIALECTS
+from smartcam._cli.smartcam import LISTED, TOPICS
 from smartcam._cli.smartcam import command as smartcam_command
+from smartcam._cli.smartcam_emulator import PROTOCOL
 from smartcam._dissector import lua_source
+from smartcam.protocols._bvs import BVS
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 from tests.cli.commandline import each, run, run_emulator
-from tests.processes import Process
+from tests.processes import Process, printed_by
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -67,6 +70,42 @@ def test_help_lists_every_command_by_topic() -> None:
         out.index(f"\n{topic}:\n") for topic in TOPICS
     )
     assert "..." not in out.partition("A camera:")[2]
+
+
+def test_list_has_the_first_sentence_of_each_commands_help() -> None:
+    for name, listed in LISTED.items():
+        with each(name):
+            command = smartcam_command.commands[name]
+            assert command.name == name
+            assert listed.summary == command.get_short_help_str(limit=400)
+
+
+def test_dialects_of_options_are_those_of_the_protocol() -> None:
+    assert tuple(BVS.dialects) == DIALECTS
+    assert BVS.name == PROTOCOL
+
+
+def imported_for(python: str) -> set[str]:
+    """Return what lines of Python import, run by themselves; ``main`` runs without an end."""
+    run_main = "def main(run):\n    try: run()\n    except SystemExit: pass\n"
+    told = "print('imported:', *sorted(sys.modules))"
+    shown = printed_by(f"import sys, smartcam._cli as cli\n{run_main}{python}\n{told}")
+    return set(shown.rpartition("imported:")[2].split())
+
+
+HEAVY = {"asyncio", "construct", "logging", "numpy", "pydantic", "socket", "yaml"}
+
+
+@pytest.mark.parametrize(
+    ("main", "argument"),
+    [("main", "--help"), ("main", "--version"), ("emulator_main", "--help")],
+)
+def test_help_imports_what_it_shows_and_nothing_else(main: str, argument: str) -> None:
+    found = imported_for(f"sys.argv = ['smartcam', {argument!r}]\nmain(cli.{main})")
+    assert "click" in found
+    assert not found & HEAVY
+    own = {name for name in found if name.startswith("smartcam.")}
+    assert {name.split(".")[1] for name in own} <= {"_cli", "_lazy", "exceptions"}
 
 
 @pytest.mark.long
