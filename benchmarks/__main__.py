@@ -32,6 +32,10 @@ BENCHMARKS = {
     "flood": "trigger latency of 99 cameras beside one that sends as fast as the link takes it",
     "emulator": "triggers that emulated cameras answer, one and 1,000 of them",
     "startup": "import smartcam, and the first connect",
+    "commands": "smartcam --help, --version and trigger in a shell",
+    "layouts": "a camera whose layout others have, too: time and memory",
+    "recorder": "what a recording adds to a result",
+    "insight": "a picture of 1 MB from an In-Sight camera",
     "calibration": "error and predicted error of a plane over the bound, points and poses a second",
     "corners": "error of corners and dots in images over the bound, and time for an image",
     "stereo": "squares of OpenCV's pairs that were left out; boards against dots",
@@ -45,8 +49,11 @@ BENCHMARKS = {
 """Modules of this package with a ``run(plan)``, and what they measure."""
 
 
-PROCESSES = {"trigger": 5, "stream": 5, "fleet": 3, "emulator": 5}
+PROCESSES = {"trigger": 5, "stream": 5, "fleet": 3, "emulator": 3}
 """Those that are measured in several processes, and in how many at most."""
+
+ROUNDS = 5
+"""Of each side in each of several processes, at most."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,6 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     plan = _plan(options)
     comparisons: list[Comparison] = []
     curves: list[Curve] = []
+    took: dict[str, float] = {}
     for name in options.names or BENCHMARKS:
         begin = time.monotonic()
         for found in _run(name, plan):
@@ -69,16 +77,18 @@ def main(arguments: list[str] | None = None) -> int:
                 curves.append(found)
             else:
                 comparisons.append(found)
-        print(f"{name}: {time.monotonic() - begin:.0f} s", file=sys.stderr)
+        took[name] = time.monotonic() - begin
+        print(f"{name}: {took[name]:.0f} s", file=sys.stderr)
     print(table(comparisons), notes(comparisons), sep="\n\n")
+    facts = as_json(comparisons, curves, took)
     if options.json is not None:
-        _write(options.json, json.dumps(as_json(comparisons, curves), indent=1))
+        _write(options.json, json.dumps(facts, indent=1))
     if options.docs is not None:
         from benchmarks import plots
 
-        _write(options.docs / "results.json", json.dumps(as_json(comparisons, curves), indent=1))
+        _write(options.docs / "results.json", json.dumps(facts, indent=1))
         pictures = plots.write(curves, comparisons, options.docs)
-        _write(options.docs / "results.md", markdown(comparisons, pictures))
+        _write(options.docs / "results.md", markdown(comparisons, pictures, facts, BENCHMARKS))
     missed = [one for one in comparisons if one.met is False]
     return 1 if missed and not plan.quick else 0
 
@@ -97,7 +107,8 @@ def _run(name: str, plan: Plan) -> Iterable[Comparison | Curve]:
     """Run one: in processes of its own where these differ, and there are to be several."""
     if name in PROCESSES and plan.processes > 1:
         processes = min(plan.processes, PROCESSES[name])
-        return runs.run(dataclasses.replace(plan, processes=processes), name)
+        rounds = min(plan.rounds, ROUNDS)
+        return runs.run(dataclasses.replace(plan, rounds=rounds, processes=processes), name)
     found: Iterable[Comparison | Curve] = importlib.import_module(f"benchmarks.{name}").run(plan)
     return found
 

@@ -9,7 +9,6 @@ left out.
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import shutil
 import subprocess
@@ -55,7 +54,6 @@ def count_sides(
         with counted() as (prefix, read):
             subprocess.run(
                 [*prefix, *sides.command(module, side, ports[side], count)],
-                env=os.environ | SAME,
                 stdout=subprocess.DEVNULL,
                 check=True,
                 timeout=PATIENCE,
@@ -65,7 +63,7 @@ def count_sides(
     return {side: difference(partial(total, side), operations) for side in ports}
 
 
-SAME = {"PYTHONHASHSEED": "0"}
+SAME = ("env", "PYTHONHASHSEED=0")
 """What makes a process do the same each time."""
 
 
@@ -82,6 +80,7 @@ def counted() -> Iterator[tuple[list[str], Callable[[], int]]]:
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder, "log")
         prefix = [
+            *SAME,
             TOOL,
             "--tool=callgrind",
             f"--log-file={log}",

@@ -62,17 +62,26 @@ def notes(comparisons: Iterable[Comparison]) -> str:
     return "".join(f"- {case}: {note}\n" for note, case in first.items())
 
 
-def markdown(comparisons: Sequence[Comparison], pictures: Mapping[str, Path]) -> str:
+def markdown(
+    comparisons: Sequence[Comparison],
+    pictures: Mapping[str, Path],
+    facts: Mapping[str, Any],
+    benchmarks: Iterable[str],
+) -> str:
     """Return what a run shows as a part of a page: when and where, a table each, the plots.
 
     Args:
         comparisons: the tables' lines.
         pictures: files by what they show; a benchmark's own begin with its name.
+        facts: of the run, as :func:`as_json` gives them.
+        benchmarks: all that there are: those without a line are named as missing.
     """
-    facts = as_json((), ())
+    shown = {one.benchmark for one in comparisons}
+    missing = ", ".join(name for name in benchmarks if name not in shown)
     lines = [
         f"Measured on {facts['at'][:10]} of commit `{facts['commit']}` with Python "
-        f"{facts['python']}, {facts['processors']}.",
+        f"{facts['python']}, {facts['processors']}. {_durations(facts['seconds'])}"
+        + (f" Not measured here: {missing}." if missing else ""),
         "",
     ]
     lines += _images(pictures, "goals")
@@ -84,19 +93,32 @@ def markdown(comparisons: Sequence[Comparison], pictures: Mapping[str, Path]) ->
     return "\n".join(lines).rstrip()
 
 
+def _durations(seconds: Mapping[str, float]) -> str:
+    """Return how long the run took, and what took a minute or more of it."""
+    minutes = {name: round(took / 60) for name, took in seconds.items()}
+    long = sorted((name for name in minutes if minutes[name]), key=lambda name: -minutes[name])
+    parts = ", ".join(f"{name} {minutes[name]}" for name in long)
+    return f"The run took {sum(seconds.values()) / 60:.0f} minutes" + (
+        f" ({parts}; the others less than one each)." if parts else "."
+    )
+
+
 def _images(pictures: Mapping[str, Path], begins: str) -> list[str]:
     named = [(title, path.name) for title, path in pictures.items()]
     return [f"![{title}]({name})\n" for title, name in named if name.startswith(begins)]
 
 
-def as_json(comparisons: Iterable[Comparison], curves: Iterable[Curve]) -> dict[str, Any]:
-    """Return every figure as plain data."""
+def as_json(
+    comparisons: Iterable[Comparison], curves: Iterable[Curve], seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """Return every figure as plain data, and how long each benchmark took."""
     return {
         "at": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
         "python": platform.python_version(),
         "platform": platform.platform(),
         "processors": _processors(),
+        "seconds": {name: round(took, 1) for name, took in seconds.items()},
         "comparisons": [
             {
                 **dataclasses.asdict(one),

@@ -19,7 +19,7 @@ import time
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from benchmarks.measure import Cost, cpu_microseconds, take_turns_awaiting
 
@@ -42,7 +42,11 @@ PATIENCE = 120.0
 
 
 async def take_sides(
-    plan: Plan, sides: Mapping[str, tuple[Side, int]], count: int
+    plan: Plan,
+    sides: Mapping[str, tuple[Side, int]],
+    count: int,
+    *,
+    unit: Literal["us", "ms"] = "us",
 ) -> dict[str, Series]:
     """Measure the CPU time of ``count`` operations of each side, in turns.
 
@@ -52,9 +56,14 @@ async def take_sides(
         plan: how many rounds.
         sides: by name, and the port of each.
         count: operations of a round.
+        unit: of the figures.
     """
-    costs = {name: partial(_cost, *place, count) for name, place in sides.items()}
-    return await take_turns_awaiting(plan, costs)
+
+    async def cost(side: Side, port: int) -> Cost:
+        return await _cost(side, port, count) * {"us": 1.0, "ms": 1e-3}[unit]
+
+    costs = {name: partial(cost, *place) for name, place in sides.items()}
+    return await take_turns_awaiting(plan, costs, unit=unit)
 
 
 async def _cost(
