@@ -2,3 +2,7 @@
 
 ``python -m benchmarks`` runs all of it; ``docs/benchmarks.md`` shows what it printed.
 """
+
+from benchmarks.malloc import settle
+
+settle()  # in every process of the benchmarks, before anything else

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import importlib
 import json
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from benchmarks import instructions, runs
 from benchmarks.measure import Comparison, Curve, Plan
 from benchmarks.report import as_json, markdown, notes, table
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+__all__: list[str] = []
+
 BENCHMARKS = {
-    "trigger": "await trigger() against a bare Protocol and pymodbus",
+    "trigger": "await trigger() against a bare protocol and pymodbus, over TCP and UDP",
     "sync": "camera.trigger() without asyncio, above await of it",
     "stream": "results as fast as the link gives them, one by one and in batches",
     "decode": "from a container's bytes to a table, localizations, texts",
@@ -24,6 +32,10 @@ BENCHMARKS = {
     "flood": "trigger latency of 99 cameras beside one that sends as fast as the link takes it",
     "emulator": "triggers that emulated cameras answer, one and 1,000 of them",
     "startup": "import smartcam, and the first connect",
+    "commands": "smartcam --help, --version and trigger in a shell",
+    "layouts": "a camera whose layout others have, too: time and memory",
+    "recorder": "what a recording adds to a result",
+    "insight": "a picture of 1 MB from an In-Sight camera",
     "calibration": "error and predicted error of a plane over the bound, points and poses a second",
     "corners": "error of corners and dots in images over the bound, and time for an image",
     "stereo": "squares of OpenCV's pairs that were left out; boards against dots",
@@ -37,6 +49,13 @@ BENCHMARKS = {
 """Modules of this package with a ``run(plan)``, and what they measure."""
 
 
+PROCESSES = {"trigger": 5, "stream": 5, "fleet": 3, "emulator": 3}
+"""Those that are measured in several processes, and in how many at most."""
+
+ROUNDS = 5
+"""Of each side in each of several processes, at most."""
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run what is asked for; return 1 where a goal of a full run is missed."""
     parser = _parser()
@@ -44,27 +63,54 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = [name for name in options.names if name not in BENCHMARKS]
     if unknown:
         parser.error(f"no benchmark is called {', '.join(unknown)}")
-    if options.rounds < 1:
-        parser.error("--rounds: 1 or more")
-    plan = Plan(rounds=1, scale=0.02) if options.quick else Plan(options.rounds, 1.0)
+    for name in ("rounds", "processes"):
+        if getattr(options, name) < 1:
+            parser.error(f"--{name}: 1 or more")
+    plan = _plan(options)
     comparisons: list[Comparison] = []
     curves: list[Curve] = []
+    took: dict[str, float] = {}
     for name in options.names or BENCHMARKS:
         begin = time.monotonic()
-        for found in importlib.import_module(f"benchmarks.{name}").run(plan):
-            (curves if isinstance(found, Curve) else comparisons).append(found)
-        print(f"{name}: {time.monotonic() - begin:.0f} s", file=sys.stderr)
+        for found in _run(name, plan):
+            if isinstance(found, Curve):
+                curves.append(found)
+            else:
+                comparisons.append(found)
+        took[name] = time.monotonic() - begin
+        print(f"{name}: {took[name]:.0f} s", file=sys.stderr)
     print(table(comparisons), notes(comparisons), sep="\n\n")
+    facts = as_json(comparisons, curves, took)
     if options.json is not None:
-        _write(options.json, json.dumps(as_json(comparisons, curves), indent=1))
+        _write(options.json, json.dumps(facts, indent=1))
     if options.docs is not None:
         from benchmarks import plots
 
-        _write(options.docs / "results.json", json.dumps(as_json(comparisons, curves), indent=1))
+        _write(options.docs / "results.json", json.dumps(facts, indent=1))
         pictures = plots.write(curves, comparisons, options.docs)
-        _write(options.docs / "results.md", markdown(comparisons, pictures))
+        _write(options.docs / "results.md", markdown(comparisons, pictures, facts, BENCHMARKS))
     missed = [one for one in comparisons if one.met is False]
     return 1 if missed and not plan.quick else 0
+
+
+def _plan(options: argparse.Namespace) -> Plan:
+    """Return what the options ask for: a quick one begins no processes and counts nothing."""
+    count = instructions.wanted(
+        asked=(not options.quick if options.instructions is None else options.instructions)
+    )
+    if options.quick:
+        return Plan(rounds=1, scale=0.02, instructions=count)
+    return Plan(options.rounds, 1.0, processes=options.processes, instructions=count)
+
+
+def _run(name: str, plan: Plan) -> Iterable[Comparison | Curve]:
+    """Run one: in processes of its own where these differ, and there are to be several."""
+    if name in PROCESSES and plan.processes > 1:
+        processes = min(plan.processes, PROCESSES[name])
+        rounds = min(plan.rounds, ROUNDS)
+        return runs.run(dataclasses.replace(plan, rounds=rounds, processes=processes), name)
+    found: Iterable[Comparison | Curve] = importlib.import_module(f"benchmarks.{name}").run(plan)
+    return found
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -76,6 +122,21 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("names", nargs="*", metavar="NAME", help="which ones; default: all")
     parser.add_argument("--quick", action="store_true", help="only see that all of it works")
     parser.add_argument("--rounds", type=int, default=9, help="of each side; default: %(default)s")
+    parser.add_argument(
+        "--processes",
+        type=int,
+        default=5,
+        metavar="N",
+        help=f"how often {', '.join(PROCESSES)} are measured, each time in a new process, as what "
+        "they cost varies with it; one with --quick; default: %(default)s, or fewer where it takes "
+        "long",
+    )
+    parser.add_argument(
+        "--instructions",
+        action=argparse.BooleanOptionalAction,
+        help="count the instructions of an operation, too, where valgrind is installed: this takes "
+        "another five minutes; default: in a full run",
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to FILE")
     parser.add_argument(
         "--docs", type=Path, metavar="DIR", help="write figures, tables and plots for the page"

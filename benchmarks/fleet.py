@@ -3,7 +3,7 @@
 Each side has a process of its own, and a peer of its own that plays its cameras; the process opens
 them once and then does what it is told, so that idle cameras of one side cost the other nothing.
 A result is 70 bytes, of which smartcam makes a numpy table that a task for each camera takes with
-``async for``; a bare Protocol cuts and counts frames. What a process costs is its CPU time.
+``async for``; a bare protocol cuts and counts frames. What a process costs is its CPU time.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def run(plan: Plan) -> Iterable[Comparison | Curve]:
             idle[BARE, size],
             how="alone",
             goal=goal,
-            note="a Query every 2.5 s from each; a bare Protocol asks nothing",
+            note="a Query every 2.5 s from each; a bare protocol asks nothing",
         )
     yield Comparison(
         "fleet",

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ASKING", "BARE", "SMARTCAM"]
 
-SMARTCAM, BARE, ASKING = "smartcam", "bare Protocol", "bare Protocol that asks"
+SMARTCAM, BARE, ASKING = "smartcam", "bare protocol", "bare protocol that asks"
 
 LAYOUT = (
     "table: (sent: uint64, feature_id: string[42], quality: real32, photo_index: int32, "

@@ -11,7 +11,7 @@ import gc
 import statistics
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -21,9 +21,11 @@ __all__ = [
     "Cost",
     "Curve",
     "Goal",
+    "Instructions",
     "Plan",
     "Series",
     "cpu_microseconds",
+    "instructions_of",
     "take_turns",
     "take_turns_awaiting",
 ]
@@ -42,10 +44,15 @@ class Plan:
         rounds: how often each side is measured.
         scale: of the number of operations; 1.0 in full, less where it is only to be seen that it
             works.
+        processes: how often the whole is measured, each time in a new process; what varies with a
+            process, such as where its memory lies, varies in no rounds of one.
+        instructions: whether they are counted as well.
     """
 
     rounds: int
     scale: float
+    processes: int = 1
+    instructions: bool = False
 
     @property
     def quick(self) -> bool:
@@ -100,6 +107,27 @@ class Goal:
         return f"{self.relation} {self.value:g}{unit}"
 
 
+class Instructions(NamedTuple):
+    """How many instructions an operation takes, in the process that is measured.
+
+    Attributes:
+        subject: smartcam's.
+        yardstick: the other side's.
+    """
+
+    subject: float
+    yardstick: float
+
+
+def instructions_of(
+    counts: Mapping[str, float], subject: str, yardstick: str
+) -> Instructions | None:
+    """Return those of two sides; None where they were not counted."""
+    if subject not in counts or yardstick not in counts:
+        return None
+    return Instructions(counts[subject], counts[yardstick])
+
+
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """One line of the table: what was measured, its yardstick, the goal.
@@ -113,6 +141,9 @@ class Comparison:
             yardstick's speed; ``more``: subject minus yardstick; ``alone``: the subject.
         goal: None where it is only shown.
         note: what the reader needs to know.
+        instructions: of both, where they were counted.
+        processes: in how many processes it was measured; beyond one, each figure is a process'
+            median.
     """
 
     benchmark: str
@@ -122,6 +153,8 @@ class Comparison:
     how: How = "ratio"
     goal: Goal | None = None
     note: str = ""
+    instructions: Instructions | None = None
+    processes: int = 1
 
     @property
     def figures(self) -> list[float]:
@@ -149,10 +182,10 @@ class Comparison:
 
     @property
     def spread(self) -> tuple[float, float]:
-        """The middle half of the figures: from and to."""
+        """From and to: the middle half of a process' rounds; of several processes, all of them."""
         figures = self.figures
-        if len(figures) < 2:
-            return figures[0], figures[0]
+        if len(figures) < 2 or self.processes > 1:
+            return min(figures), max(figures)
         low, _, high = statistics.quantiles(figures, n=4, method="inclusive")
         return low, high
 
@@ -193,10 +226,18 @@ def take_turns(
     sides: Mapping[str, Callable[[], Cost]],
     *,
     unit: str = "us",
+    warm_up: bool = True,
 ) -> dict[str, Series]:
-    """Measure every side once a round; the first round warms up and is dropped."""
+    """Measure every side once a round; a first round warms up and is dropped.
+
+    Args:
+        plan: how many rounds.
+        sides: what returns the cost of an operation, by name.
+        unit: of these costs.
+        warm_up: false where each measurement is a process of its own.
+    """
     values: dict[str, list[float]] = {name: [] for name in sides}
-    for number in range(plan.rounds + 1):
+    for number in range(0 if warm_up else 1, plan.rounds + 1):
         for name in _order(list(sides), number):
             gc.collect()
             cost = sides[name]()

@@ -1,33 +1,34 @@
 """Start: what ``import smartcam``, a first camera and the pytest plugin cost a fresh process.
 
 CPU time of the process, user and system together, less that of an interpreter which is started
-beside it and does nothing (for pytest: the whole of it, with the plugin and without). With ``-I``,
-so that the directory it starts in plays no part; imports find compiled files, as a second start
-does.
+beside it and does nothing (for pytest: the whole of it, with the plugin and without). The yardstick
+of a camera is a process that imports the modules which that one has in the end, and that are not
+smartcam's, in the same order, and does nothing with them: numpy is in it only if it is used.
 """
 
 from __future__ import annotations
 
 import os
-import statistics
-import sys
 import tempfile
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.measure import Comparison, Goal, Plan, take_turns
+from benchmarks.measure import Comparison, Goal, Plan, Series, take_turns
 from benchmarks.peers import peer
+from benchmarks.starts import imports_of, median, start
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable
 
 __all__ = ["run"]
 
 STARTS = 3
 """Of each process in a round; the median counts."""
 
-SMARTCAM, ASYNCIO, HEAVY = "import smartcam", "import asyncio", "import numpy, pydantic, construct"
+SMARTCAM, ASYNCIO = "import smartcam", "import asyncio"
+MAKING, OPENING = "smartcam.connect(url)", "async with smartcam.connect(url)"
+NEEDED = "import what it needs"
 MAKE = "import smartcam; smartcam.connect('bvs://127.0.0.1')"
 OPEN = """
 import asyncio, smartcam
@@ -42,27 +43,27 @@ PYTEST = ["-m", "pytest", "-q", "-p", "no:cacheprovider"]
 def run(plan: Plan) -> Iterable[Comparison]:
     """Measure imports, a first camera, and the pytest plugin where there is one."""
     with peer("trigger", "together") as port:
-        codes = {
-            SMARTCAM: SMARTCAM,
-            ASYNCIO: ASYNCIO,
-            HEAVY: HEAVY,
-            "smartcam.connect(url)": MAKE,
-            "async with smartcam.connect(url)": OPEN.format(port=port),
-        }
+        codes = {SMARTCAM: SMARTCAM, ASYNCIO: ASYNCIO}
+        for name, code in ((MAKING, MAKE), (OPENING, OPEN.format(port=port))):
+            codes |= {name: code, f"{NEEDED}: {name}": imports_of(code)}
         starts = plan.operations(STARTS)
         series = take_turns(
-            plan, {name: _side(code, starts) for name, code in codes.items()}, unit="ms"
+            plan,
+            {name: _side(code, starts) for name, code in codes.items()},
+            unit="ms",
+            warm_up=not plan.quick,
         )
     for case, other, most in (
         (SMARTCAM, ASYNCIO, 1.3),
-        ("smartcam.connect(url)", HEAVY, 1.5),
-        ("async with smartcam.connect(url)", HEAVY, 1.5),
+        (MAKING, NEEDED, 1.2),
+        (OPENING, NEEDED, 1.2),
     ):
+        yardstick = series[other if other == ASYNCIO else f"{NEEDED}: {case}"]
         yield Comparison(
             "startup",
             case,
             series[case],
-            series[other],
+            Series(other, yardstick.unit, yardstick.values),
             goal=Goal("at most", most),
             note="CPU time of a fresh process, the interpreter's own start subtracted",
         )
@@ -89,12 +90,13 @@ def _plugin(plan: Plan, plugins: list[str], starts: int) -> Comparison:
         series = take_turns(
             plan,
             {
-                "with the plugin": lambda: _median(
-                    starts, lambda: _cpu([*command, *loaded], environment)
+                "with the plugin": lambda: median(
+                    starts, lambda: start([*command, *loaded], environment).cpu
                 ),
-                "without": lambda: _median(starts, lambda: _cpu(command, environment)),
+                "without": lambda: median(starts, lambda: start(command, environment).cpu),
             },
             unit="ms",
+            warm_up=not plan.quick,
         )
     return Comparison(
         "startup",
@@ -108,23 +110,4 @@ def _plugin(plan: Plan, plugins: list[str], starts: int) -> Comparison:
 
 
 def _side(code: str, starts: int) -> Callable[[], float]:
-    return lambda: _median(starts, lambda: _cpu(["-c", code]) - _cpu(["-c", "pass"]))
-
-
-def _median(times: int, measure: Callable[[], float]) -> float:
-    return statistics.median(measure() for _ in range(times))
-
-
-def _cpu(arguments: list[str], environment: Mapping[str, str] = os.environ) -> float:
-    """Run Python and return the CPU time of the process, milliseconds."""
-    command = [sys.executable, "-I", *arguments]
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
-        process = os.posix_spawn(
-            sys.executable,
-            command,
-            environment,
-            file_actions=[(os.POSIX_SPAWN_DUP2, nowhere.fileno(), 1)],
-        )
-        _, status, used = os.wait4(process, 0)
-    assert status == 0, f"{command} ended with {status}"
-    return (used.ru_utime + used.ru_stime) * 1e3
+    return lambda: median(starts, lambda: start(["-c", code]).cpu - start(["-c", "pass"]).cpu)

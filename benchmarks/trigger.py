@@ -1,72 +1,119 @@
 """Trigger round trip: ``await camera.trigger()`` with five localizations, one after the other.
 
-smartcam sends a Query in front of each Trigger, in the same write; the yardstick's bare Protocol
+smartcam sends a Query in front of each Trigger, in the same write; the yardstick's bare protocol
 sends only the Trigger. The peer answers as a camera does: to the Query, then a status without
 Waiting for Trigger, the result, a status with it. They come together in one delivery, as in a burst
 behind a busy network, or apart, as from a camera that takes its time: the Query's answer with the
 first status, the result and the second status each a delivery of its own. pymodbus reads 32 holding
 registers, one request and one delivery: that is the same work as a trigger whose answers come
-together. Apart, the bare Protocol alone takes three deliveries for its one, so there pymodbus is
+together. Apart, the bare protocol alone takes three deliveries for its one, so there pymodbus is
 shown without a goal.
 
-The bare Protocol is shown without a goal, too. asyncio's own ``data_received`` takes 256 KiB for
-each read, which a fresh process maps and unmaps every time: with that the yardstick is 20 to 80 us
-too dear, by how the process happens to have laid out its memory, and says little about smartcam.
+Over UDP each frame is a datagram, there and back: two to the camera and four from it. asyncio reads
+each into a block of its own, so a process whose allocator is as it began is shown, too.
 """
 
 from __future__ import annotations
 
 import asyncio
-import time
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, cast
 
 from pymodbus.client import AsyncModbusTcpClient
 
 import smartcam
-from benchmarks.measure import (
-    Comparison,
-    Cost,
-    Goal,
-    Plan,
-    Series,
-    cpu_microseconds,
-    take_turns_awaiting,
-)
+from benchmarks.instructions import count_sides
+from benchmarks.malloc import FRESH
+from benchmarks.measure import Comparison, Goal, Plan, Series, instructions_of, take_turns
 from benchmarks.peers import peer, wire
-from benchmarks.yardsticks import bare_client
+from benchmarks.sides import Side, alone, take_sides
+from benchmarks.yardsticks import bare_client, bare_datagrams
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import AsyncIterator, Callable, Iterable
 
-__all__ = ["run"]
+    from benchmarks.sides import Work
+
+__all__ = ["SIDES", "run"]
 
 TRIGGERS = 400
 """In a round of each side."""
 
+COUNTED = 50
+"""Where instructions are counted."""
+
 REGISTERS = 32
 
-SMARTCAM, BARE, PYMODBUS = "smartcam", "bare Protocol", "pymodbus"
-
+SMARTCAM, BARE, PYMODBUS = "smartcam", "bare protocol", "pymodbus"
+UDP, BARE_UDP, TCP = "smartcam, UDP", "bare datagrams", "smartcam, TCP"
+YOUNG = "smartcam, UDP, young process"
 
 GOALS: dict[str, dict[str, Goal | None]] = {
-    "together": {BARE: None, PYMODBUS: Goal("at most", 1.0)},
+    "together": {BARE: Goal("at most", 2.6), PYMODBUS: Goal("at most", 1.0)},
     "apart": {BARE: None, PYMODBUS: None},
 }
 
 
 def run(plan: Plan) -> Iterable[Comparison]:
-    """Measure on stock asyncio and on uvloop, with the answers together and apart."""
+    """Measure on stock asyncio and on uvloop, with the answers together and apart, and over UDP."""
     with peer("modbus") as plc:
         for how, goals in GOALS.items():
             case = f"await trigger(), 5 localizations, {how}"
             with peer("trigger", how) as camera:
-                series = asyncio.run(_measure(plan, camera, plc))
+                ports = {SMARTCAM: camera, BARE: camera, PYMODBUS: plc}
+                counts = count_sides(plan, "trigger", ports, COUNTED)
+                series = asyncio.run(_measure(plan, ports))
                 for name, goal in goals.items():
-                    yield Comparison("trigger", case, series[SMARTCAM], series[name], goal=goal)
+                    counted = instructions_of(counts, SMARTCAM, name)
+                    yield Comparison(
+                        "trigger",
+                        case,
+                        series[SMARTCAM],
+                        series[name],
+                        goal=goal,
+                        instructions=counted,
+                    )
                 with asyncio.Runner(loop_factory=_uvloop()) as runner:
-                    series = runner.run(_measure(plan, camera, plc))
+                    series = runner.run(_measure(plan, ports))
                 for name in goals:
                     yield Comparison("trigger", f"{case}, uvloop", series[SMARTCAM], series[name])
+    yield from _datagrams(plan)
+
+
+def _datagrams(plan: Plan) -> Iterable[Comparison]:
+    case = "await trigger(), 5 localizations, UDP"
+    with peer("trigger", "udp") as datagrams, peer("trigger", "together") as stream:
+        ports = {UDP: datagrams, BARE_UDP: datagrams, TCP: stream}
+        counts = count_sides(plan, "trigger", ports, COUNTED)
+        series = asyncio.run(_measure(plan, ports))
+        for name in (BARE_UDP, TCP):
+            yield Comparison(
+                "trigger",
+                case,
+                series[UDP],
+                series[name],
+                instructions=instructions_of(counts, UDP, name),
+            )
+        count = plan.operations(TRIGGERS, least=5)
+        young = take_turns(
+            Plan(min(plan.rounds, FEW), plan.scale),
+            {
+                YOUNG: lambda: alone("trigger", UDP, datagrams, count, FRESH),
+                UDP: lambda: alone("trigger", UDP, datagrams, count, {}),
+            },
+            warm_up=False,
+        )
+    yield Comparison(
+        "trigger",
+        f"{case}, in a process that has freed no large block yet",
+        young[YOUNG],
+        young[UDP],
+        note="each time in a new process, as against one whose allocator has settled",
+    )
+
+
+FEW = 3
+"""Rounds of what begins a process each time."""
 
 
 def _uvloop() -> Callable[[], asyncio.AbstractEventLoop]:
@@ -75,44 +122,79 @@ def _uvloop() -> Callable[[], asyncio.AbstractEventLoop]:
     return cast("Callable[[], asyncio.AbstractEventLoop]", uvloop.new_event_loop)
 
 
-async def _measure(plan: Plan, camera_port: int, plc_port: int) -> dict[str, Series]:
-    count = plan.operations(TRIGGERS, least=5)
-    bare = await bare_client(camera_port)
-    plc = AsyncModbusTcpClient("127.0.0.1", port=plc_port)
-    await plc.connect()
-    url = f"bvs://127.0.0.1:{camera_port}?dialect=handbook"
+async def _measure(plan: Plan, ports: dict[str, int]) -> dict[str, Series]:
+    sides = {name: (SIDES[name], port) for name, port in ports.items()}
+    return await take_sides(plan, sides, plan.operations(TRIGGERS, least=5))
 
-    async def smartcam_side() -> Cost:
-        begin = time.process_time()
-        for _ in range(count):
-            result = await camera.trigger()
-        cost = cpu_microseconds(begin, count)
-        assert len(result.value) == 5
-        assert result.value[4].feature_id == "part 4"
-        return cost
 
-    async def bare_side() -> Cost:
-        begin = time.process_time()
+# ---------------------------------------------------------------------- sides
+
+
+@asynccontextmanager
+async def _smartcam(port: int, scheme: str = "bvs") -> AsyncIterator[Work]:
+    url = f"{scheme}://127.0.0.1:{port}?dialect=handbook"
+    async with smartcam.connect(url, interpret_as="localizations") as camera:
+        triggered = 0
+
+        async def work(count: int) -> None:
+            nonlocal triggered
+            for _ in range(count):
+                result = await camera.trigger()
+            triggered += count
+            assert len(result.value) == 5
+            assert result.value[4].feature_id == "part 4"
+
+        yield work
+        counted = camera.statistics()
+        assert counted.received == counted.triggered == triggered
+
+
+@asynccontextmanager
+async def _bare(port: int) -> AsyncIterator[Work]:
+    bare = await bare_client(port)
+
+    async def work(count: int) -> None:
         for _ in range(count):
             await bare.ask(TRIGGER, wire.RESULT)
-        return cpu_microseconds(begin, count)
 
-    async def pymodbus_side() -> Cost:
-        begin = time.process_time()
+    yield work
+    bare.transport.close()
+
+
+@asynccontextmanager
+async def _bare_datagrams(port: int) -> AsyncIterator[Work]:
+    bare = await bare_datagrams(port)
+
+    async def work(count: int) -> None:
+        for _ in range(count):
+            await bare.ask(TRIGGER, wire.RESULT)
+
+    yield work
+    bare.close()
+
+
+@asynccontextmanager
+async def _pymodbus(port: int) -> AsyncIterator[Work]:
+    plc = AsyncModbusTcpClient("127.0.0.1", port=port)
+    await plc.connect()
+
+    async def work(count: int) -> None:
         for _ in range(count):
             got = await plc.read_holding_registers(0, count=REGISTERS)
-        cost = cpu_microseconds(begin, count)
         assert got.registers == list(range(REGISTERS))
-        return cost
 
-    async with smartcam.connect(url, interpret_as="localizations") as camera:
-        sides = {SMARTCAM: smartcam_side, BARE: bare_side, PYMODBUS: pymodbus_side}
-        series = await take_turns_awaiting(plan, sides)
-        counted = camera.statistics()
-        assert counted.received == counted.triggered == count * (plan.rounds + 1)
-    bare.transport.close()
+    yield work
     plc.close()
-    return series
 
+
+SIDES: dict[str, Side] = {
+    SMARTCAM: _smartcam,
+    BARE: _bare,
+    PYMODBUS: _pymodbus,
+    UDP: lambda port: _smartcam(port, "bvs+udp"),
+    BARE_UDP: _bare_datagrams,
+    TCP: _smartcam,
+}
+"""By name; ``python -m benchmarks.sides trigger NAME PORT OPERATIONS`` has one alone."""
 
 TRIGGER = wire.frame(wire.TRIGGER)

@@ -12,15 +12,24 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 __all__ = ["peer"]
 
+PATIENCE = 30.0
+"""Seconds until a process that is told to end is killed."""
+
 
 @contextlib.contextmanager
-def peer(module: str, *arguments: str) -> Iterator[int]:
-    """Run ``benchmarks.peers.<module>``; gives the port that it listens to on 127.0.0.1."""
-    command = [sys.executable, "-m", f"benchmarks.peers.{module}", *arguments]
+def peer(module: str, *arguments: str, under: Sequence[str] = ()) -> Iterator[int]:
+    """Run ``benchmarks.peers.<module>``; gives the port that it listens to on 127.0.0.1.
+
+    Args:
+        module: its name.
+        *arguments: of its command line.
+        under: a command that runs it and has something to say when it ends.
+    """
+    command = [*under, sys.executable, "-m", f"benchmarks.peers.{module}", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -29,5 +38,9 @@ def peer(module: str, *arguments: str) -> Iterator[int]:
             raise RuntimeError(f"{' '.join(command)} did not start")
         yield int(line)
     finally:
+        if under:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(PATIENCE)
         process.kill()
         process.communicate()

@@ -1,6 +1,6 @@
 """A camera with prepared answers on asyncio: the least that answers a trigger there.
 
-A bare Protocol cuts frames and writes what stands in a table. One port, any number of clients.
+A bare protocol cuts frames and writes what stands in a table. One port, any number of clients.
 ``python -m benchmarks.peers.canned CLIENTS PROCESSING_TIME``: the time in seconds; with 0 the whole
 answer is one write, otherwise result and last status come later, by a timer.
 """
@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import asyncio
 import functools
-import socket
 import sys
-from typing import cast
 
 from benchmarks.peers import wire
 from benchmarks.peers.control import allow_files, resident, serve_control
+from benchmarks.yardsticks import Bare
 
 __all__ = ["CONTAINER", "HELLO", "RUN", "SPARE_FILES"]
 
@@ -36,44 +35,36 @@ SPARE_FILES = 50
 ANSWERS = {wire.CONNECT: HELLO, wire.QUERY: wire.query_answer(), wire.TRIGGER: RUN}
 
 
-class Canned(asyncio.Protocol):
+class Canned(Bare):
     """Answers one client.
 
     Args:
         processing_time: seconds.
     """
 
-    _transport: asyncio.Transport
-
     def __init__(self, processing_time: float) -> None:
+        super().__init__()
         self._processing_time = processing_time
         self._answers = ANSWERS | ({wire.TRIGGER: BEGIN} if processing_time else {})
         self._call_later = asyncio.get_running_loop().call_later
-        self._buffer = b""
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio: the link is open."""
-        self._transport = cast("asyncio.Transport", transport)
-        sock = transport.get_extra_info("socket")
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    def data_received(self, data: bytes) -> None:
+    def buffer_updated(self, size: int) -> None:
         """asyncio: bytes."""
-        buffer = self._buffer + data if self._buffer else data
-        size, unpack = wire.HEADER.size, wire.HEADER.unpack_from
-        start, available = 0, len(buffer)
-        while available - start >= size:
+        buffer, available = self.unread(size)
+        header, unpack = wire.HEADER.size, wire.HEADER.unpack_from
+        start = 0
+        while available - start >= header:
             _, length, message_id = unpack(buffer, start)
-            end = start + size + length
+            end = start + header + length
             if end > available:
                 break
             start = end
             answer = self._answers.get(message_id)
             if answer is not None:
-                self._transport.write(answer)
+                self.transport.write(answer)
             if message_id == wire.TRIGGER and self._processing_time:
-                self._call_later(self._processing_time, self._transport.write, END)
-        self._buffer = buffer[start:]
+                self._call_later(self._processing_time, self.transport.write, END)
+        self.keep(buffer, start, available)
 
 
 async def main() -> None:

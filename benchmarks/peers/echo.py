@@ -9,13 +9,13 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import socket
 import sys
 import threading
 from typing import Any, cast
 
 from benchmarks.peers import wire
 from benchmarks.peers.control import resident, serve_control
+from benchmarks.yardsticks import BUFFER, Bare
 from smartcam._zenoh import RUNTIME, with_ports
 
 __all__ = ["BATCH", "RESULTS", "Zenoh", "asking"]
@@ -103,26 +103,21 @@ class Zenoh:
         cast("Any", self._session).close()
 
 
-class Echo(asyncio.Protocol):
+class Echo(Bare):
     """The same over TCP."""
 
-    _transport: asyncio.Transport
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """asyncio: the link is open."""
-        self._transport = cast("asyncio.Transport", transport)
+    def __init__(self) -> None:
+        super().__init__()
         self._left, self._paused = 0, False
-        sock = transport.get_extra_info("socket")
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def data_received(self, data: bytes) -> None:
+    def buffer_updated(self, size: int) -> None:
         """asyncio: bytes."""
-        batches = int.from_bytes(data[:8], "little")
+        batches = int.from_bytes(BUFFER[:8], "little")
         if batches:
             self._left += batches
             self.resume_writing()
         else:
-            self._transport.write(REPLY)
+            self.transport.write(REPLY)
 
     def pause_writing(self) -> None:
         """asyncio: the transport has enough."""
@@ -133,7 +128,7 @@ class Echo(asyncio.Protocol):
         self._paused = False
         while self._left and not self._paused:
             self._left -= 1
-            self._transport.write(BATCH)
+            self.transport.write(BATCH)
 
 
 async def main() -> None:

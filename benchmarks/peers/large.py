@@ -1,13 +1,15 @@
 """A canned camera with large result containers, sent in segments of a given size.
 
 The body of a Trigger frame says how large, in what segments and how many, three numbers of four
-bytes (the peer's own word). They come one at a time, as inspections give them.
+bytes (the peer's own word). They come one at a time, as inspections give them; with the argument
+``flat`` one right behind the other.
 """
 
 from __future__ import annotations
 
 import functools
 import struct
+import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -28,7 +30,7 @@ def segments(size: int, segment: int) -> list[bytes]:
     return [frame[start : start + segment] for start in range(0, len(frame), segment)]
 
 
-def serve(client: socket.socket) -> None:
+def serve(pause: float, client: socket.socket) -> None:
     """Answer one client until it goes."""
     for message_id, body in frames(client):
         match message_id:
@@ -39,10 +41,11 @@ def serve(client: socket.socket) -> None:
             case wire.TRIGGER:
                 size, segment, count = struct.unpack("<III", body)
                 for _ in range(count):
-                    time.sleep(PAUSE)
+                    if pause:
+                        time.sleep(pause)
                     for piece in segments(size, segment):
                         client.sendall(piece)
 
 
 if __name__ == "__main__":
-    listen(serve)
+    listen(functools.partial(serve, 0.0 if sys.argv[1:] == ["flat"] else PAUSE))

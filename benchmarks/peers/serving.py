@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 from typing import TYPE_CHECKING
@@ -9,19 +10,37 @@ from typing import TYPE_CHECKING
 from benchmarks.peers import wire
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from typing import NoReturn
 
-__all__ = ["frames", "listen", "reads"]
+__all__ = ["frames", "listen", "listen_to_datagrams", "reads"]
 
 
 def listen(serve: Callable[[socket.socket], None]) -> None:
-    """Print the port; give each client to ``serve`` in a thread of its own."""
+    """Print the port; give each client to ``serve`` in a thread of its own, until it goes."""
+
+    def one(client: socket.socket) -> None:
+        with contextlib.suppress(ConnectionError):  # it went while an answer was on its way
+            serve(client)
+
     server = socket.create_server(("127.0.0.1", 0), backlog=64)
     print(server.getsockname()[1], flush=True)
     while True:
         client, _ = server.accept()
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        threading.Thread(target=serve, args=(client,), daemon=True).start()
+        threading.Thread(target=one, args=(client,), daemon=True).start()
+
+
+def listen_to_datagrams(answers: Mapping[int, Sequence[bytes]]) -> NoReturn:
+    """Print the port; answer a frame a datagram with datagrams, whoever sent it."""
+    server = socket.socket(type=socket.SOCK_DGRAM)
+    server.bind(("127.0.0.1", 0))
+    print(server.getsockname()[1], flush=True)
+    while True:
+        data, client = server.recvfrom(4096)
+        _, _, message_id = wire.HEADER.unpack_from(data)
+        for answer in answers.get(message_id, ()):
+            server.sendto(answer, client)
 
 
 def frames(client: socket.socket) -> Iterator[tuple[int, bytes]]:

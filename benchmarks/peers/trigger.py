@@ -2,7 +2,8 @@
 
 With ``together`` all that one read asks for is one write: a Query in front of the trigger is
 answered in it, too. With ``apart`` it is answered with the first status; the result and the second
-status come one by one, as a real camera's do: each after a moment, a delivery of its own.
+status come one by one, as a real camera's do: each after a moment, a delivery of its own. With
+``udp`` each is a datagram of its own, one right behind the other.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import time
 from typing import TYPE_CHECKING
 
 from benchmarks.peers import wire
-from benchmarks.peers.serving import listen, reads
+from benchmarks.peers.serving import listen, listen_to_datagrams, reads
 
 if TYPE_CHECKING:
     import socket
@@ -23,7 +24,7 @@ PAUSE = 0.0004
 
 FOUND = wire.result(b"".join(wire.localization(number) for number in range(5)))
 ANSWERS = {
-    wire.CONNECT: [wire.CONNECT_ANSWER + wire.status(waiting=True)],
+    wire.CONNECT: [wire.CONNECT_ANSWER, wire.status(waiting=True)],
     wire.QUERY: [wire.query_answer()],
     wire.TRIGGER: [wire.status(waiting=False), FOUND, wire.status(waiting=True)],
 }
@@ -32,6 +33,8 @@ ANSWERS = {
 def main() -> None:
     """Answer triggers."""
     answers = ANSWERS
+    if sys.argv[1:] == ["udp"]:
+        listen_to_datagrams(answers)
     if sys.argv[1:] == ["together"]:
         answers = {message_id: [b"".join(parts)] for message_id, parts in ANSWERS.items()}
 

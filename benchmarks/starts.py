@@ -1,0 +1,102 @@
+"""Whole processes: what a Python that is started and ends takes, and what it has imported by then.
+
+They are started with ``-P -s``, so that the directory they start in plays no part; imports find
+compiled files, as a second start does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+__all__ = ["Took", "imports_of", "median", "start"]
+
+PYTHON = [sys.executable, "-P", "-s"]
+
+MODULES = "\nimport json, sys; print(json.dumps(list(sys.modules)))"
+
+OURS = "smartcam"
+
+PATIENCE = 120.0
+"""Seconds until a process that does not end is an error."""
+
+
+class Took(NamedTuple):
+    """What a process took, milliseconds.
+
+    Attributes:
+        cpu: its CPU time, user and system together.
+        wall: from its start to its end.
+    """
+
+    cpu: float
+    wall: float
+
+
+def start(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> Took:
+    """Run Python with these arguments and without output; return what it took."""
+    command = [*PYTHON, *arguments]
+    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+        begin = time.perf_counter()
+        process = os.posix_spawn(
+            sys.executable,
+            command,
+            environment,
+            file_actions=[(os.POSIX_SPAWN_DUP2, nowhere.fileno(), 1)],
+        )
+        _, status, used = os.wait4(process, 0)
+        wall = time.perf_counter() - begin
+    assert status == 0, f"{command} ended with {status}"
+    return Took((used.ru_utime + used.ru_stime) * 1e3, wall * 1e3)
+
+
+def median(times: int, measure: Callable[[], float]) -> float:
+    """Return the figure in the middle of several."""
+    return statistics.median(measure() for _ in range(times))
+
+
+def imports_of(code: str) -> str:
+    """Return code that imports what ``code`` ends up with, in the same order, and no smartcam.
+
+    That is the standard library's and other people's modules: what smartcam is made of, and cannot
+    be without. A module that its package makes itself, and that cannot be imported by its name, is
+    left out.
+    """
+    plain = set(_modules("pass"))
+    needed = [
+        name
+        for name in _modules(code)
+        if name not in plain and name.partition(".")[0] not in {OURS, "__mp_main__"}
+    ]
+    tried = "".join(
+        f"try: __import__({name!r})\nexcept ImportError: missing.append({name!r})\n"
+        for name in needed
+    )
+    missing = json.loads(_said(f"missing = []\n{tried}import json; print(json.dumps(missing))"))
+    return "\n".join(f"__import__({name!r})" for name in needed if name not in missing)
+
+
+def _modules(code: str) -> list[str]:
+    """Return the names of the modules that are there when ``code`` has run."""
+    names: list[str] = json.loads(_said(code + MODULES))
+    return [name for name in names if name != "__main__"]
+
+
+def _said(code: str) -> str:
+    """Return the last line that code prints."""
+    done = subprocess.run(
+        [*PYTHON, "-c", code],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        timeout=PATIENCE,
+    )
+    return done.stdout.splitlines()[-1]
