@@ -180,7 +180,7 @@ class _Patterned(Protocol):
 P = TypeVar("P", bound=_Patterned)
 
 
-class _Place(Generic[P]):
+class _ByPattern(Generic[P]):
     """What an end has of one kind, by pattern: of thousands, those that a key means."""
 
     def __init__(self) -> None:
@@ -221,7 +221,7 @@ class _MemoryDeclared(Handle):
     """What an end has declared under a pattern."""
 
     def __init__(
-        self, place: _Place[_MemoryDeclared], pattern: str, call: Callable[..., None]
+        self, place: _ByPattern[_MemoryDeclared], pattern: str, call: Callable[..., None]
     ) -> None:
         self.pattern = pattern
         self.call = call
@@ -252,12 +252,12 @@ class MemoryEnd(Bus):
 
     def __init__(self, bus: MemoryBus) -> None:
         self._bus = bus
-        self.heard_parts = _Place[_MemoryDeclared]()
-        self.heard = _Place[_MemoryDeclared]()
-        self.answered = _Place[_MemoryDeclared]()
-        self.watched = _Place[_MemoryDeclared]()
-        self.present_here = _Place[_MemoryDeclared]()
-        self.publishers = _Place[_MemoryPublisher]()
+        self.heard_parts = _ByPattern[_MemoryDeclared]()
+        self.heard = _ByPattern[_MemoryDeclared]()
+        self.answered = _ByPattern[_MemoryDeclared]()
+        self.watched = _ByPattern[_MemoryDeclared]()
+        self.present_here = _ByPattern[_MemoryDeclared]()
+        self.publishers = _ByPattern[_MemoryPublisher]()
 
     @property
     def attached(self) -> bool:
@@ -384,7 +384,7 @@ class _MemoryPublisher(Publisher):
     def __init__(
         self,
         end: MemoryEnd,
-        place: _Place[_MemoryPublisher],
+        place: _ByPattern[_MemoryPublisher],
         key: str,
         on_heard: Callable[[bool], None] | None,
     ) -> None:

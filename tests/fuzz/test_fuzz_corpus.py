@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-import smartcam.layout as layout_module
+import smartcam.layout._compiled as compiled_module
 import smartcam.layout._yaml_files as scenario_module
 from smartcam.emulator import Device
 from smartcam.interpreters._localizations import LocalizationsInterpreter
@@ -147,7 +147,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "camera": (Device, "_report", lambda *_: None),
     "layout_file": (Layout, "to_yaml", lambda _: "x: bool"),
     "address": (Address, "url", property(lambda address: f"bvs://{address.host}")),
-    "spec": (layout_module, "parse_text", lambda text, start: parse_text(text[start:])),
+    "spec": (compiled_module, "parse_text", lambda text, start: parse_text(text[start:])),
 }
 """A mistake for each target: what is replaced, and by what."""
 
