@@ -30,6 +30,10 @@ class ProactorLike(asyncio.SelectorEventLoop):
     def _has_not(self, *_: object, **__: object) -> NoReturn:
         raise NotImplementedError
 
+    def _sock_read_done(self, fd: int, *_: object) -> None:
+        """Its own way to have accepted, which calls what the other loop has not."""
+        self._remove_reader(fd)  # type: ignore[attr-defined]
+
     add_reader = remove_reader = add_writer = remove_writer = _has_not  # pyright: ignore[reportAssignmentType]
     add_signal_handler = remove_signal_handler = _has_not  # pyright: ignore[reportAssignmentType]
     create_unix_server = create_unix_connection = _has_not  # pyright: ignore[reportAssignmentType]

@@ -206,15 +206,22 @@ def to_text(spec: LayoutSpec) -> str:
 def parse_text(text: str, start: int = 0) -> LayoutSpec:
     """Return the fields and groups of a layout text, read from ``start`` on.
 
-    Raises LayoutError: with the position of the mistake in ``text``.
+    Raises LayoutError: with the position of the mistake in ``text``. Too long is also what its
+    canonical text, which is that of a copy and of a file, would be too long for.
     """
-    if len(text) - start > MAX_TEXT:
+    _check_length(text, len(text) - start, start)
+    spec = _Parser(text, start).layout()
+    _check_length(text, len(to_text(spec)), start, "in its canonical form, ")
+    return spec
+
+
+def _check_length(text: str, length: int, start: int, form: str = "") -> None:
+    if length > MAX_TEXT:
         raise LayoutError(
-            f"layout: expected at most {MAX_TEXT} characters, got {len(text) - start}",
+            f"layout: {form}expected at most {MAX_TEXT} characters, got {length}",
             text=text,
-            position=start + MAX_TEXT,
+            position=min(start + MAX_TEXT, len(text)),
         )
-    return _Parser(text, start).layout()
 
 
 def misfit(

@@ -198,12 +198,6 @@ KNOWN = (
         r"AssertionError: too much memory",
         "a wrong value is written out in full before 64 characters of it are taken",
     ),
-    Known(
-        "canonical-text-too-long",
-        "layout",
-        r"LayoutError: layout: expected at most 20000 characters",
-        "a text that is accepted prints as one that is not: no copy, no pickle, no file",
-    ),
 )
 
 
