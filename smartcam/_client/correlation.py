@@ -104,6 +104,7 @@ class Match(NamedTuple):
 
 
 OURS, HELD = Match("triggered"), Match("held")
+NOBODYS, EXTRA = Match("nobody"), Match("nobody", extra=True)
 
 _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
 
@@ -323,16 +324,17 @@ class Correlation:
             self._pay([one for one in self._owed if one.number == number])
             return Match(self._given_up[number])
         if number is not None and number == self._last_number:
-            return Match("nobody", extra=True)
+            return EXTRA
         # a number that is none of ours may be that of a trigger that was sent without one
-        open_ = [
-            one
-            for one in self._owed
-            if (number is None or one.number is None) and self._may_pay(one.progress)
-        ]
-        if open_:
-            return Match(self._pay(open_))
-        return Match("nobody", extra=self._satisfied and number is None)
+        if self._owed:
+            open_ = [
+                one
+                for one in self._owed
+                if (number is None or one.number is None) and self._may_pay(one.progress)
+            ]
+            if open_:
+                return Match(self._pay(open_))
+        return EXTRA if self._satisfied and number is None else NOBODYS
 
     def _pay(self, owed: list[_Owed]) -> Debt:
         """One result of the first of these has come."""

@@ -124,20 +124,20 @@ class Dispatch:
             self._polling.ask()
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
-        before, status = self._state.status, report.status
-        switching = m.SwitchAnswer in self._waits.answers
-        previous = self._state.report(report, switching=switching)
-        bits, was = int(status), previous or 0
+        state, waits, listeners, status = self._state, self._waits, self._listeners, report.status
+        before = state.status
+        previous = state.report(report, switching=m.SwitchAnswer in waits.answers)
+        bits, was = state.bits, previous or 0
         if (bits ^ was) & _NOTED:
             self._note_changes(bits, was)
         self._results.on_status(previous, bits, now)
-        if status != before and self._listeners.sees_events:
+        if status != before and listeners.sees_events:
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
-            self._listeners.publish(event)
-        if self._listeners.hears_statuses:
-            self._listeners.offer_status(status, now)
-        if self._waits.statuses:
-            self._waits.show(status)
+            listeners.publish(event)
+        if listeners.hears_statuses:
+            listeners.offer_status(status, now)
+        if waits.statuses:
+            waits.show(status)
 
     def _note_changes(self, bits: int, was: int) -> None:
         risen, fallen = bits & ~was, was & ~bits
