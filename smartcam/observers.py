@@ -63,8 +63,9 @@ class Observer:
     def on_result(self, result: Result) -> None:
         """See a result that was interpreted: for a trigger, a stream or ``next_result()``.
 
-        Results are handed over one by one for this only where an observer overrides it; so do it in
-        the class. The result of a trigger has ``triggered_at`` and ``latency``. A container that nobody waits
+        Results are handed over one by one for this only where an observer overrides it.
+
+        The result of a trigger has ``triggered_at`` and ``latency``. A container that nobody waits
         for is counted and not interpreted.
         """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import random
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 from smartcam._client.correlation import Correlation, Match, SentTrigger
@@ -67,7 +67,7 @@ class PendingTrigger(SentTrigger):
     sent_at: float
     triggered_at: datetime
     application: int | None
-    results: list[Result] = field(init=False, default_factory=list[Result])
+    results: list[Result]
 
     def take(self, result: Result) -> None:
         """One of its results has come."""

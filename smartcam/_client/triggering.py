@@ -210,6 +210,7 @@ class Triggers:
             datetime.now(UTC),
             # where each application has its own interpreter none is read with another's layout
             request.expected if interpretation.by_application else state.active,
+            [],
         )
         return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
