@@ -259,6 +259,16 @@ class Results:
             self._note_extra(count)
         self._listeners.offer_burst(results, now, burst.size)
 
+    @property
+    def only_streams(self) -> bool:
+        """Whether what comes goes to streams, and to nobody else, whatever statuses come between.
+
+        None of it can be a trigger's or pay a debt, nor count as an extra result.
+        """
+        correlation = self.correlation
+        ours = self._pending or self._numbering or correlation.debt or correlation.satisfied
+        return not ours and self._listeners.streams_results
+
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None where one may be anything else.
 
