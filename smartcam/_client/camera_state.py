@@ -86,7 +86,7 @@ class CameraState:
             The one before, None where there was none in this session.
         """
         status = report.status
-        # int(status) costs ten times as much, with each status that comes
+        # int(status) costs three times as much, with each status that comes
         bits, was = status._value_, self.bits if self._heard_status else None
         self.statuses_heard += 1
         self.status, self.bits, self.endian = status, bits, report.endian
