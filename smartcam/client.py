@@ -176,11 +176,16 @@ class SmartCamera(Camera[ValueT]):
     async def _trigger(
         self, application: int | None, request: TriggerRequest, timeout: float
     ) -> list[Result]:
-        lock = self._lock
-        turn = lock.hold(timeout) if application is None else lock.hold_in(application, timeout)
+        lock, triggers = self._lock, self._triggers
         try:
-            async with turn as deadline:
-                return await self._triggers.trigger(request, deadline)
+            if application is not None:
+                async with lock.hold_in(application, timeout) as deadline:
+                    return await triggers.trigger(request, deadline)
+            deadline = await lock.take(timeout)  # as hold() does, without an object for it
+            try:
+                return await triggers.trigger(request, deadline)
+            finally:
+                lock.give_back()
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
 

@@ -55,10 +55,15 @@ class Observer:
         """
 
     def on_state(self, event: CameraEvent) -> None:
-        """See what happened to the camera: the items of ``camera.events()``, in the same order."""
+        """See what happened to the camera: the items of ``camera.events()``, in the same order.
+
+        They are made for this only where an observer overrides it.
+        """
 
     def on_result(self, result: Result) -> None:
         """See a result that was interpreted: for a trigger, a stream or ``next_result()``.
+
+        Results are handed over one by one for this only where an observer overrides it.
 
         The result of a trigger has ``triggered_at`` and ``latency``. A container that nobody waits
         for is counted and not interpreted.
@@ -80,10 +85,18 @@ class Observers:
 
     Args:
         observers: in the order in which they are called.
+
+    Attributes:
+        see_states: whether any looks at events.
+        see_results: whether any looks at results.
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
         self._all = tuple(observers)
+        self._on_state = self._overriding("on_state")
+        self._on_result = self._overriding("on_result")
+        self.see_states: bool = bool(self._on_state)
+        self.see_results: bool = bool(self._on_result)
 
     def __bool__(self) -> bool:
         return bool(self._all)
@@ -91,25 +104,25 @@ class Observers:
     @property
     def trace(self) -> Callable[[TraceEntry], None] | None:
         """What is to be called with every frame; None where no observer looks at frames."""
-        watching = [o for o in self._all if type(o).on_frame is not Observer.on_frame]
-        if not watching:
+        hooks = self._overriding("on_frame")
+        if not hooks:
             return None
 
         def on_frame(entry: TraceEntry) -> None:
-            for one in watching:
-                self._call(one.on_frame, entry)
+            for hook in hooks:
+                self._call(hook, entry)
 
         return on_frame
 
     def state(self, event: CameraEvent) -> None:
         """Tell all of an event."""
-        for one in self._all:
-            self._call(one.on_state, event)
+        for hook in self._on_state:
+            self._call(hook, event)
 
     def result(self, result: Result) -> None:
         """Tell all of a result."""
-        for one in self._all:
-            self._call(one.on_result, result)
+        for hook in self._on_result:
+            self._call(hook, result)
 
     def error(
         self, camera: str, error: SmartCamError, triggered_at: datetime | None = None
@@ -117,6 +130,12 @@ class Observers:
         """Tell all of an error."""
         for one in self._all:
             self._call(one.on_error, camera, error, triggered_at)
+
+    def _overriding(self, name: str) -> tuple[Callable[..., None], ...]:
+        """Return a hook of those observers that have one of their own, in order."""
+        hooks = [getattr(one, name) for one in self._all]
+        own = getattr(Observer, name)
+        return tuple(hook for hook in hooks if getattr(hook, "__func__", None) is not own)
 
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
         try:

@@ -328,7 +328,8 @@ class BatchSubscription(Queue[T]):
         """
         if not self._items:
             await self._wait()
-        items, batch = self._items, list[T]()
+        items = self._items
+        batch: list[T] = []  # list[T]() costs twenty times as much
         if not self._errors:
             batch = cast("list[T]", list(items))
             items.clear()
@@ -367,6 +368,22 @@ class Subscribers(Generic[T]):
 
     def __bool__(self) -> bool:
         return bool(self.references)
+
+    @property
+    def any_open(self) -> bool:
+        """Whether something that is offered now would be queued."""
+        for reference in self.references:
+            queue = reference()
+            if queue is not None and not queue.ended and queue.since <= self.horizon:
+                return True
+        return False
+
+    def offer(self, item: T | SmartCamError, now: float, size: int = 0) -> None:
+        """Hand an item of ``size`` bytes to each queue."""
+        for reference in self.references:
+            queue = reference()
+            if queue is not None and queue.since <= self.horizon:
+                queue.offer(item, now, size)
 
     def __iter__(self) -> Iterator[Queue[T]]:
         for reference in self.references:

@@ -150,6 +150,25 @@ def test_frames_go_to_an_observer_that_inherits_the_hook() -> None:
     assert Observers([Heir("heir", [])]).trace is not None
 
 
+def test_results_and_events_are_asked_for_where_somebody_looks() -> None:
+    class Looks(Observer):
+        def on_result(self, result: Result) -> None: ...
+
+    one, other = Observers([Blind(), Looks()]), Observers([Blind(), Everything("one", [])])
+    assert (one.see_results, one.see_states) == (True, False)
+    assert (other.see_results, other.see_states) == (True, True)
+    neither = Observers([Blind()])
+    assert (neither.see_results, neither.see_states) == (False, False)
+
+
+def test_observer_with_a_hook_of_its_own_object_is_called() -> None:
+    seen: list[Result] = []
+    blind = Blind()
+    setattr(blind, "on_result", seen.append)  # noqa: B010 - a type checker would refuse it
+    Observers([blind]).result(RESULT)
+    assert seen == [RESULT]
+
+
 def test_observers_given_as_a_generator_are_kept() -> None:
     calls: list[tuple[Any, ...]] = []
     observers = Observers(Everything("one", calls) for _ in range(1))

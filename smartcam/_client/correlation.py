@@ -104,6 +104,7 @@ class Match(NamedTuple):
 
 
 OURS, HELD = Match("triggered"), Match("held")
+NOBODYS, EXTRA = Match("nobody"), Match("nobody", extra=True)
 
 _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
 
@@ -127,6 +128,7 @@ class Correlation:
 
     Attributes:
         pending: the trigger under way.
+        satisfied: the last trigger has its results, and no other inspection was seen since.
         doubted: the status may be older than the last trigger, which was given up: it may say that
             the camera waits for one although it has one.
     """
@@ -136,7 +138,7 @@ class Correlation:
         self.doubted: bool = False
         self._ordered = False
         self._drops_waiting: bool | None = None  # whether it shows a trigger; None: not known yet
-        self._satisfied = False  # the last trigger has its results, no other inspection was seen
+        self.satisfied: bool = False
         self._last: Progress | None = None  # of the last trigger, until it has its results
         self._owed: list[_Owed] = []
         self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
@@ -154,7 +156,7 @@ class Correlation:
     def begin_session(self, *, ordered: bool) -> None:
         """A new link: what earlier triggers owe may still come over it."""
         self._ordered = ordered
-        self._satisfied = self.doubted = False
+        self.satisfied = self.doubted = False
         self._last = None
         for one in self._owed:  # whether it began may have been told to nobody
             one.progress = Progress(begun=True)
@@ -162,7 +164,7 @@ class Correlation:
     def settled(self) -> None:
         """Nothing of before can come: the application was stopped, and all of that was heard."""
         self._owed.clear()
-        self._satisfied = self.doubted = False
+        self.satisfied = self.doubted = False
         self._last = None
 
     def heard(self) -> None:
@@ -196,7 +198,7 @@ class Correlation:
 
     def send(self, pending: SentTrigger) -> None:
         """A trigger is sent now."""
-        self.pending, self._satisfied = pending, False
+        self.pending, self.satisfied = pending, False
         self._last = pending.progress
         if pending.number is None:
             self._given = None  # its run has it
@@ -207,7 +209,7 @@ class Correlation:
 
     def done(self, pending: SentTrigger) -> None:
         """The trigger has all its results."""
-        self._satisfied, self._last_number = True, pending.number
+        self.satisfied, self._last_number = True, pending.number
         self._last = None
 
     def give_up(self, pending: SentTrigger, fate: Debt = "late", *, unread: int = 0) -> None:
@@ -280,7 +282,7 @@ class Correlation:
             return False
         if last is not None and last.begun:
             last.over = self._ordered
-        self._satisfied = False
+        self.satisfied = False
         self._given = None  # that run has it
         return self._ordered and previous is not None
 
@@ -323,16 +325,17 @@ class Correlation:
             self._pay([one for one in self._owed if one.number == number])
             return Match(self._given_up[number])
         if number is not None and number == self._last_number:
-            return Match("nobody", extra=True)
+            return EXTRA
         # a number that is none of ours may be that of a trigger that was sent without one
-        open_ = [
-            one
-            for one in self._owed
-            if (number is None or one.number is None) and self._may_pay(one.progress)
-        ]
-        if open_:
-            return Match(self._pay(open_))
-        return Match("nobody", extra=self._satisfied and number is None)
+        if self._owed:
+            open_ = [
+                one
+                for one in self._owed
+                if (number is None or one.number is None) and self._may_pay(one.progress)
+            ]
+            if open_:
+                return Match(self._pay(open_))
+        return EXTRA if self.satisfied and number is None else NOBODYS
 
     def _pay(self, owed: list[_Owed]) -> Debt:
         """One result of the first of these has come."""

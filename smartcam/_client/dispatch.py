@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
+FEWEST_GATHERED = 6
+"""Events of a chunk that are worth to be looked through: two results, each between statuses."""
+
 _NOTED = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
 
 
@@ -74,7 +77,10 @@ class Dispatch:
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
-        for event in chunk.events:
+        events = chunk.events
+        if len(events) >= FEWEST_GATHERED and self._only_streams():
+            events = gathered(events, self._state.endian)
+        for event in events:
             take = self._takers.get(type(event))
             if take is not None:  # LinkFailed and LinkEnded: the receive task ends by them
                 take(event, now, at)
@@ -82,6 +88,12 @@ class Dispatch:
                 self._waits.on_message(event, now)
         if self._state.active_in_doubt:
             self._requests.ask_what_is_active()
+
+    def _only_streams(self) -> bool:
+        """Whether nobody looks at statuses, and containers go to streams whatever statuses say."""
+        waits, listeners = self._waits, self._listeners
+        heard = waits.answers or waits.statuses or listeners.hears_statuses
+        return not (heard or listeners.sees_events) and self._results.only_streams
 
     def fail(self, error: SmartCamError) -> None:
         """The session is over: tell everybody who waits, and who comes before the next one.
@@ -124,20 +136,20 @@ class Dispatch:
             self._polling.ask()
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
-        before, status = self._state.status, report.status
-        switching = m.SwitchAnswer in self._waits.answers
-        previous = self._state.report(report, switching=switching)
-        bits, was = int(status), previous or 0
+        state, waits, listeners, status = self._state, self._waits, self._listeners, report.status
+        before = state.status
+        previous = state.report(report, switching=m.SwitchAnswer in waits.answers)
+        bits, was = state.bits, previous or 0
         if (bits ^ was) & _NOTED:
             self._note_changes(bits, was)
         self._results.on_status(previous, bits, now)
-        if status != before and self._listeners.sees_events:
+        if status != before and listeners.sees_events:
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
-            self._listeners.publish(event)
-        if self._listeners.hears_statuses:
-            self._listeners.offer_status(status, now)
-        if self._waits.statuses:
-            self._waits.show(status)
+            listeners.publish(event)
+        if listeners.hears_statuses:
+            listeners.offer_status(status, now)
+        if waits.statuses:
+            waits.show(status)
 
     def _note_changes(self, bits: int, was: int) -> None:
         risen, fallen = bits & ~was, was & ~bits
@@ -149,3 +161,36 @@ class Dispatch:
             logger.info("%s = the camera is no longer too hot", self._name)
         if risen & Status.SYSTEM_ERROR:
             logger.error("%s ! the camera reports System Error", self._name)
+
+
+def gathered(events: list[Event], endian: int) -> list[Event]:
+    """Return events of a camera that runs free with its containers as one burst, then the statuses.
+
+    It sends statuses around each container, which keeps those that came together from being read
+    together. As they came where there is anything else among them, or a container could be read
+    otherwise for where it stands: of another application, or behind a status with another byte
+    order than ``endian``, the present one.
+    """
+    statuses: list[Event] = []
+    data: list[bytes] = []
+    applications: set[int] = set()
+    for event in events:
+        if isinstance(event, m.StatusReport) and event.endian == endian:
+            statuses.append(event)
+        elif isinstance(event, ResultBurst):
+            data += event.data
+            applications.add(event.application)
+        elif isinstance(event, m.ResultContainer) and _is_plain(event):
+            data.append(event.data)
+            applications.add(event.application)
+        else:
+            return events
+    if len(data) < 2 or len(applications) != 1 or not statuses:
+        return events
+    size = sum(map(len, data))
+    return [ResultBurst(application=applications.pop(), data=data, size=size), *statuses]
+
+
+def _is_plain(container: m.ResultContainer) -> bool:
+    """Whether a container is nothing but its bytes, and says whose it is."""
+    return container.application >= 0 and container.cells is None and container.fault is None

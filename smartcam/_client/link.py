@@ -384,8 +384,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
     """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut."""
-    some, left = list[Event](), frames
-    rest = collections.deque(chunk.events)
+    at, events = chunk.received_at, chunk.events
+    if chunk.frames == len(events):  # one each
+        others = Chunk(at, events[frames:], chunk.frames - frames)
+        return Chunk(at, events[:frames], frames), others
+    some: list[Event] = []
+    left, rest = frames, collections.deque(events)
     while left > 0 and rest:
         event = rest.popleft()
         if type(event) is ResultBurst:

@@ -31,18 +31,19 @@ class Listeners:
         results: subscriptions to results.
         statuses: subscriptions to statuses.
         events: subscriptions to events.
-        observed: there are observers.
+        observed: there are observers that look at results.
     """
 
     def __init__(self, name: str, observers: Observers) -> None:
         self.results: Subscribers[Result] = Subscribers()
         self.statuses: Subscribers[Status] = Subscribers()
         self.events: Subscribers[CameraEvent] = Subscribers()
-        self.observed: bool = bool(observers)
+        self.observed: bool = observers.see_results
         self._name = name
         self._observers = observers
         # weak: a waiter that was made and never awaited must not count as a listener
         self._next_results: weakref.WeakSet[asyncio.Future[Result]] = weakref.WeakSet()
+        self._may_await = False  # somebody asked for the next result since the last one
 
     def streams(self) -> list[Queue[Any]]:
         """Return every subscription that is still referred to."""
@@ -52,6 +53,7 @@ class Listeners:
         """Return a future that gets the next result; it is let go when nobody holds it."""
         future: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
         self._next_results.add(future)
+        self._may_await = True
         return future
 
     @property
@@ -66,11 +68,11 @@ class Listeners:
 
     @property
     def _streams_hear(self) -> bool:
-        return any(not stream.ended for stream in self.results)
+        return self.results.any_open
 
     @property
     def _awaits_next(self) -> bool:
-        return any(not future.done() for future in self._next_results)
+        return self._may_await and any(not future.done() for future in self._next_results)
 
     @property
     def hears_statuses(self) -> bool:
@@ -86,8 +88,9 @@ class Listeners:
     @property
     def sees_events(self) -> bool:
         """Whether anybody would see an event."""
-        watched = self.observed or bool(self.events.references)
-        return watched or logger.isEnabledFor(logging.DEBUG)
+        if self.events.references or self._observers.see_states:
+            return True
+        return logger.isEnabledFor(logging.DEBUG)
 
     # ------------------------------------------------------------------ what comes
 
@@ -95,13 +98,11 @@ class Listeners:
         """Hand an event to its subscribers."""
         logger.debug("%s = %s", self._name, event)
         self._observers.state(event)
-        for stream in self.events:
-            stream.offer(event, 0.0)
+        self.events.offer(event, 0.0)
 
     def offer_status(self, status: Status, now: float) -> None:
         """Hand a status to its subscribers."""
-        for stream in self.statuses:
-            stream.offer(status, now)
+        self.statuses.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
         """Hand results that are only streamed to their subscribers; ``size`` bytes in all."""
@@ -120,9 +121,8 @@ class Listeners:
         if self.observed:
             self._observers.result(result)
         if self.results.references:
-            for stream in self.results:
-                stream.offer(result, now, len(result.raw))
-        if current and self._next_results:
+            self.results.offer(result, now, len(result.raw))
+        if current and self._may_await:
             for future in self._take_next_results():
                 future.set_result(result)
 
@@ -140,8 +140,7 @@ class Listeners:
         """
         if self.results:
             _drop_frames(error)
-        for stream in self.results:
-            stream.offer(error, now, size)
+        self.results.offer(error, now, size)
         if current:
             for future in self._take_next_results():
                 future.set_exception(error)
@@ -161,6 +160,7 @@ class Listeners:
     def _take_next_results(self) -> list[asyncio.Future[Result]]:
         waiting = [future for future in self._next_results if not future.done()]
         self._next_results.clear()
+        self._may_await = False
         return waiting
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import random
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 from smartcam._client.correlation import Correlation, Match, SentTrigger
@@ -67,7 +67,7 @@ class PendingTrigger(SentTrigger):
     sent_at: float
     triggered_at: datetime
     application: int | None
-    results: list[Result] = field(init=False, default_factory=list[Result])
+    results: list[Result]
 
     def take(self, result: Result) -> None:
         """One of its results has come."""
@@ -188,9 +188,9 @@ class Results:
     def on_query_answer(self, *, fence: bool) -> None:
         """A Query is answered; ``fence``: the one in front of the last trigger."""
         if fence:
-            self.correlation.on_query_answer(int(self._state.status or 0), fence=True)
+            self.correlation.on_query_answer(self._state.bits, fence=True)
         elif self._held:
-            self.correlation.on_query_answer(int(self._state.status or 0), fence=False)
+            self.correlation.on_query_answer(self._state.bits, fence=False)
             self._release_held()
 
     def on_trigger_answer(self) -> bool:
@@ -208,15 +208,14 @@ class Results:
             now: loop time.
         """
         was = previous or 0
-        risen, fallen = bits & ~was, was & ~bits
-        if risen & _FAILING or fallen & _RUNNING:
-            self._fail_trigger(risen, fallen)
+        if bits & ~was & _FAILING or was & ~bits & _RUNNING:
+            self._fail_trigger(bits & ~was, was & ~bits)
         if self.correlation.on_status(previous, bits):
             self._note_others()
         if self._held:
             self._release_held()
         pending = self._pending
-        if pending is not None and pending.results:
+        if pending is not None and pending.results and not pending.ended:
             self._complete(pending, now)
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
@@ -259,6 +258,16 @@ class Results:
         if self.correlation.judge(None).extra:
             self._note_extra(count)
         self._listeners.offer_burst(results, now, burst.size)
+
+    @property
+    def only_streams(self) -> bool:
+        """Whether what comes goes to streams, and to nobody else, whatever statuses come between.
+
+        None of it can be a trigger's or pay a debt, nor count as an extra result.
+        """
+        correlation = self.correlation
+        ours = self._pending or self._numbering or correlation.debt or correlation.satisfied
+        return not ours and self._listeners.streams_results
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None where one may be anything else.
@@ -402,22 +411,19 @@ class Results:
     ) -> Result:
         interpretation = owner.interpretation if owner is not None else self.interpretation
         number = self._counters.received + 1
-        value, sequence, empty_slots = interpretation(
+        # by the method's name: a call of the object itself costs four times as much
+        value, sequence, empty_slots = interpretation.__call__(
             container, self._state.endian, camera=self._name, number=number, at=at
         )
         if empty_slots:
             self._counters.skip(empty_slots)
-        return Result(
-            self._name,
-            container.application,
-            sequence,
-            number,
-            owner.triggered_at if owner is not None else None,
-            at,
-            now - owner.sent_at if owner is not None else None,
-            container.data,
-            value,
-        )
+        name, application, data = self._name, container.application, container.data
+        triggered_at, latency = None, None
+        if owner is not None:
+            triggered_at, latency = owner.triggered_at, now - owner.sent_at
+        fields = (name, application, sequence, number, triggered_at, at, latency, data, value)
+        result: Result = _new_tuple(Result, fields)
+        return result
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
         """End the trigger under way if it has all its results, and nothing speaks against it."""

@@ -183,7 +183,7 @@ class Triggers:
         if self._commands.halted or correlation.debt is not None:
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
         while True:
-            status = int(state.status or 0)
+            status = state.bits
             if status & _SPEAKS_AGAINST != _WAITING:
                 await self._wait_for_trigger(deadline, wait=request.wait)
             elif status & _OVERTRIGGERED and not cleared:
@@ -210,6 +210,7 @@ class Triggers:
             datetime.now(UTC),
             # where each application has its own interpreter none is read with another's layout
             request.expected if interpretation.by_application else state.active,
+            [],
         )
         return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
 
@@ -335,7 +336,7 @@ class Triggers:
                 ) from exc
 
     def _raise_fault(self) -> None:
-        if int(self._state.status or 0) & _SYSTEM_ERROR:
+        if self._state.bits & _SYSTEM_ERROR:
             raise CameraFaultError(f"{self._name}: the camera reports System Error")
 
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:

@@ -373,6 +373,148 @@ async def test_observer_sees_each_of_a_burst_in_order(*, together: bool) -> None
         assert len(witness.seen) == 10
 
 
+class Quiet(Observer):
+    """Looks at errors only."""
+
+    def __init__(self) -> None:
+        self.seen: list[Any] = []
+
+    def on_error(self, camera: str, error: Exception, triggered_at: object) -> None:
+        self.seen.append(error)
+
+
+async def test_observer_that_does_not_look_at_results_leaves_bursts_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    quiet = Quiet()
+    async with by_hand(interpret_as="n: int32", observers=[quiet]) as (box, camera):
+        results, alone = camera.results(), list[object]()
+        kept = inside(camera)._results
+        take = kept.on_result
+
+        def note(*given: Any) -> None:
+            alone.append(given)
+            take(*given)
+
+        monkeypatch.setattr(kept, "on_result", note)
+        await say(camera, box, *numbered(box, 3), together=True)
+        assert [one.value.n for one in await queued(results)] == [0, 1, 2]
+        assert alone == []
+        await say(camera, box, *numbered(box, 2), box.result_frame(b"?"), together=True)
+        assert [type(one) for one in quiet.seen] == [InterpretationError]
+        assert len(alone) == 3
+        assert fates(camera) == {"streamed": 5, "uninterpretable": 1}
+
+
+# ---------------------------------------------------------------------- statuses around each
+
+INSPECTS, DONE = RUNNING, RUNNING | WAITING
+
+
+def around(box: HandmadeCamera, results: list[bytes]) -> list[bytes]:
+    """Return the frames of a camera that runs free: each result between two statuses."""
+    statuses = box.status_frame(INSPECTS), box.status_frame(DONE)
+    return [frame for one in results for frame in (statuses[0], one, statuses[1])]
+
+
+@each_way
+async def test_results_between_statuses_are_what_they_are_one_by_one(*, together: bool) -> None:
+    async with by_hand(interpret_as="n: int32") as (box, camera):
+        sizes, results, batch = bursts(camera), camera.results(), camera.results(batch=True)
+        before = camera.statistics()
+        for turn in range(3):
+            await say(camera, box, *around(box, numbered(box, 4, 4 * turn)), together=together)
+            assert camera.status == DONE
+        seen = await queued(results)
+        assert [(one.value.n, one.number) for one in seen] == [(n, n + 1) for n in range(12)]
+        assert await queued(batch) == seen
+        assert fates(camera) == {"streamed": 12}
+        after = camera.statistics()
+        assert after.inspections_by_others - before.inspections_by_others == 12
+        assert sizes == ([4, 4, 4] if together else [])
+
+
+@each_way
+async def test_result_between_statuses_that_does_not_fit_is_raised_in_its_place(
+    *, together: bool
+) -> None:
+    async with by_hand(interpret_as="n: int32") as (box, camera):
+        results = camera.results()
+        frames = numbered(box, 4)
+        frames[1] = box.result_frame(b"?")
+        await say(camera, box, *around(box, frames), together=together)
+        seen = await queued(results)
+        assert [isinstance(one, InterpretationError) for one in seen] == [False, True, False, False]
+        assert fates(camera) == {"streamed": 3, "uninterpretable": 1}
+
+
+@each_way
+async def test_results_around_a_status_of_the_other_byte_order_are_read_by_theirs(
+    *, together: bool
+) -> None:
+    async with by_hand(interpret_as="n: int32") as (box, camera):
+        sizes, results = bursts(camera), camera.results()
+        little, big = (box.result_frame(struct.pack(code, 1)) for code in ("<i", ">i"))
+        frames = [little, box.status_frame(DONE, endian=1), big, box.status_frame(INSPECTS), big]
+        frames += [box.status_frame(DONE, endian=0), little, box.status_frame(INSPECTS)]
+        await say(camera, box, *frames, together=together)
+        assert [one.value.n for one in await queued(results)] == [1, 1, 1, 1]
+        assert sizes == []
+
+
+@each_way
+async def test_statuses_that_somebody_waits_for_keep_their_place(*, together: bool) -> None:
+    async with by_hand(interpret_as="n: int32") as (box, camera):
+        sizes, results, statuses = bursts(camera), camera.results(), camera.statuses()
+        frames = around(box, numbered(box, 3))
+        await say(camera, box, *frames, together=together)
+        assert await queued(statuses) == [INSPECTS, DONE] * 3
+        statuses.close()
+        del statuses
+        seen: list[tuple[object, int]] = []
+
+        def show(status: object) -> bool:
+            seen.append((status, camera.statistics().received))
+            return False
+
+        waiting = asyncio.create_task(camera.wait_status(show))
+        await steps(3)
+        seen.clear()
+        await say(camera, box, *frames, together=together)
+        await cancelled(waiting)
+        assert seen == [(one, 3 + n + (one == DONE)) for n in range(3) for one in (INSPECTS, DONE)]
+        assert len(await queued(results)) == 6
+        assert sizes == []
+
+
+@each_way
+async def test_extra_results_between_statuses_are_extra_until_an_inspection_begins(
+    *, together: bool
+) -> None:
+    async with by_hand() as (box, camera):
+        results = camera.results()
+        await camera.trigger()
+        frames = [*numbered(box, 2), *around(box, numbered(box, 4))]
+        await say(camera, box, *frames, together=together)
+        assert fates(camera) == {"triggered": 1, "streamed": 6, "extra_results": 2}
+        assert [one.number for one in await queued(results)] == [*range(1, 8)]
+
+
+@each_way
+async def test_results_of_two_applications_between_statuses_are_told_apart(
+    *, together: bool
+) -> None:
+    async with by_hand(application=7, interpret_as="n: int32") as (box, camera):
+        results = camera.results()
+        frames = numbered(box, 4)
+        frames[2] = box.result_frame(bytes(4), application=3)
+        await say(camera, box, *around(box, frames), together=together)
+        assert [(one.value.n, one.number) for one in await queued(results)] == [
+            *((0, 1), (1, 2), (3, 4))
+        ]
+        assert fates(camera) == {"streamed": 3, "wrong_application": 1}
+
+
 @each_way
 @pytest.mark.parametrize("listening", [True, False])
 async def test_debt_is_paid_by_the_first_of_a_burst(*, together: bool, listening: bool) -> None:

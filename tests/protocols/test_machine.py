@@ -21,6 +21,7 @@ from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
 from smartcam.protocols._framed.dialect import FramedDialect
 from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame
 from smartcam.protocols._framed.machine import (
+    MAX_FAMILIAR,
     TRANSITIONS,
     Counters,
     Event,
@@ -597,6 +598,73 @@ def test_trace_says_nothing_of_what_could_not_be_sent() -> None:
     with pytest.raises(LocalProtocolError):
         made.send(m.Trigger())
     assert seen == []
+
+
+# ---------------------------------------------------------------------- statuses that came before
+
+
+@pytest.mark.parametrize("dialect", DIALECTS, ids=label)
+def test_statuses_that_repeat_come_whole_and_in_order(dialect: FramedDialect) -> None:
+    busy, done = (m.StatusReport(status=Status(bits)) for bits in (0x90, 0x80))
+    said = [busy, done, result(b"a", 5), done, busy, busy, result(b"b", 5), done, done]
+    data = b"".join(map(dialect.encode, said))
+    told = [carried(dialect, one) for one in said]
+    made = client(dialect)
+    for turn in range(1, 3):
+        made.receive_data(data)
+        assert made.events() == told
+        assert made.counters.frames_received == 1 + turn * len(said)
+    for cut in range(len(data)):
+        made.receive_data(data[:cut])
+        first = made.events()
+        made.receive_data(data[cut:])
+        assert first + made.events() == told
+
+
+def test_status_that_came_before_is_one_only_where_it_is_whole_and_as_long() -> None:
+    made = client()
+    assert feed(made, STATUS * 2) == [STATUS_MESSAGE] * 2
+    long = header(12, 0x12) + STATUS[12:] + bytes(4)
+    assert feed(made, STATUS, long, STATUS) == [STATUS_MESSAGE] * 3
+    assert made.counters.long_bodies == 1
+    assert feed(made, STATUS + b"PSVX") == [STATUS_MESSAGE, LinkFailed(error=made.error)]  # type: ignore[arg-type]
+
+
+def test_status_that_was_asked_for_by_its_id_is_its_answer_though_it_came_before() -> None:
+    made = client()
+    feed(made, STATUS * 2)
+    request = m.UnknownMessage(message_id=0x12, payload=b"")
+    made.send(request, answered=True)
+    with pytest.raises(LocalProtocolError):
+        made.send(request, answered=True)
+    feed(made, STATUS)
+    made.send(request, answered=True)
+
+
+def test_status_that_came_before_is_refused_where_none_may_come() -> None:
+    made = client()
+    feed(made, STATUS * 2)
+    made.send(m.Disconnect())
+    assert feed(made, STATUS * 2) == [STATUS_MESSAGE] * 2
+    made.send(m.Connect())
+    made.receive_data(STATUS)
+    assert "where it is not expected" in str(failure(made.events()))
+
+
+def test_statuses_of_many_kinds_are_all_told() -> None:
+    made = client()
+    said = [m.StatusReport(status=Status(0x80), endian=number) for number in range(200)] * 2
+    made.receive_data(b"".join(map(HANDBOOK.encode, said)))
+    assert made.events() == said
+    assert len(made._familiar) == MAX_FAMILIAR
+
+
+def test_status_that_came_before_is_traced_each_time() -> None:
+    seen: list[object] = []
+    made = client(trace=lambda sender, frame: seen.append(frame))
+    before = len(seen)
+    feed(made, STATUS * 3)
+    assert seen[before:] == [Frame(0x12, STATUS[12:])] * 3
 
 
 # ---------------------------------------------------------------------- bursts

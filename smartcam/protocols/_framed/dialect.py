@@ -168,13 +168,11 @@ class Codec:
         self._meaning = dialect.code
         self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
         # what fills the slots of a frozen message, in half the time of its own constructor
-        self._fill = [vars(_owner(row.type, name))[name].__set__ for name, _ in fields]
-        on_the_wire = {name for name, _ in fields}
-        self._omitted = [
-            (vars(_owner(row.type, one.name))[one.name].__set__, one.default)
-            for one in dataclasses.fields(row.type)
-            if one.name not in on_the_wire
-        ]
+        names = [name for name, _ in fields]
+        others = [one for one in dataclasses.fields(row.type) if one.name not in names]
+        names += [one.name for one in others]
+        self._fill = [vars(_owner(row.type, name))[name].__set__ for name in names]
+        self._omitted = tuple(one.default for one in others)
 
     @property
     def may_be_a_code(self) -> bool:
@@ -239,9 +237,7 @@ class Codec:
 
     def _make(self, values: tuple[Any, ...]) -> Message:
         message = object.__new__(self.type)
-        for fill, value in zip(self._fill, values, strict=True):
-            fill(message, value)
-        for fill, value in self._omitted:
+        for fill, value in zip(self._fill, values + self._omitted, strict=True):
             fill(message, value)
         return message
 

@@ -319,7 +319,7 @@ class Machine:
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
-        self._sender, self._sends = role.receives, role.sends
+        self._sender = role.receives
         self._decoders: dict[int, Codec] = {}
         # whole frames of statuses that came before, and what they are; of this state only
         self._familiar: dict[bytes, Message] = {}
@@ -348,10 +348,9 @@ class Machine:
         self._burst_reader = dialect.header.reader(result.size)
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
-        self._constant = dialect.constant
         self._familiar = {}
-        self._plain = self.role is Role.CLIENT and self._trace is None
-        self._takes_bursts = self._plain and result.size > 0
+        plain = self.role is Role.CLIENT and self._trace is None
+        self._takes_bursts = plain and result.size > 0
 
     @property
     def state(self) -> State:
@@ -363,7 +362,7 @@ class Machine:
         self._state = state
         self._deaf = state is State.FAILED or state is State.CLOSED
         self._may_come = _SAID[state, self._sender]
-        self._may_go = _SAID[state, self._sends]
+        self._may_go = _SAID[state, self.role.sends]
         self._familiar = {}
 
     # ------------------------------------------------------------------ bytes in
@@ -453,13 +452,14 @@ class Machine:
             LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
                 the same id is still owed (answers carry no correlation). Nothing has changed.
         """
-        following = self._may_go.get(type(message))
+        kind = type(message)
+        following = self._may_go.get(kind)
         if following is None:
             raise LocalProtocolError(
-                f"{type(message).__name__} cannot be sent by the {self.role.value} "
+                f"{kind.__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant = self._constant.get(type(message))
+        constant = self.dialect.constant.get(kind)
         if constant is not None:
             data, message_id, owed = constant
         else:
@@ -469,20 +469,21 @@ class Machine:
             owed = None
         elif answered:
             owed = message_id
-        if owed in self._open:
-            raise LocalProtocolError(
-                f"an answer to message {message_id:#04x} is still owed; one request of an id "
-                "can be open"
-            )
         if owed is not None:
+            if owed in self._open:
+                raise LocalProtocolError(
+                    f"an answer to message {message_id:#04x} is still owed; one request of an id "
+                    "can be open"
+                )
             self._open.add(owed)
         if following is not self._state:
             self.state = following
         self._outbox.append(data)
-        self.counters.frames_sent += 1
-        self.counters.bytes_sent += len(data)
+        counters = self.counters
+        counters.frames_sent += 1
+        counters.bytes_sent += len(data)
         if self._trace is not None:
-            self._trace(self._sends, Frame(message_id, data[self.dialect.header.size :]))
+            self._trace(self.role.sends, Frame(message_id, data[self.dialect.header.size :]))
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -632,7 +633,8 @@ class Machine:
 
         Not where each frame is to be traced, nor for the camera, to which no client sends one.
         """
-        if self._plain and len(self._familiar) < MAX_FAMILIAR:
+        plain = self.role is Role.CLIENT and self._trace is None
+        if plain and len(self._familiar) < MAX_FAMILIAR:
             self._familiar[self._framer.take(end - self._status_size, end)] = status
 
     def _narrow(self, message_id: int, size: int) -> None:
