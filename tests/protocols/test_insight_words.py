@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -228,10 +230,10 @@ class Pieces:
 
     def __init__(self, max_length: int = 100) -> None:
         self.told: list[tuple[str, bool]] = []
-        self.reader = AnswerReader(max_length=max_length, on_piece=self._take)
+        self.reader = AnswerReader(max_length=max_length, on_pieces=self._take)
 
-    def _take(self, text: str, ended: bool) -> None:
-        self.told.append((text, ended))
+    def _take(self, pieces: Sequence[bytes], ended: bool) -> None:
+        self.told += [(piece.decode("latin-1"), ended) for piece in pieces]
 
 
 @each
@@ -311,6 +313,56 @@ def test_image_in_lines_of_a_byte_is_read() -> None:
     answer = reader.next_answer()
     assert answer is not None
     assert answer.data == BITMAP
+
+
+@given(
+    st.lists(
+        st.sampled_from([b"42", b"4D4", b"", b"0aFf", b"4 4D", b"\xff\xff", b"4\n", b"00" * 40])
+    ),
+    st.integers(0, 60),
+    st.lists(st.integers(0, 400), max_size=6),
+)
+def test_image_is_the_same_in_pieces_of_any_size_broken_or_not(
+    lines: list[bytes], missing: int, cuts: list[int]
+) -> None:
+    size = 6 + max(0, sum(map(len, lines)) // 2 - missing)
+    start = b"1\r\n1\r\n" + (b"BM" + struct.pack("<I", size)).hex().encode() + b"\r\n"
+    heard = start + b"".join(line + b"\r\n" for line in lines) + b"0000\r\n"
+    read = []
+    for splits in (range(len(heard)), cuts, ()):  # byte by byte there are never two lines at once
+        points = sorted({0, len(heard), *(cut for cut in splits if cut < len(heard))})
+        pieces, answer, failed = Pieces(), None, ""
+        pieces.reader.expect(AnswerForm.HEX)
+        for begin, end in pairwise(points):
+            pieces.reader.feed(heard[begin:end])
+            try:
+                answer = answer or pieces.reader.next_answer()
+            except FrameError as exc:
+                failed = str(exc)
+                break
+        read.append((answer, failed, pieces.told))
+    assert read[0] == read[1] == read[2]
+
+
+def test_image_with_a_broken_line_behind_thousands_is_told_up_to_it() -> None:
+    pieces = Pieces()
+    pieces.reader.expect(AnswerForm.HEX)
+    header = (b"BM" + struct.pack("<I", 1 << 20)).hex().encode()
+    pieces.reader.feed(b"1\r\n1\r\n" + header + b"\r\n" + b"00\r\n" * 5000 + b"0x\r\n00\r\n")
+    with pytest.raises(FrameError, match="'0x' came, hexadecimal digits of an image were due"):
+        pieces.reader.next_answer()
+    assert pieces.told[-2:] == [("00", True), ("0x", True)]
+    assert len(pieces.told) == 3 + 5000 + 1
+
+
+def test_image_with_a_line_too_long_among_others_is_refused() -> None:
+    reader = Pieces().reader
+    reader.expect(AnswerForm.HEX)
+    header = (b"BM" + struct.pack("<I", 1 << 20)).hex().encode()
+    lines = [b"1", b"1", header, b"00", b"00" * (words.MAX_LINE // 2), b"0" * (words.MAX_LINE + 2)]
+    reader.feed(b"".join(line + b"\r\n" for line in lines))
+    with pytest.raises(FrameError, match=f"a line of more than {words.MAX_LINE} bytes came"):
+        reader.next_answer()
 
 
 @given(st.binary(min_size=1, max_size=500), st.booleans())

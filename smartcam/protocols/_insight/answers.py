@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import binascii
+from bisect import bisect_right
+from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import FrameError
@@ -9,6 +12,7 @@ from smartcam.protocols._insight.words import (
     ENCODING,
     ENDS,
     INFO_LINES,
+    LINE_END,
     MAX_LINE,
     AnswerForm,
     StatusCode,
@@ -17,7 +21,7 @@ from smartcam.protocols._insight.words import (
 from smartcam.protocols._line_reader import LineReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable, Generator, Sequence
 
 MAX_IMAGE = 1 << 26
 """Bytes of an image that are accepted: 20 million pixels of three bytes, and then some."""
@@ -47,13 +51,15 @@ class AnswerReader(LineReader):
 
     Args:
         max_length: longest text of an answer that says its length, bytes.
-        on_piece: called with each piece that came, and whether a line end stood behind it.
+        on_pieces: called with pieces that came, and whether a line end stood behind each.
     """
 
-    def __init__(self, *, max_length: int, on_piece: Callable[[str, bool], None]) -> None:
+    def __init__(
+        self, *, max_length: int, on_pieces: Callable[[Sequence[bytes], bool], None]
+    ) -> None:
         super().__init__(ENDS, max_line=MAX_LINE, encoding=ENCODING)
         self._max_length = max_length
-        self._on_piece = on_piece
+        self._on_pieces = on_pieces
         self._reading: Generator[None, None, CommandAnswer] | None = None
 
     def expect(self, form: AnswerForm) -> None:
@@ -79,14 +85,14 @@ class AnswerReader(LineReader):
         """Return the next line as :meth:`LineReader.next_line`, and tell of it."""
         line = super().next_line()
         if line is not None:
-            self._on_piece(line, True)
+            self._on_pieces((line.encode(ENCODING),), True)
         return line
 
     def take_prompt(self, prompt: bytes) -> bool:
         """Take a prompt as :meth:`LineReader.take_prompt`, and tell of it."""
         taken = super().take_prompt(prompt)
         if taken:
-            self._on_piece(prompt.decode(ENCODING), False)
+            self._on_pieces((prompt,), False)
         return taken
 
     # ------------------------------------------------------------------ forms
@@ -119,35 +125,70 @@ class AnswerReader(LineReader):
             raise FrameError(f"a text of {size} bytes comes; 0 to {self._max_length} are accepted")
         while (data := self.take(size)) is None:
             yield
-        text = data.decode(ENCODING)
-        self._on_piece(text, False)
+        self._on_pieces((data,), False)
         if end := (yield from self._line()):
             raise FrameError(f"{end[:64]!r} came behind a text of {size} bytes, its end was due")
-        return text
+        return data.decode(ENCODING)
 
     def _image(self) -> Generator[None, None, bytes]:
         """Read a bitmap; its own header says how long it is, the size may count digits."""
         _number((yield from self._line()), "an image's size")
         data = bytearray()
-        size = 0
+        size, check, regular = 0, "", True
         while not size or len(data) < size:
-            line = yield from self._line()
-            try:
-                more = bytes.fromhex(line) if line.isalnum() else b""
-            except ValueError:
-                more = b""
+            more: bytes | None = b""
+            if size and regular:
+                more = self._take_hex(2 * (size - len(data)))
+                regular = more is not None
             if not more:
-                raise FrameError(f"{line[:64]!r} came, hexadecimal digits of an image were due")
+                more = yield from self._hex_line()
             data += more
+            check = checksum(binascii.hexlify(more).upper(), check)
             if not size and len(data) >= _BMP_SIZE_AT.stop:
                 size = _bitmap_size(data)
         if len(data) > size:
             raise FrameError(f"{len(data)} bytes of a bitmap of {size} bytes came")
         told = yield from self._line()
-        right = checksum(data.hex().upper().encode(ENCODING))
-        if told.strip().upper() != right:
-            raise FrameError(f"the image's checksum is {told[:16]!r}, {right} was expected")
+        if told.strip().upper() != check:
+            raise FrameError(f"the image's checksum is {told[:16]!r}, {check} was expected")
         return bytes(data)
+
+    def _hex_line(self) -> Generator[None, None, bytes]:
+        """Read one line of an image."""
+        line = yield from self._line()
+        data = _from_hex(line.encode(ENCODING))
+        if not data:
+            raise FrameError(f"{line[:64]!r} came, hexadecimal digits of an image were due")
+        return data
+
+    def _take_hex(self, most: int) -> bytes | None:
+        """Take all lines of an image that are there, ``most`` digits of it: there are thousands.
+
+        Returns what they say, nothing if no whole one is there. None: one of them is broken, and
+        all are left to be read line by line, which tells which one, and what came before it.
+        """
+        end = self._buffer.rfind(LINE_END)
+        if end < 0:
+            return b""
+        lines = bytes(memoryview(self._buffer)[:end]).split(LINE_END)
+        if end - (len(lines) - 1) * len(LINE_END) > most:
+            del lines[bisect_right(list(accumulate(map(len, lines))), most) :]
+        digits = b"".join(lines)
+        if any(not 0 < size <= MAX_LINE or size % 2 for size in set(map(len, lines))):
+            return None
+        data = _from_hex(digits)
+        if data:
+            self.take(len(digits) + len(lines) * len(LINE_END))
+            self._on_pieces(lines, True)
+        return data
+
+
+def _from_hex(digits: bytes) -> bytes | None:
+    """Return what hexadecimal digits say; None: they are none."""
+    try:
+        return binascii.unhexlify(digits)
+    except ValueError:
+        return None
 
 
 def _bitmap_size(data: bytearray) -> int:

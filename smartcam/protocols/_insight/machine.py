@@ -147,7 +147,7 @@ class InSightMachine:
         self.counters: Counters = Counters()
         self.state: State = State.IDLE
         self._trace = trace
-        self._reader = AnswerReader(max_length=max_length, on_piece=self._on_piece)
+        self._reader = AnswerReader(max_length=max_length, on_pieces=self._on_pieces)
         self._store = memoryview(bytearray(READ_SIZE))
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
@@ -245,13 +245,14 @@ class InSightMachine:
         self.state = state
         self._job = None
         self._waiting.clear()
-        self._reader = AnswerReader(max_length=0, on_piece=self._on_piece)
+        self._reader = AnswerReader(max_length=0, on_pieces=self._on_pieces)
 
-    def _on_piece(self, text: str, ended: bool) -> None:
-        self.counters.frames_received += 1
+    def _on_pieces(self, pieces: Sequence[bytes], ended: bool) -> None:
+        self.counters.frames_received += len(pieces)
         if self._trace is not None:
             kind = Piece.LINE if ended else Piece.TEXT
-            self._trace(m.Sender.CAMERA, Frame(kind, text.encode(ENCODING)))
+            for piece in pieces:
+                self._trace(m.Sender.CAMERA, Frame(kind, piece))
 
     # ------------------------------------------------------------------ messages out
 

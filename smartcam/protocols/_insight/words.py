@@ -394,12 +394,13 @@ def job_id(file: str) -> int | None:
 # ---------------------------------------------------------------------- data
 
 
-def checksum(digits: bytes) -> str:
+def checksum(digits: bytes, before: str = "") -> str:
     """Return the checksum of hexadecimal data: CRC-16 with polynomial 0x1021, first value 0.
 
     It is made of the digits' characters in upper case, without line ends (manual, published).
+    ``before``: that of the digits in front of these.
     """
-    return f"{binascii.crc_hqx(digits, 0):04X}"
+    return f"{binascii.crc_hqx(digits, int(before or '0', 16)):04X}"
 
 
 def hex_lines(data: bytes) -> tuple[int, bytes]:
@@ -407,10 +408,11 @@ def hex_lines(data: bytes) -> tuple[int, bytes]:
 
     Returns the number of hexadecimal digits, and the lines: 80 digits each, then the checksum's.
     """
-    digits = data.hex().upper().encode("ascii")
-    lines = [digits[begin : begin + HEX_WIDTH] for begin in range(0, len(digits), HEX_WIDTH)]
-    lines.append(checksum(digits).encode("ascii"))
-    return len(digits), b"".join(line + LINE_END for line in lines)
+    digits = binascii.hexlify(data).upper()
+    # negative: the short line is the last one
+    lines = binascii.hexlify(data, b"\n", -HEX_WIDTH // 2).upper().replace(b"\n", LINE_END)
+    told = checksum(digits).encode("ascii") + LINE_END
+    return len(digits), lines + LINE_END * bool(lines) + told
 
 
 # ---------------------------------------------------------------------- lines
