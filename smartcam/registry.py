@@ -143,21 +143,33 @@ def _distribution(point: EntryPoint) -> str:
 
 def _points(group: str) -> Iterator[EntryPoint]:
     """Yield the entry points of a group; of a distribution that is there twice, the first's."""
+    found = [(one, _said(one)) for one in _distributions()]
+    if not any(said is None or group in said for _, said in found):
+        return  # as it mostly is; names are the slow part
     seen: set[str] = set()
-    for found in _distributions():
+    for one, said in found:
         try:
-            name = _key(found)
-            points = [] if name in seen else list(found.entry_points.select(group=group))
-            seen.add(name or str(id(found)))
+            name = _key(one)
+            wanted = name not in seen and (said is None or group in said)
+            points = list(one.entry_points.select(group=group)) if wanted else []
+            seen.add(name or str(id(one)))
         except Exception as exc:  # noqa: BLE001 - anything may stand in other people's files
             _log.warning(
                 "%s: the entry points of %s cannot be read, they are left out: %r",
                 group,
-                getattr(found, "_path", None) or "a distribution",
+                getattr(one, "_path", None) or "a distribution",
                 exc,
             )
         else:
             yield from points
+
+
+def _said(found: Distribution) -> str | None:
+    """Return the text of a distribution's entry points, None where it cannot be told like this."""
+    try:
+        return found.read_text("entry_points.txt") or ""
+    except Exception:  # noqa: BLE001 - anything may stand in other people's files
+        return None
 
 
 def _distributions() -> Iterator[Distribution]:

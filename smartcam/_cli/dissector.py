@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import click
 
 from smartcam._cli.options import naming, option, runs
-from smartcam._dissector import lua_source
 
 if TYPE_CHECKING:
     from smartcam._cli.options import Options
@@ -24,12 +23,14 @@ async def dissector(output: str | None, options: Options) -> None:
     Put it into Wireshark's folder for personal Lua plugins, or use it once with
     -X lua_script:FILE.
     """
+    from smartcam._dissector import lua_source
+
     if output is None:
         click.echo(lua_source(), nl=False)
     else:
-        _write(Path(output))
+        _write(Path(output), lua_source())
 
 
-def _write(path: Path) -> None:
+def _write(path: Path, text: str) -> None:
     with naming(f"--output {path}"):
-        path.write_text(lua_source(), encoding="ascii")
+        path.write_text(text, encoding="ascii")

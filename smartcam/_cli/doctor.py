@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import aclosing
+from typing import TYPE_CHECKING
 
 import click
 
@@ -10,8 +11,9 @@ from smartcam._cli.options import CAMERA, CONNECTS, Options, option, runs
 from smartcam._cli.probe import frame_text
 from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import table_text
-from smartcam.doctor import Finding, examine
-from smartcam.doctor._findings import summary
+
+if TYPE_CHECKING:
+    from smartcam.doctor import Finding
 
 MAX_BROKEN = 4
 """Lines of broken bytes below a finding."""
@@ -39,6 +41,9 @@ MAX_BROKEN = 4
 @runs(*CAMERA)
 async def doctor(url: str, trigger: bool, options: Options) -> None:
     """Print what an examination finds, as it finds it; end with the exit code of the worst."""
+    from smartcam.doctor import examine
+    from smartcam.doctor._findings import summary
+
     findings: list[Finding] = []
     with options.tracing(url) as trace:
         examination = examine(

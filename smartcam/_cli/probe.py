@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from smartcam._cli.options import CAMERA, CONNECTS, Options, runs
-from smartcam.doctor._probing import trials
 from smartcam.exceptions import ConnectFailedError
-from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from smartcam.doctor._probing import CameraAnswer, Trial
@@ -32,6 +30,9 @@ async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
 
     Raises ConnectFailedError: none answered; names each try.
     """
+    from smartcam.doctor._probing import trials
+    from smartcam.settings import parse_address
+
     address = parse_address(host_or_url)
     answers: list[CameraAnswer] = []
     failed: list[str] = []

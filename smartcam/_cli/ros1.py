@@ -12,7 +12,6 @@ import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam.exceptions import ConfigurationError
-from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -48,6 +47,8 @@ async def ros1(place: str, bridge: str, namespace: str | None, options: Options)
     def tell(node: RosbridgeNode) -> None:
         if node.full_name in begun:
             _tell(node, bridge, options)
+
+    from smartcam.settings import is_fleet
 
     has = _of_fleet if is_fleet(place) else _served
     async with has(place, bridge, namespace, tell) as ros:

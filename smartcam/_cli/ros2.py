@@ -7,11 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from pydantic import ValidationError
 
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam.exceptions import ConfigurationError
-from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from smartcam.fleet._ros_file import RosSection
@@ -47,6 +45,8 @@ async def ros2(
     """Have cameras seen in ROS 2."""
     said = {"domain": domain, "namespace": namespace, "distribution": distribution}
     given: dict[str, object] = {name: value for name, value in said.items() if value is not None}
+    from smartcam.settings import is_fleet
+
     if is_fleet(place):
         await _of_fleet(place, given, options)
     else:
@@ -81,6 +81,8 @@ async def _of_fleet(url: str, given: dict[str, object], options: Options) -> Non
 
 
 def _section(given: dict[str, object]) -> RosSection:
+    from pydantic import ValidationError
+
     from smartcam.fleet._ros_file import RosSection
 
     try:

@@ -89,6 +89,9 @@ StatusWord = Annotated[Status, Wire.WORD]
 class Message:
     """Base of all messages.
 
+    One without fields of its own is what its base makes of it, and no dataclass by itself: making
+    one takes as long as importing a module.
+
     Attributes:
         sender: who may send it.
     """
@@ -96,7 +99,6 @@ class Message:
     sender: ClassVar[Sender]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Request(Message):
     """A message from client to camera.
 
@@ -105,14 +107,15 @@ class Request(Message):
             never does.
     """
 
+    __slots__ = ()
     sender: ClassVar[Sender] = Sender.CLIENT
     answer: ClassVar[type[Message] | None] = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Report(Message):
     """A message from camera to client: an answer, or sent by itself."""
 
+    __slots__ = ()
     sender: ClassVar[Sender] = Sender.CAMERA
 
 
@@ -134,9 +137,10 @@ class ConnectAnswer(Acknowledgement):
     version: Word
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DisconnectAnswer(Acknowledgement):
     """The session is over."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,34 +201,40 @@ class SwitchAnswer(Acknowledgement):
     application: Word
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerAnswer(Acknowledgement):
     """The trigger was understood; not whether an inspection began."""
 
+    __slots__ = ()
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
 class SetClockAnswer(Acknowledgement):
     """The clock is set, or why not."""
 
+    __slots__ = ()
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
 class SetInputAnswer(Acknowledgement):
     """The input data (BVS ID: the reference value) is taken, or why not."""
 
+    __slots__ = ()
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
 class ResetErrorsAnswer(Acknowledgement):
     """The error bits are reset; a status follows."""
 
+    __slots__ = ()
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
 class StartAnswer(Acknowledgement):
     """Run mode is entered, or why not."""
 
+    __slots__ = ()
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
 class StopAnswer(Acknowledgement):
     """Run mode is left, or why not."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -246,36 +256,37 @@ class ClockAnswer(Acknowledgement):
     second: Word
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Connect(Request):
     """Start a session; the answer and a status follow."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = ConnectAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Disconnect(Request):
     """End the session: neither results nor status after it."""
 
+    __slots__ = ()
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+
 class GetStatus(Request):
     """Ask for the status."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = StatusReport
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ResetErrors(Request):
     """Clear the error bits that stay set until then; a status follows the answer."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = ResetErrorsAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Query(Request):
     """Ask for the active application."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = QueryAnswer
 
 
@@ -297,17 +308,17 @@ class LoadFile(Request):
     name: Data
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReadImage(Request):
     """Ask for the last picture."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = Image
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GetClock(Request):
     """Ask for the clock."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = ClockAnswer
 
 
@@ -344,30 +355,31 @@ class SetSequenceNumber(Request):
     number: UInt32
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Trigger(Request):
     """Run a triggered application once."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = TriggerAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Start(Request):
     """Enter run mode."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = StartAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Stop(Request):
     """Leave run mode."""
 
+    __slots__ = ()
     answer: ClassVar[type[Message] | None] = StopAnswer
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Reboot(Request):
     """Restart the camera. The manual's name is "Trigger reset"; it clears no trigger."""
+
+    __slots__ = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

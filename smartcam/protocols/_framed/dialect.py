@@ -10,6 +10,7 @@ import dataclasses
 import struct
 import sys
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from smartcam.exceptions import (
@@ -307,36 +308,42 @@ class FramedDialect(Dialect):
     codes: Mapping[int, CodeMeaning] = field(default_factory=lambda: SWITCH_CODES)
     status_by_itself: bool = True
     wire_quirks: Mapping[str, WireQuirk] = field(default_factory=dict[str, WireQuirk])
-    _encoders: dict[type[Message], Codec] = field(
-        init=False, repr=False, default_factory=dict[type[Message], Codec]
-    )
-    _decoders: dict[Sender, dict[int, Codec]] = field(
-        init=False, repr=False, default_factory=lambda: {sender: {} for sender in Sender}
-    )
-    _answers: dict[int, int | None] = field(
-        init=False, repr=False, default_factory=dict[int, int | None]
-    )
-    # of the messages that have no body: whole frame, id, id of the answer
-    constant: dict[type[Message], tuple[bytes, int, int | None]] = field(
-        init=False, repr=False, default_factory=dict[type[Message], Any]
-    )
-    _variants: dict[tuple[str, ...], FramedDialect] = field(
-        init=False, repr=False, default_factory=dict[tuple[str, ...], Any]
-    )
 
-    def __post_init__(self) -> None:
+    # made at their first use, which most dialects of a protocol never see
+
+    @cached_property
+    def _encoders(self) -> dict[type[Message], Codec]:
+        return {row.type: Codec(row, self) for row in self.table}
+
+    @cached_property
+    def _decoders(self) -> dict[Sender, dict[int, Codec]]:
+        found: dict[Sender, dict[int, Codec]] = {sender: {} for sender in Sender}
         for row in self.table:
-            codec = Codec(row, self)
-            self._encoders[row.type] = codec
-            self._decoders[row.type.sender][row.message_id] = codec
+            found[row.type.sender][row.message_id] = self._encoders[row.type]
+        return found
+
+    @cached_property
+    def _answers(self) -> dict[int, int | None]:
+        found: dict[int, int | None] = {}
         for row in self.table:
             if issubclass(row.type, Request):
                 answer = self._encoders.get(row.type.answer) if row.type.answer else None
-                self._answers[row.message_id] = None if answer is None else answer.message_id
+                found[row.message_id] = None if answer is None else answer.message_id
+        return found
+
+    @cached_property
+    def constant(self) -> dict[type[Message], tuple[bytes, int, int | None]]:
+        """Of the messages that have no body: whole frame, id, id of the answer."""
+        found: dict[type[Message], tuple[bytes, int, int | None]] = {}
         for row in self.table:
             if not row.fields:
-                frame = self.encode(row.type())
-                self.constant[row.type] = frame, row.message_id, self.answer_id(row.message_id)
+                frame = self.encode_frame(self.to_frame(row.type()))
+                found[row.type] = frame, row.message_id, self.answer_id(row.message_id)
+        return found
+
+    @cached_property
+    def _variants(self) -> dict[tuple[str, ...], FramedDialect]:
+        return {}
 
     def with_quirks(self, names: Iterable[str]) -> FramedDialect:
         """Return the dialect with these deviations, always the same one for the same names.
@@ -364,7 +371,7 @@ class FramedDialect(Dialect):
                 codes=codes[0] if codes else self.codes,
                 quirks=key,
             )
-            object.__setattr__(variant, "_variants", self._variants)  # one for all of them
+            vars(variant)["_variants"] = self._variants  # one for all of them
         return variant
 
     @property
