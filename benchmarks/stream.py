@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import smartcam
+from benchmarks.cores import placed
 from benchmarks.instructions import count_sides
 from benchmarks.measure import Comparison, Goal, Plan, instructions_of
 from benchmarks.peers import peer, wire
@@ -58,6 +59,11 @@ of them was worked off by itself."""
 
 def run(plan: Plan) -> Iterable[Comparison]:
     """Measure item by item, in batches, observed, and between statuses."""
+    with placed(apart=False):
+        yield from _results(plan)
+
+
+def _results(plan: Plan) -> Iterable[Comparison]:
     with peer("stream") as port:
         ports = dict.fromkeys((ITEMS, BATCHES, OBSERVED, BARE, READER), port)
         counts = count_sides(plan, "stream", ports, COUNTED)
