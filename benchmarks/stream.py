@@ -52,7 +52,7 @@ CASES: tuple[tuple[str, str, str, How, Goal | None], ...] = (
 )
 """Side, what it is, its yardstick, how they are compared, the goal."""
 
-BETWEEN = 13.0
+BETWEEN = 10.0
 """Times the bare protocol, for a result between two statuses: half of what it was when each frame
 of them was worked off by itself."""
 
