@@ -15,7 +15,9 @@ from functools import partial
 from itertools import cycle, islice
 from typing import TYPE_CHECKING, NamedTuple
 
+from benchmarks.cores import placed
 from benchmarks.instructions import counted, difference
+from benchmarks.malloc import UNSETTLED
 from benchmarks.measure import Comparison, Cost, Goal, Plan, Series, instructions_of, take_turns
 from benchmarks.peers import peer, wire
 from benchmarks.peers.canned import HELLO, RUN, SPARE_FILES
@@ -37,9 +39,10 @@ CAMERAS = 100, 1000
 IDLE = 0.5
 """Seconds of each look at cameras that do nothing."""
 
-EMULATOR, CANNED = "emulator", "canned, asyncio"
+EMULATOR, CANNED, SETTLED = "emulator", "canned, asyncio", "emulator, settled"
 
 ONE, MANY = Goal("at most", 60, "us"), Goal("at most", 70, "us")
+"""Of a trigger at one camera and at many, in a process whose allocator has not settled."""
 
 
 class Case(NamedTuple):
@@ -51,7 +54,7 @@ class Case(NamedTuple):
         source: where the values come from: ``constant`` or ``generator``.
         triggers: in a round of each side.
         note: what the reader needs to know.
-        most: of a trigger's CPU time, where there is a goal; then instructions are counted, too.
+        most: of a trigger's CPU time, where there is a goal; then more is looked at.
     """
 
     title: str
@@ -89,7 +92,12 @@ CASES = (
 
 
 def run(plan: Plan) -> Iterable[Comparison]:
-    """Measure one camera, and 100 and 1,000 in one process."""
+    """Measure one camera, and many in one process; who triggers has the same core."""
+    with placed(apart=False):
+        yield from _cases(plan)
+
+
+def _cases(plan: Plan) -> Iterable[Comparison]:
     for case in CASES:
         with (
             _serving(EMULATOR, 1, case.processing_time, case.source) as subject,
@@ -98,24 +106,43 @@ def run(plan: Plan) -> Iterable[Comparison]:
             series = _triggers(plan, subject, yardstick, case.triggers)
         title = f"one camera, triggers, 5 localizations, {case.title}"
         counts = _count(plan, 1, COUNTED) if case.most else {}
-        yield from _compared(title, series, counts, case.most, case.note)
+        yield _compared(title, series, counts, case.note)
+        if case.most is not None:
+            yield _unsettled(plan, 1, title, case.most)
     for cameras in CAMERAS[:1] if plan.quick else CAMERAS:
         yield from _many(plan, cameras)
 
 
 def _compared(
-    title: str,
-    series: dict[str, Series],
-    counts: dict[str, float],
-    most: Goal | None,
-    note: str,
-) -> Iterable[Comparison]:
-    """Compare with the yardstick, and, where there is one, with what a trigger may cost at most."""
-    sides = series[EMULATOR], series[CANNED]
+    title: str, series: dict[str, Series], counts: dict[str, float], note: str
+) -> Comparison:
     counted = instructions_of(counts, EMULATOR, CANNED)
-    yield Comparison("emulator", title, *sides, "speed", None, note, counted)
-    if most is not None:
-        yield Comparison("emulator", f"{title}, CPU", *sides, "alone", most)
+    sides = series[EMULATOR], series[CANNED]
+    return Comparison("emulator", title, *sides, "speed", None, note, counted)
+
+
+def _unsettled(plan: Plan, cameras: int, title: str, most: Goal) -> Comparison:
+    """Measure emulators in a process that maps and unmaps each large block."""
+    under = ("env", *(f"{name}={value}" for name, value in UNSETTLED.items()))
+    with (
+        _serving(EMULATOR, cameras, under=under) as subject,
+        _serving(EMULATOR, cameras) as yardstick,
+    ):
+        count = plan.operations(TRIGGERS, least=20)
+        sides = {
+            EMULATOR: lambda: subject.trigger(count),
+            SETTLED: lambda: yardstick.trigger(count),
+        }
+        series = take_turns(plan, sides)
+    return Comparison(
+        "emulator",
+        f"{title}, allocator not settled",
+        series[EMULATOR],
+        series[SETTLED],
+        "alone",
+        most,
+        "CPU time; the process maps and unmaps each block of 128 KiB or more",
+    )
 
 
 def _many(plan: Plan, full: int) -> Iterable[Comparison]:
@@ -139,7 +166,9 @@ def _many(plan: Plan, full: int) -> Iterable[Comparison]:
     case = f"{count} cameras in one process"
     most = MANY if full == CAMERAS[0] else None
     counts = _count(plan, count, 2 * count) if most else {}
-    yield from _compared(f"{case}, triggers in turn", series, counts, most, fewer)
+    yield _compared(f"{case}, triggers in turn", series, counts, fewer)
+    if most is not None:
+        yield _unsettled(plan, count, f"{case}, triggers in turn", most)
     yield Comparison(
         "emulator",
         f"{case}, memory of one with its client",

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks import sides
+from benchmarks import cores, sides
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -69,7 +69,7 @@ SAME = ("env", "PYTHONHASHSEED=0")
 
 def difference(total: Callable[[int], int], operations: int) -> float:
     """Return what one of N operations takes, from what N and 2 N take; both at the same time."""
-    with ThreadPoolExecutor(2) as pool:
+    with cores.free(), ThreadPoolExecutor(2) as pool:
         once, twice = pool.map(total, (operations, 2 * operations))
     return (twice - once) / operations
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from benchmarks.measure import Plan
 
-__all__ = ["run"]
+__all__ = ["merged", "middle", "run"]
 
 
 def run(plan: Plan, name: str) -> Iterator[Comparison | Curve]:
@@ -38,9 +38,9 @@ def run(plan: Plan, name: str) -> Iterator[Comparison | Curve]:
         _child(plan, name, instructions=plan.instructions and not n) for n in range(plan.processes)
     ]
     for alike in zip(*(one["comparisons"] for one in found), strict=True):
-        yield _merged([comparison(one) for one in alike])
+        yield merged([comparison(one) for one in alike])
     for curves in zip(*(one["curves"] for one in found), strict=True):
-        yield _middle([Curve(**one) for one in curves])
+        yield middle([Curve(**one) for one in curves])
 
 
 def _child(plan: Plan, name: str, *, instructions: bool) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def _child(plan: Plan, name: str, *, instructions: bool) -> dict[str, Any]:
         return figures
 
 
-def _merged(alike: Sequence[Comparison]) -> Comparison:
+def merged(alike: Sequence[Comparison]) -> Comparison:
     """Return one comparison whose figures are the medians of each process."""
     first = alike[0]
     assert all(one.case == first.case for one in alike)
@@ -73,7 +73,7 @@ def _medians(alike: Sequence[Series]) -> Series:
     return Series(alike[0].name, alike[0].unit, [one.median for one in alike])
 
 
-def _middle(alike: Sequence[Curve]) -> Curve:
+def middle(alike: Sequence[Curve]) -> Curve:
     """Return the curve through the medians."""
     lines = {
         name: [

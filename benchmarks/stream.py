@@ -13,6 +13,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
 import smartcam
+from benchmarks.cores import placed
 from benchmarks.instructions import count_sides
 from benchmarks.measure import Comparison, Goal, Plan, instructions_of
 from benchmarks.peers import peer, wire
@@ -51,13 +52,18 @@ CASES: tuple[tuple[str, str, str, How, Goal | None], ...] = (
 )
 """Side, what it is, its yardstick, how they are compared, the goal."""
 
-BETWEEN = 13.0
+BETWEEN = 10.0
 """Times the bare protocol, for a result between two statuses: half of what it was when each frame
 of them was worked off by itself."""
 
 
 def run(plan: Plan) -> Iterable[Comparison]:
     """Measure item by item, in batches, observed, and between statuses."""
+    with placed(apart=False):
+        yield from _results(plan)
+
+
+def _results(plan: Plan) -> Iterable[Comparison]:
     with peer("stream") as port:
         ports = dict.fromkeys((ITEMS, BATCHES, OBSERVED, BARE, READER), port)
         counts = count_sides(plan, "stream", ports, COUNTED)

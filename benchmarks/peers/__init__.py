@@ -11,6 +11,8 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
+from benchmarks.cores import for_peers
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
@@ -30,7 +32,8 @@ def peer(module: str, *arguments: str, under: Sequence[str] = ()) -> Iterator[in
         under: a command that runs it and has something to say when it ends.
     """
     command = [*under, sys.executable, "-m", f"benchmarks.peers.{module}", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    with for_peers():
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
