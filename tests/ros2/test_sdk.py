@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from smartcam.exceptions import ServiceCallError
 from smartcam.ros2 import Node, QoS
 from smartcam.ros2._qos import LATCHED
 from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, free_place, soon, until
@@ -131,5 +132,12 @@ async def test_calls_both_ways(tmp_path: Path) -> None:
 
         await partner("serve", service="/theirs")
         calls = node.client("/theirs", SET_BOOL)
-        reply = await soon(calls.call(data=True, timeout=PATIENCE))
+        async with asyncio.timeout(PATIENCE):
+            while True:
+                try:
+                    reply = await calls.call(data=True, timeout=PATIENCE)
+                except ServiceCallError:  # it is seen before it answers
+                    await asyncio.sleep(0.1)
+                else:
+                    break
         assert (reply.success, reply.message) == (True, "was True")
