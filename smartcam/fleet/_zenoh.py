@@ -171,7 +171,8 @@ class ZenohEnd(ZenohSession, Bus):
         session = self._session
         if session is None:
             return False
-        return bool(self._link.listen or session.info.routers_zid())
+        # links, for the engine tells that all are gone before it forgets the router that was lost
+        return bool(self._link.listen or session.info.links())
 
     # ------------------------------------------------------------------ what is said
 

@@ -119,7 +119,8 @@ class PairWatch:
         if any(one.host == HUB for one in happening):
             hit = any(one.fault.network and one.host in PAIR for one in happening)
             return ROUTER_AND_MORE if hit else 0
-        return sum(one.fault.moves for one in happening if one.host == self._holders[camera])
+        mine = [one for one in happening if one.host == self._holders[camera]]
+        return sum(one.fault.moves for one in mine if one.gone is not None)
 
     def judge(self, told: Told) -> None:
         """Nobody takes what the other one can keep, nobody flaps, and programs are told of it.

@@ -128,6 +128,7 @@ def test_it_is_known_when_one_takes_over(
         (2, [KILLED], [1], 1, "may be 0 times"),
         (1, [SPLIT], [2, 1, 2], 1, ""),
         (1, [SPLIT], [2, 1, 2, 1, 2], 1, "may be 4 times"),
+        (1, [Happening("cable cut", 1, 1.0)], [2], 1, "may be 0 times"),  # less than the lease
         (1, [AWAY], [2], 1, "may be 0 times"),
         (1, [AWAY, Happening("5 % of packets lost", 1, 5.0)], [2], 1, ""),
         (1, [Happening("program stopped", 1, 5.0)], [2], 1, "may be 0 times"),

@@ -1,0 +1,48 @@
+"""Whether an end is on the bus is known before it is told that the others are gone."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+pytest.importorskip("zenoh")
+
+from smartcam._zenoh import BusLink, with_ports
+from smartcam.fleet._keys import Keys
+from smartcam.fleet._zenoh import ZenohEnd
+from tests.fleet.fleetkit import FLEET, PATIENCE, until
+
+pytestmark = pytest.mark.real_time
+
+MANY = 300
+"""Cameras of an agent: the engine tells one after the other that they are gone."""
+
+
+async def test_router_that_is_gone_is_known_before_its_agents_are() -> None:
+    keys = Keys(FLEET)
+    places = with_ports(["tcp/127.0.0.1:0"])
+    router, end = ZenohEnd(BusLink(listen=places)), ZenohEnd(BusLink(connect=places))
+    await router.open(PATIENCE)
+    try:
+        await end.open(PATIENCE)
+        there: set[str] = set()
+        reached: list[bool] = []
+
+        def see(key: str, present: bool) -> None:
+            if present:
+                there.add(key)
+            else:
+                reached.append(end.reached)
+
+        end.watch(keys.camera("*", "**"), see)
+        for number in range(MANY):
+            router.be_present(keys.camera("north", f"cam{number}"))
+        await until(lambda: len(there) == MANY)
+        assert end.reached
+        await asyncio.to_thread(router.session.close)  # all at once, as where it is killed
+        await until(lambda: len(reached) == MANY)
+        assert not any(reached)
+    finally:
+        await end.close()
+        await router.close()
