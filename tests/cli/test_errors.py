@@ -102,7 +102,7 @@ def test_status_silent_udp_peer_exits_3() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
         silent.bind(("127.0.0.1", 0))
         url = f"bvs+udp://127.0.0.1:{silent.getsockname()[1]}"
-        outcome = run_as_far_as("silence", "status", url)
+        outcome = run_as_far_as("nothing comes back", "status", url)
     outcome.failed(3, "nothing comes back from", "set to UDP, not to TCP")
 
 
