@@ -125,7 +125,11 @@ def test_a_side_and_its_peer_have_one_core_or_two() -> None:
         assert os.sched_getaffinity(0) == before
 
 
-def test_the_yardstick_of_a_start_imports_what_it_needs_and_nothing_of_ours() -> None:
+def test_the_yardstick_of_a_start_imports_what_it_needs_and_nothing_of_ours(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in [one for one in os.environ if one.startswith("COV")]:
+        monkeypatch.delenv(name)  # whoever counts lines has imported some of it before
     code = imports_of("import json.tool, smartcam")
     assert "__import__('json.decoder')" in code
     assert "smartcam" not in code

@@ -30,7 +30,7 @@ class ProactorLike(asyncio.SelectorEventLoop):
     def _has_not(self, *_: object, **__: object) -> NoReturn:
         raise NotImplementedError
 
-    def _sock_read_done(self, fd: int, *_: object) -> None:
+    def _sock_read_done(self, fd: int, *_: object, **__: object) -> None:
         """Its own way to have accepted, which calls what the other loop has not."""
         self._remove_reader(fd)  # type: ignore[attr-defined]
 
