@@ -30,9 +30,10 @@ class ProactorLike(asyncio.SelectorEventLoop):
     def _has_not(self, *_: object, **__: object) -> NoReturn:
         raise NotImplementedError
 
-    def _sock_read_done(self, fd: int, *_: object, **__: object) -> None:
+    def _sock_read_done(self, fd: int, _: object, handle: asyncio.Handle | None = None) -> None:
         """Its own way to have accepted, which calls what the other loop has not."""
-        self._remove_reader(fd)  # type: ignore[attr-defined]
+        if handle is None or not handle.cancelled():  # by who accepts the next one already
+            self._remove_reader(fd)  # type: ignore[attr-defined]
 
     add_reader = remove_reader = add_writer = remove_writer = _has_not  # pyright: ignore[reportAssignmentType]
     add_signal_handler = remove_signal_handler = _has_not  # pyright: ignore[reportAssignmentType]
