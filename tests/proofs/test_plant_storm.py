@@ -36,8 +36,8 @@ async def test_plant_in_a_storm_mixes_up_nothing_and_loses_nothing_unseen(
     assert storm.figures.outcomes["result"] > 50
     assert storm.accounts["taken"] > 150
     assert storm.accounts["missed"] > 0  # of who was stopped for longer than agents remember
-    assert storm.taken_over["agent killed"]
-    assert storm.moves["agent killed"] > 0
+    for name in ("agent killed", "router cut off"):
+        assert len(storm.taken_over[name]) == len(PAIRED)
     assert switch.carried > 1000
     assert switch.lost > 10
 
