@@ -136,7 +136,9 @@ class Site:
             path = self.folder / f"host{site}.yaml"
             path.write_text(self._file(site), encoding="utf-8")
             self.agents[site] = self.part(site, f"agent {site}", "agent", str(path))
-        await asyncio.gather(*(one.come() for one in self.agents.values()))
+        first, *others = self.agents.values()
+        await first.come()  # it has the cameras of the pair
+        await asyncio.gather(*(one.come() for one in others))
         for site in SITES:
             given = (self.url(f"robot{site}"), str(site * TOKENS), str(self.seed))
             self.programs[site] = self.part(site, f"program {site}", "program", *given)

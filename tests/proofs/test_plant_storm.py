@@ -35,6 +35,8 @@ async def test_plant_in_a_storm_mixes_up_nothing_and_loses_nothing_unseen(
     assert {*storm.done} == {one.name for happening in SHORT for one in happening}
     assert storm.figures.outcomes["result"] > 50
     assert storm.accounts["taken"] > 150
+    for name in ("agent killed", "router cut off"):
+        assert len(storm.taken_over[name]) == len(PAIRED)
     assert switch.carried > 1000
     assert switch.lost > 10
 
