@@ -53,7 +53,7 @@ def count_sides(
     def total(side: str, count: int) -> int:
         with counted() as (prefix, read):
             subprocess.run(
-                [*prefix, *sides.command(module, side, ports[side], count)],
+                [*prefix, *sides.command(module, side, ports[side], count), sides.COUNTED],
                 stdout=subprocess.DEVNULL,
                 check=True,
                 timeout=PATIENCE,

@@ -26,7 +26,7 @@ from benchmarks.measure import Cost, cpu_microseconds, take_turns_awaiting
 if TYPE_CHECKING:
     from benchmarks.measure import Plan, Series
 
-__all__ = ["Side", "Work", "alone", "command", "take_sides"]
+__all__ = ["COUNTED", "Side", "Work", "alone", "command", "take_sides"]
 
 Work = Callable[[int], Awaitable[None]]
 """Does so many operations."""
@@ -36,6 +36,15 @@ Side = Callable[[int], AbstractAsyncContextManager[Work]]
 
 WARM_UP = 0.2
 """Operations before those that count, as a share of them."""
+
+COUNTED = "counted"
+"""Last word of the command line where instructions are counted."""
+
+COUNTED_WARM_UP = 20
+"""Operations before those; N and 2 N have the same."""
+
+SLOWER = 50
+"""Times that a process is slower then, about."""
 
 PATIENCE = 120.0
 """Seconds until a process that does not end is an error."""
@@ -60,18 +69,24 @@ async def take_sides(
     """
 
     async def cost(side: Side, port: int) -> Cost:
-        return await _cost(side, port, count) * {"us": 1.0, "ms": 1e-3}[unit]
+        return (
+            await _cost(side, port, count, round(count * WARM_UP)) * {"us": 1.0, "ms": 1e-3}[unit]
+        )
 
     costs = {name: partial(cost, *place) for name, place in sides.items()}
     return await take_turns_awaiting(plan, costs, unit=unit)
 
 
 async def _cost(
-    side: Side, port: int, count: int, prepare: Callable[[], object] = gc.collect
+    side: Side,
+    port: int,
+    count: int,
+    warm_up: int,
+    prepare: Callable[[], object] = gc.collect,
 ) -> Cost:
     """Return the CPU time of an operation, microseconds; opening and a few before are not in it."""
     async with side(port) as work:
-        await work(max(1, round(count * WARM_UP)))
+        await work(max(1, warm_up))
         prepare()
         begin = time.process_time()
         await work(count)
@@ -110,10 +125,22 @@ def _freeze() -> None:
     gc.freeze()
 
 
-async def main(module: str, side: str, port: str, count: str) -> None:
+def _slow_clock() -> None:
+    """Let the client cut its work as it does at full speed: it goes by the CPU time of a chunk."""
+    from smartcam._client import link
+
+    link.TURN *= SLOWER
+    link.SHARED_TURN *= SLOWER
+
+
+async def main(module: str, side: str, port: str, count: str, how: str = "") -> None:
     """Open a side of a module, and print what an operation costs."""
     sides: Mapping[str, Side] = importlib.import_module(f"benchmarks.{module}").SIDES
-    print(await _cost(sides[side], int(port), int(count), _freeze))
+    warm_up = round(int(count) * WARM_UP)
+    if how == COUNTED:
+        _slow_clock()
+        warm_up = COUNTED_WARM_UP
+    print(await _cost(sides[side], int(port), int(count), warm_up, _freeze))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ __all__ = ["SIDES", "run"]
 RESULTS = 100_000
 """In a round of each side; a tenth of it with statuses."""
 
-COUNTED = 2_000
+COUNTED = 5_000
 """Where instructions are counted."""
 
 LAYOUT = (
