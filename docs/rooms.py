@@ -30,7 +30,16 @@ class Room(NamedTuple):
 
 VALUES = ("models", "exceptions", "settings", "registry", "streams", "observers", "backoff")
 HELPERS = (
-    *("_accepting", "_datagrams", "_html", "_lazy", "_locks", "_loop_thread", "_server", "_suggestions"),
+    *(
+        "_accepting",
+        "_datagrams",
+        "_html",
+        "_lazy",
+        "_locks",
+        "_loop_thread",
+        "_server",
+        "_suggestions",
+    ),
     "_zenoh",
 )
 ROOMS = (

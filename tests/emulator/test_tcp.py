@@ -7,12 +7,13 @@ import contextlib
 import logging
 import socket
 from collections.abc import AsyncIterator
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.emulator._client_link import MAX_INPUT
+from smartcam.emulator._links import LEAST_READ, MOST_READ
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient, until
@@ -408,6 +409,47 @@ async def test_tcp_client_without_a_session_holds_one_frame_at_most(
     client.send(b"!")  # which makes it a whole one
     await emulator.wait_received(0x21)
     assert link.machine.buffered == 0
+
+
+async def test_tcp_more_requests_than_a_read_takes_are_all_answered_in_order(
+    session: TcpClient,
+) -> None:
+    count = 3 * LEAST_READ // len(wire.QUERY)
+    session.send(wire.QUERY * count, wire.GET_CLOCK)
+    await session.expect(wire.ACTIVE_1 * count, wire.CLOCK_0)
+
+
+async def test_tcp_idle_connection_has_a_small_buffer_also_after_a_long_input(
+    emulator: EmulatedCamera, session: TcpClient
+) -> None:
+    (link,) = cast("Any", emulator._listener).links
+    sizes = {len(link._room)}
+    data = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
+    for count in range(1, 4):
+        session.send(data + bytes(MAX_INPUT))
+        await emulator.wait_received(0x21, count=count)
+        sizes.add(len(link._room))
+        await session.expect_nothing_but(wire.GET_CLOCK, wire.CLOCK_0)
+    assert len(link._room) == LEAST_READ
+    assert max(sizes) <= MOST_READ
+
+
+@pytest.mark.parametrize("sizes", [[1], [LEAST_READ - 1, LEAST_READ, LEAST_READ + 1], [5000, 3]])
+async def test_tcp_buffer_gives_what_was_written_into_it(
+    emulator: EmulatedCamera, session: TcpClient, sizes: list[int]
+) -> None:
+    (link,) = cast("Any", emulator._listener).links
+    rest = wire.QUERY * 500
+    while rest:  # as a loop does it: a read fills the buffer as far as there is anything
+        for size in sizes:
+            room = link.get_buffer(-1)
+            assert LEAST_READ <= len(room) <= MOST_READ
+            count = min(size, len(room), len(rest))
+            room[:count], rest = rest[:count], rest[count:]
+            link.buffer_updated(count)
+            if not rest:
+                break
+    await session.expect(wire.ACTIVE_1 * 500)
 
 
 # ---------------------------------------------------------------------- the operator

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError
@@ -315,6 +315,9 @@ def test_image_in_lines_of_a_byte_is_read() -> None:
     assert answer.data == BITMAP
 
 
+@example([b"4D4", b"4D4"], 0, [])
+@example([b"0aFf", b"", b"0aFf"], 0, [])
+@example([b"0aFf", b"0aFf", b"42"], 1, [41, 500])
 @given(
     st.lists(
         st.sampled_from([b"42", b"4D4", b"", b"0aFf", b"4 4D", b"\xff\xff", b"4\n", b"00" * 40])
