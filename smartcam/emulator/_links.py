@@ -59,7 +59,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         self._listener = listener
         self._farewell: asyncio.TimerHandle | None = None
         self._end_waits = False
-        self._room = bytearray(LEAST_READ)
+        self._room = memoryview(bytearray(LEAST_READ))
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
@@ -75,16 +75,16 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             transport.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._owner.arrived(self)
 
-    def get_buffer(self, sizehint: int) -> bytearray:
+    def get_buffer(self, sizehint: int) -> memoryview:
         return self._room
 
     def buffer_updated(self, nbytes: int) -> None:
         room, size = self._room, len(self._room)
-        data = bytes(memoryview(room)[:nbytes])
+        data = bytes(room[:nbytes])
         if nbytes == size < MOST_READ:
-            self._room = bytearray(2 * size)
+            self._room = memoryview(bytearray(2 * size))
         elif nbytes < size > LEAST_READ:
-            self._room = bytearray(LEAST_READ)
+            self._room = memoryview(bytearray(LEAST_READ))
         if self.closed:  # it says farewell
             return
         with self._owner.step():

@@ -253,14 +253,13 @@ def open_link() -> tuple[_TcpLink, Owner]:
     return link, owner
 
 
-def give(link: _TcpLink, data: bytes) -> None:
-    """Have a link receive bytes, as its transport does."""
+def deliver(link: _TcpLink, data: bytes) -> None:
+    """Write bytes into a link's buffer, as a transport does."""
     while data:
-        buffer = link.get_buffer(len(data))
-        count = min(len(buffer), len(data))
-        buffer[:count] = data[:count]
+        room = link.get_buffer(-1)
+        count = min(len(room), len(data))
+        room[:count], data = data[:count], data[count:]
         link.buffer_updated(count)
-        data = data[count:]
 
 
 @given(pieces=st.lists(PIECES, max_size=15), cuts=st.lists(st.integers(1, 30)))
@@ -269,15 +268,15 @@ def test_link_any_bytes_in_any_chunks_give_the_same_messages(
 ) -> None:
     data = wire.CONNECT + b"".join(pieces)
     whole, one = open_link()
-    give(whole, data)
+    deliver(whole, data)
     cut, other = open_link()
     rest = data
     for size in cuts:
         if rest:
-            give(cut, rest[:size])
+            deliver(cut, rest[:size])
         rest = rest[size:]
     if rest:
-        give(cut, rest)
+        deliver(cut, rest)
     assert one.messages == other.messages
     assert one.messages[0] == m.Connect()
     assert whole.machine.buffered == cut.machine.buffered < MAX_INPUT
@@ -287,8 +286,8 @@ def test_link_every_split_point_of_a_conversation() -> None:
     data = wire.CONNECT + wire.SET_CLOCK + b"??" + wire.SWITCH_21 + wire.QUERY
     for at in range(1, len(data)):
         link, owner = open_link()
-        give(link, data[:at])
-        give(link, data[at:])
+        deliver(link, data[:at])
+        deliver(link, data[at:])
         kinds = [type(message) for message in owner.messages]
         assert kinds == [m.Connect, m.SetClock, m.SwitchApplication, m.Query]
 
@@ -300,7 +299,7 @@ def test_link_closed_is_closed_once(times: int) -> None:
         link.close("enough")
     assert link.closed
     assert not link.write(b"?")
-    give(link, wire.CONNECT)
+    deliver(link, wire.CONNECT)
     assert owner.messages == []
 
 
