@@ -11,6 +11,7 @@ import statistics
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Took(NamedTuple):
 def start(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> Took:
     """Run Python with these arguments and without output; return what it took."""
     command = [*PYTHON, *arguments]
-    with open(os.devnull, "wb") as nowhere:  # noqa: PTH123
+    with Path(os.devnull).open("wb") as nowhere:
         begin = time.perf_counter()
         process = os.posix_spawn(
             sys.executable,

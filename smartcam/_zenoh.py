@@ -247,8 +247,6 @@ class ZenohSession:
                         # who is silent is given up after a lease: there may be time for another
                         if loop.time() - begun < 0.9 * min(timeout, LEASE):
                             raise self._failed(_reason(exc)) from exc
-                    else:
-                        return
         except TimeoutError as exc:
             raise self._failed(f"no answer within {timeout:g} s") from exc
 

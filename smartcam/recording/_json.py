@@ -84,15 +84,14 @@ def _object_of(names: tuple[str, ...], texts: tuple[str, ...]) -> str:
 
 
 def _text(value: object) -> str:
-    kind = type(value)
-    if kind is str:
-        return _quoted(value)  # type: ignore[arg-type]
-    if kind is int:
+    if type(value) is str:
+        return _quoted(value)
+    if type(value) is int:
         return repr(value)
     if value is None:
         return NULL
-    if kind is datetime:
-        return _time_text(value)  # type: ignore[arg-type]
+    if type(value) is datetime:
+        return _time_text(value)
     return _value_text(value)
 
 
@@ -126,9 +125,8 @@ def _hex_text(text: str) -> str:
 
 
 def _value_text(value: object) -> str:
-    kind = type(value)
-    if kind is list:
-        text = _parts_text(value)  # type: ignore[arg-type]
+    if type(value) is list:
+        text = _parts_text(value)
         if text is not None:
             return text
     try:

@@ -16,6 +16,8 @@ from smartcam.layout import _compiled as compiled
 from smartcam.layout._codec import RecordCodec
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.layout._text import Field
     from smartcam.models import ByteOrder
 
@@ -48,10 +50,12 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Field, ...]]:
         lambda: resolve(f"table: {TEXT}").layout,
     ],
 )
-def test_layouts_that_are_equal_are_worked_out_once(again: object, made: list[object]) -> None:
+def test_layouts_that_are_equal_are_worked_out_once(
+    again: Callable[[], Layout], made: list[object]
+) -> None:
     first = Layout(TEXT)
     assert len(made) == 4  # head and record, in two byte orders
-    second = again()  # type: ignore[operator]
+    second = again()
     assert second == first
     assert len(made) == 4
 
