@@ -37,7 +37,8 @@ class Fault:
         seconds: how long it may last; one of them, by chance.
         gone: seconds until the host's agent is gone, if it lasts that long; None: it stays.
         moves: how often a camera of the pair may go from one agent to the other by it, where it is
-            the pair's; of one that only stands by none does.
+            the pair's; of one that only stands by none does. Who is cut off and comes back takes
+            the camera, and so does the other one, until they see each other.
         network: it is in the way of who is to take over.
         chance: of being chosen, against 1 of others.
     """
@@ -182,8 +183,8 @@ LATE = partial(cable_bad, what="delay", value=0.2)
 FAULTS: dict[str, Fault] = {
     "agent killed": Fault(agent_killed, (0.0, 1.0, 3.0), 0.0, moves=1, network=True),
     "router killed": Fault(router_killed, (0.5, 3.0), network=True),
-    "cable cut": Fault(cable_cut, (1.0, 10.0), LEASE, moves=2, network=True),
-    "cable cut for a minute": Fault(cable_cut, (60.0,), LEASE, moves=2, network=True, chance=0.1),
+    "cable cut": Fault(cable_cut, (1.0, 10.0), LEASE, moves=4, network=True),
+    "cable cut for a minute": Fault(cable_cut, (60.0,), LEASE, moves=4, network=True, chance=0.1),
     "router cut off": Fault(router_cut_off, (1.0, 12.0), LEASE, moves=4, network=True),
     "5 % of packets lost": Fault(LOST, (5.0, 15.0), network=True),
     "packets 200 ms late": Fault(LATE, (5.0, 15.0), network=True),

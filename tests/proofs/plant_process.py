@@ -130,7 +130,8 @@ async def router(place: str, certificates: str) -> None:
 class Heard:
     """What a program has read of a camera's results."""
 
-    last: int | None = None  # run
+    first: int | None = None  # run
+    last: int | None = None
     number: int = 0  # the agent's
     seen: int = 0
     gaps: list[int] = field(default_factory=list)  # runs that are missing
@@ -141,7 +142,9 @@ class Heard:
         run = result.value.run
         self.seen += 1
         self.number = result.number
-        if self.last is not None:
+        if self.last is None:
+            self.first = run
+        else:
             if run <= self.last:
                 self.again += 1
                 return

@@ -42,6 +42,7 @@ async def test_plant_in_a_storm_mixes_up_nothing_and_loses_nothing_unseen(
 
 
 FINE = {
+    "first": 1,
     "last": 9,
     "number": 9,
     "seen": 6,
@@ -63,6 +64,8 @@ FINE = {
         ({"missed": 0}, 1, ""),  # the greater gap is what a killed agent took with it
         ({"missed": 0, "dropped": 0, "offered": 6}, 1, "lacks results"),
         ({"missed": 3}, 0, "more in its account"),
+        ({"missed": 3, "first": 2, "last": 10}, 0, ""),
+        ({"missed": 4, "first": 2, "last": 10}, 0, "more in its account"),
         ({"again": 1}, 0, "once more"),
         ({"dropped": 2}, 0, "balance"),
         ({"taken": 7, "offered": 8}, 0, "took"),
