@@ -27,13 +27,16 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._json import frame_text, object_text, result_text
+from smartcam.recording._json import frame_text, object_text, result_text, with_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-FORMAT = "1"
-"""Version of the form; a reader refuses another one."""
+FORMAT = "2"
+"""Version of the form that is written."""
+
+FORMATS = ("1", FORMAT)
+"""Those that are read; another one is refused. In 1 a frame's body repeats the frame's end."""
 
 PROFILE = "x-smartcam"
 """Profile in the file's header."""
@@ -293,13 +296,17 @@ def _frame(fields: dict[str, Any]) -> TraceEntry:
     if direction not in {">", "<", "!"}:
         raise ValueError(f"direction: {direction!r:.60} came, expected >, < or !")
     bytes.fromhex(data)
+    body = cast("dict[str, Any] | None", _optional(fields, "fields", dict))
+    data_from = _optional(fields, "data_from", int)
+    if data_from is not None:
+        body = with_data(body, data, data_from)
     return TraceEntry(
         _when_of(fields, "at"),
         _camera_name(fields),
         direction,
         _optional(fields, "message_id", int),
         _get(fields, "message", str),
-        cast("dict[str, Any] | None", _optional(fields, "fields", dict)),
+        body,
         data,
     )
 
@@ -399,6 +406,7 @@ KINDS: dict[str, Kind] = {
             "message": _text("name of the message, or what is wrong with the bytes"),
             "fields": {"type": "object", "properties": {}, "description": "the decoded body"},
             "hex": _text("the bytes"),
+            "data_from": _integer("at which of the bytes data begins, which fields has not"),
         },
         ("at", "camera", "direction", "message", "hex"),
         frame_text,

@@ -1,7 +1,8 @@
 """Frames and results as JSON, put together: they are nearly all that is in a recording.
 
 The text is that of ``json.dumps(jsonable(item))`` without white space and without what is None,
-character for character. What is not of the types that a client makes goes that way itself.
+character for character, but that a frame's bytes are in it once (:func:`frame_text`). What is not
+of the types that a client makes goes that way itself.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from smartcam.models import (
 from smartcam.observers import TraceEntry
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
 LONG = 1024
 """Characters of a text from which on it pays to look whether it is nothing but hex, which needs no
@@ -44,7 +45,7 @@ _quoted: Callable[[str], str] = encode_basestring_ascii
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 _encode_finite = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 
-_FRAME = tuple(f'"{name}":' for name in TraceEntry._fields)
+_FRAME = tuple(f'"{name}":' for name in (*TraceEntry._fields, "data_from"))
 _RESULT = tuple(f'"{name}":' for name in Result._fields)
 
 _HEADER = '{"seq":%s,"stamp":%s,"frame_id":%s}'
@@ -60,14 +61,37 @@ def object_text(fields: dict[str, Any]) -> str:
 
 
 def frame_text(entry: TraceEntry) -> str:
-    """Return a frame's text."""
+    """Return a frame's text.
+
+    A body's ``data`` that is the end of the frame is not written a second time: ``data_from`` says
+    at which of the frame's bytes it begins (:func:`with_data`).
+    """
     at, camera, direction, message_id, message, fields, data = entry
+    data_from = None
+    if type(fields) is dict and type(data) is str:
+        end = fields.get("data")
+        if type(end) is str and end and data.endswith(end) and len(data) % 2 == len(end) % 2 == 0:
+            data_from = (len(data) - len(end)) // 2
+            fields = {name: value for name, value in fields.items() if name != "data"}
     texts = (
         *(_text(at), _text(camera), _text(direction), _text(message_id), _text(message)),
-        _fields_text(fields, data) if type(fields) is dict else _text(fields),
+        _text(fields),
         _hex_text(data) if type(data) is str else _text(data),
+        _text(data_from),
     )
     return _object_of(_FRAME, texts)
+
+
+def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[str, Any]:
+    """Return a body with its ``data`` again, which begins at that byte of the frame.
+
+    Raises:
+        ValueError: the frame has no such byte.
+    """
+    end = data[2 * data_from :]
+    if data_from < 0 or not end:
+        raise ValueError(f"data_from: {data_from} came, expected a byte of {len(data) // 2}")
+    return {**(fields or {}), "data": end}
 
 
 def result_text(result: Result[Any]) -> str:
@@ -105,17 +129,6 @@ def _time_text(at: datetime) -> str:
         text = f'"{at.isoformat()}"'
         _latest[0] = at, text
     return text
-
-
-def _fields_text(fields: Mapping[str, Any], data: str) -> str:
-    """Return a frame's fields; ``data``: all of its bytes, as hex."""
-    texts: list[str] = []
-    for name, value in fields.items():
-        # the container is the end of its frame, which is looked through by itself
-        same = type(value) is str and len(value) > LONG and data.endswith(value)
-        text = _hex_text(value) if same else _text(value)
-        texts.append(f"{_quoted(str(name))}:{text}")
-    return f"{{{','.join(texts)}}}"
 
 
 def _hex_text(text: str) -> str:

@@ -20,7 +20,7 @@ from smartcam.recording._form import (
     CAMERA_METADATA,
     EPOCH,
     FILE_METADATA,
-    FORMAT,
+    FORMATS,
     KINDS,
     MAX_CAMERAS,
     RecordedError,
@@ -449,11 +449,11 @@ class _Scan:
             raise ConfigurationError(f"recording {self.path}: this is no MCAP file: {came}")
 
     def _check_format(self) -> None:
-        came = self.file_facts.get("format")
-        if came != FORMAT:
+        came, version = self.file_facts.get("format"), self.file_facts.get("version")
+        if came not in FORMATS:
             raise ConfigurationError(
                 f"recording {self.path}: its form is {came}, this version of smartcam reads "
-                f"{FORMAT}; it was written by smartcam {self.file_facts.get('version')}"
+                f"{' and '.join(FORMATS)}; it was written by smartcam {version}"
             )
 
     def _check_ours(self, schemas: dict[int, str]) -> None:

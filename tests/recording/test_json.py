@@ -29,7 +29,7 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._form import message_of, nanoseconds
+from smartcam.recording._form import KINDS, message_fields, message_of, nanoseconds
 from smartcam.recording._json import LONG
 from tests.recording.recordingkit import at
 
@@ -175,7 +175,32 @@ def test_frame_is_written_as_the_slow_way_writes_it(
     message_id: int | None, message: str, fields: dict[str, Any] | None, data: str
 ) -> None:
     entry = TraceEntry(at(0), "left", "<", message_id, message, fields, data)
-    assert message_of("frames", entry) == plainly(entry)
+    written = message_of("frames", entry)
+    if b'"data_from":' not in written:
+        assert written == plainly(entry)
+        return
+    came = json.loads(written)
+    came["fields"]["data"] = data[2 * came.pop("data_from") :]
+    assert came == json.loads(plainly(entry))
+
+
+@given(st.binary(max_size=40), st.binary(max_size=40), st.none() | st.integers())
+def test_data_of_a_frame_is_written_once_and_read_again(
+    head: bytes, data: bytes, application: int | None
+) -> None:
+    fields: dict[str, Any] = {"application": application, "data": data.hex()}
+    entry = TraceEntry(at(0), "left", "<", 32, "ResultContainer", fields, (head + data).hex())
+    written = message_of("frames", entry)
+    assert (b'"data":' in written) == (not data)
+    assert KINDS["frames"].from_json(message_fields(written)) == entry
+
+
+@pytest.mark.parametrize("data_from", [-1, 2, 3, 1 << 40])
+def test_data_of_a_frame_begins_within_it(data_from: int) -> None:
+    entry = TraceEntry(at(0), "left", "<", 32, "ResultContainer", None, "aabb")
+    fields = {**message_fields(message_of("frames", entry)), "data_from": data_from}
+    with pytest.raises(ValueError, match=r"data_from: .* expected a byte of 2"):
+        KINDS["frames"].from_json(fields)
 
 
 @given(st.datetimes(timezones=st.just(UTC)) | st.just(at(0).astimezone(timezone(timedelta(1 / 3)))))

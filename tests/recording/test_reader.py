@@ -12,8 +12,8 @@ from mcap.writer import Writer
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
 from smartcam.recording import load_recording
-from smartcam.recording._form import FORMAT
-from tests.recording.recordingkit import COUNTER, frame, record, session, write
+from smartcam.recording._form import FORMAT, FORMATS
+from tests.recording.recordingkit import COUNTER, at, frame, record, session, write
 
 
 async def test_load_recording_gives_what_was_recorded(tmp_path: Path) -> None:
@@ -142,6 +142,27 @@ def test_load_recording_of_another_form_is_refused(tmp_path: Path) -> None:
         ConfigurationError, match=r"its form is 9, this version .* by smartcam 8\.0"
     ):
         load_recording(path)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_load_recording_of_either_form(tmp_path: Path, form: str) -> None:
+    path = tmp_path / "run.mcap"
+    said: dict[str, Any] = {"at": at(0).isoformat(), "camera": "left", "direction": "<"}
+    said |= {"message": "ResultContainer", "hex": "0102aabb", "fields": {"application": 5}}
+    if form == "1":
+        said["fields"]["data"] = "aabb"
+    else:
+        said["data_from"] = 2
+    with path.open("wb") as stream:
+        writer: Any = Writer(stream)
+        writer.start()
+        writer.add_metadata("smartcam", {"format": form})
+        schema = writer.register_schema("smartcam.Frame", "jsonschema", json.dumps({}).encode())
+        channel = writer.register_channel("/left/frames", "json", schema)
+        writer.add_message(channel, 0, json.dumps(said).encode(), 0)
+        writer.finish()
+    (entry,) = load_recording(path).frames()
+    assert entry.fields == {"application": 5, "data": "aabb"}
 
 
 def test_load_recording_other_topics_are_left_alone(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ async def test_recorder_header_and_metadata_tell_the_run(tmp_path: Path) -> None
         assert reader.get_header().library == f"smartcam {smartcam.__version__}"
         told = [(one.name, one.metadata) for one in reader.iter_metadata()]
     assert told[0][0] == "smartcam"
-    assert told[0][1]["format"] == "1"
+    assert told[0][1]["format"] == "2"
     assert told[-1] == (
         "smartcam.camera",
         {
