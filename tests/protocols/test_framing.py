@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 import pytest
 
@@ -296,3 +297,62 @@ def test_resync_without_magic_drops_everything(data: bytes) -> None:
     framer.feed(data)
     assert framer.resync() == len(data)
     assert framer.buffered == 0
+
+
+# ---------------------------------------------------------------------- frames in a row
+
+
+def followers(framer: Framer, dialect: FramedDialect, size: int) -> tuple[list[bytes], bytes]:
+    """What :meth:`Framer.following` gives behind the first frame, and what it leaves."""
+    found = framer.cut()
+    assert found is not None
+    like = found[1] - dialect.header.size
+    return framer.following(dialect.header.reader(size), like, size), framer.pending
+
+
+def frame_of(dialect: FramedDialect, payload: bytes, message_id: int = 0x20) -> bytes:
+    return dialect.header.pack(message_id, len(payload)) + payload
+
+
+@each_dialect
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 32, 40])
+@pytest.mark.parametrize(
+    "then",
+    [
+        lambda dialect: b"",
+        lambda dialect: frame_of(dialect, b"\1\2\3\4 another id", 0x12),
+        lambda dialect: frame_of(dialect, b"\1\2\3\5 number of another"),
+        lambda dialect: frame_of(dialect, b"\1\2\3\4 result")[:-1],
+        lambda dialect: frame_of(dialect, b"\1\2\3\4 result")[:3],
+    ],
+    ids=["nothing", "another id", "another beginning", "a part", "a part of a header"],
+)
+def test_following_takes_those_that_begin_alike_and_no_more(
+    dialect: FramedDialect, count: int, then: Callable[[FramedDialect], bytes]
+) -> None:
+    payloads = [b"\1\2\3\4 result %3d" % number for number in range(count + 1)]
+    behind = then(dialect)
+    framer = Framer(dialect.header)
+    framer.feed(b"".join(frame_of(dialect, one) for one in payloads) + behind)
+    assert followers(framer, dialect, 4) == ([one[4:] for one in payloads[1:]], behind)
+
+
+def test_following_takes_frames_of_other_lengths_and_goes_on_behind_them() -> None:
+    lengths = [5] * 20 + [9] + [5] * 33 + [4, 100] + [5] * 16
+    payloads = [b"\1\2\3\4" + bytes(length - 4) for length in lengths]
+    framer = fed(b"".join(header(len(one)) + one for one in payloads))
+    found, left = followers(framer, HANDBOOK, 4)
+    assert (found, left) == ([one[4:] for one in payloads[1:]], b"")
+
+
+def test_following_is_not_misled_by_headers_within_payloads() -> None:
+    one = b"\1\2\3\4" + 3 * (header(52) + b"\1\2\3\4")
+    assert len(one) == 52
+    framer = fed((header(52) + one) * 40)
+    assert followers(framer, HANDBOOK, 4) == ([one[4:]] * 39, b"")
+
+
+def test_following_stops_where_the_length_is_above_the_limit() -> None:
+    framer = fed((header(8) + bytes(8)) * 20 + (header(9) + bytes(9)) * 20, max_length=8)
+    found, left = followers(framer, HANDBOOK, 4)
+    assert (found, len(left)) == ([bytes(4)] * 19, 20 * 21)

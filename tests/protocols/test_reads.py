@@ -25,7 +25,13 @@ from smartcam.protocols._base import Policy
 from smartcam.protocols._bvs import HANDBOOK, THESIS
 from smartcam.protocols._framed import framing, machine
 from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
+from smartcam.protocols._framed.framing import (
+    ALIKE,
+    DEFAULT_MAX_LENGTH,
+    Frame,
+    Framer,
+    HeaderLayout,
+)
 from smartcam.protocols._framed.machine import LinkFailed, Machine, ResultBurst, State
 from tests.machines import DIALECTS, client, label, one_by_one
 
@@ -253,7 +259,8 @@ def words(dialect: FramedDialect, limit: int) -> st.SearchStrategy[bytes]:
         results.map(lambda frame: b"?" + frame[1:]),
     )
     runs = st.lists(results, min_size=1, max_size=6).map(b"".join)
-    return st.lists(st.one_of(runs, runs, other), max_size=6).map(b"".join)
+    alike = st.builds(bytes.__mul__, results, st.integers(ALIKE - 1, 2 * ALIKE + 2))
+    return st.lists(st.one_of(runs, runs, alike, other), max_size=6).map(b"".join)
 
 
 def outcome(made: Machine, events: list[Any]) -> tuple[Any, ...]:
