@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.models import ApplicationChanged, Status
+from smartcam.protocols.messages import SwitchAnswer
 
 if TYPE_CHECKING:
+    from collections.abc import Container
     from datetime import datetime
 
     from smartcam._client.listeners import Listeners
@@ -44,6 +46,7 @@ class CameraState:
         endian: what the last status said of the byte order.
         active: the application that is active as far as is known.
         wanted: what was asked of the camera.
+        expected: the application that results are to be of, whoever gets them; None for any.
         active_in_doubt: somebody else loaded an application.
         loads_by_others: how often somebody else did.
         statuses_heard: how many statuses have come.
@@ -56,31 +59,26 @@ class CameraState:
         self.bits: int = 0
         self.endian: int = 0
         self.active: int | None = None
-        self.wanted: Wanted = Wanted(application, None)
+        self.shared: bool = shared
+        self.want(Wanted(application, None))
         self.active_in_doubt: bool = False
         self.loads_by_others: int = 0
         self.statuses_heard: int = 0
-        self.shared: bool = shared
         self._name = name
         self._listeners = listeners
         self._heard_status = False  # in this session
         self._loaded_by_us = False
 
-    @property
-    def expected(self) -> int | None:
-        """The application that results are to be of, whoever gets them; None for any."""
-        return None if self.shared else self.wanted.application
-
     def begin_session(self) -> None:
         """Forget what only the session before has told."""
         self._heard_status = self.active_in_doubt = False
 
-    def report(self, report: StatusReport, *, switching: bool) -> int | None:
+    def report(self, report: StatusReport, awaited: Container[object]) -> int | None:
         """Take a status.
 
         Args:
             report: it.
-            switching: the answer to a switch of ours is awaited.
+            awaited: the kinds of answers that are awaited, one to a switch of ours among them.
 
         Returns:
             The one before, None where there was none in this session.
@@ -96,7 +94,7 @@ class CameraState:
         elif (
             was is not None
             and was & _RUNNING_OR_BUSY == _BUSY
-            and not (self._loaded_by_us or switching)
+            and not (self._loaded_by_us or SwitchAnswer in awaited)
         ):
             self.active_in_doubt = True
             self.loads_by_others += 1
@@ -123,12 +121,13 @@ class CameraState:
 
     def want(self, wanted: Wanted) -> None:
         """Note what the camera is to be."""
-        self.wanted = wanted
+        self.wanted: Wanted = wanted
+        self.expected: int | None = None if self.shared else wanted.application
 
     def want_application(self, application: int) -> None:
         """Note from which application results are expected."""
-        self.wanted = self.wanted._replace(application=application)
+        self.want(self.wanted._replace(application=application))
 
     def want_running(self, running: bool) -> None:
         """Note which run state was asked for."""
-        self.wanted = self.wanted._replace(running=running)
+        self.want(self.wanted._replace(running=running))

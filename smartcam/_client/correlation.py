@@ -234,22 +234,20 @@ class Correlation:
 
     # ------------------------------------------------------------------ what comes
 
-    def on_query_answer(self, status: int, *, fence: bool) -> None:
-        """A Query is answered.
+    def on_fence(self, status: int) -> None:
+        """The Query in front of the last trigger is answered; the status is as it is now."""
+        run = self._last
+        if run is not None:
+            run.reached, run.shown = True, self._ordered and not status & _WAITING
 
-        Args:
-            status: as it is now.
-            fence: it is the one in front of the last trigger; else it was sent behind that. A
-                camera that shows the trigger has done so by now then. Of one that was never seen
-                to, it is known now that it does not, and a container that was held for that is the
-                trigger's.
+    def on_query_answer(self) -> None:
+        """A Query is answered that was sent behind the last trigger.
+
+        A camera that shows the trigger has done so by now. Of one that was never seen to, it is
+        known now that it does not, and a container that was held for that is the trigger's.
         """
         run = self._last
-        if run is None:
-            return
-        if fence:
-            run.reached, run.shown = True, self._ordered and not status & _WAITING
-        elif run.reached and not run.begun and self._drops_waiting is None:
+        if run is not None and run.reached and not run.begun and self._drops_waiting is None:
             self._drops_waiting = False
 
     def on_answer(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import collections
 import dataclasses
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     from smartcam.models import SubscriberStatistics
 
 
+FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
 _WIRE = tuple(field.name for field in dataclasses.fields(Counters))
 
 
@@ -68,7 +68,7 @@ class ClientCounters:
     """
 
     def __init__(self) -> None:
-        self.fates: collections.Counter[str] = collections.Counter()
+        self.fates: dict[str, int] = dict.fromkeys(FATES, 0)
         self.received: int = 0
         self.empty_slots: int = 0
         self.extra_results: int = 0
@@ -83,8 +83,8 @@ class ClientCounters:
 
     def count(self, fate: str, containers: int = 1) -> None:
         """Count containers with what became of them, in one step: the sum always holds."""
-        self.received += containers
         self.fates[fate] += containers
+        self.received += containers
 
     def skip(self, empty_slots: int) -> None:
         """Count all-zero records that an interpreter skipped."""

@@ -56,6 +56,7 @@ class Dispatch:
 
     def __post_init__(self) -> None:
         self._dialect: Dialect | None = None
+        self._notes_events = False  # events are seen although nobody subscribed to them
         self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
             m.ResultContainer: self._results.on_result,
@@ -78,6 +79,7 @@ class Dispatch:
         """Hand on every event of a chunk, in order; never waits, never raises."""
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
         events = chunk.events
+        self._notes_events = self._listeners.notes_events()
         if len(events) >= FEWEST_GATHERED and self._only_streams():
             events = gathered(events, self._state.endian)
         for event in events:
@@ -117,7 +119,10 @@ class Dispatch:
         return Verdict.DONE if self._dialect is None else self._dialect.code(code).verdict
 
     def _on_active(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
-        self._results.on_query_answer(fence=self._waits.take_fence())
+        if self._waits.take_fence():
+            self._results.on_fence()
+        else:
+            self._results.on_query_answer()
         state = self._state
         if answer.application != state.active and self._verdict(answer.code) is Verdict.DONE:
             state.set_active(answer.application, at)
@@ -138,16 +143,15 @@ class Dispatch:
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         state, waits, listeners, status = self._state, self._waits, self._listeners, report.status
         before = state.status
-        previous = state.report(report, switching=m.SwitchAnswer in waits.answers)
+        previous = state.report(report, waits.answers)
         bits, was = state.bits, previous or 0
         if (bits ^ was) & _NOTED:
             self._note_changes(bits, was)
         self._results.on_status(previous, bits, now)
-        if status != before and listeners.sees_events:
+        if status != before and (self._notes_events or listeners.events.references):
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
             listeners.publish(event)
-        if listeners.hears_statuses:
-            listeners.offer_status(status, now)
+        listeners.offer_status(status, now)
         if waits.statuses:
             waits.show(status)
 

@@ -33,7 +33,7 @@ from smartcam.models import Localization
 from smartcam.registry import INTERPRETERS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from datetime import datetime
 
     from smartcam.models import ByteOrder, Calibration
@@ -59,6 +59,9 @@ def byte_order(endian: int) -> ByteOrder:
         got=endian,
     )
 
+
+# half the time of a NamedTuple's own; the cast because a bare tuple is generic
+new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 MAX_NUMBER = (1 << 31) - 1
 """Largest sequence number of ours: an int32 in the container holds it."""
@@ -176,7 +179,8 @@ class Interpretation:
                 poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
-        interpreter, simple, sequenced, _ = self._known(container.application)
+        way = self._one or self._known(container.application)
+        interpreter, simple, sequenced, _ = way
         data = container.data
         if container.cells is not None:
             data = _from_cells(container, interpreter)
@@ -185,7 +189,8 @@ class Interpretation:
             value = run_plain(simple, data, context)
             if self._calibrations is not None:
                 value = self._calibrations.apply(value, container.application)
-            return Interpreted(value, None, context.empty_slots)
+            read: Interpreted = new_tuple(Interpreted, (value, None, context.empty_slots))
+            return read
         order = byte_order(endian)
         context = Context(
             camera, container.application, number, at, order, self._y_down, self._lenient

@@ -88,9 +88,11 @@ class Listeners:
     @property
     def sees_events(self) -> bool:
         """Whether anybody would see an event."""
-        if self.events.references or self._observers.see_states:
-            return True
-        return logger.isEnabledFor(logging.DEBUG)
+        return bool(self.events.references) or self.notes_events()
+
+    def notes_events(self) -> bool:
+        """Return whether events are seen although nobody subscribed to them."""
+        return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)
 
     # ------------------------------------------------------------------ what comes
 
@@ -102,7 +104,8 @@ class Listeners:
 
     def offer_status(self, status: Status, now: float) -> None:
         """Hand a status to its subscribers."""
-        self.statuses.offer(status, now)
+        if self.statuses.references:
+            self.statuses.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
         """Hand results that are only streamed to their subscribers; ``size`` bytes in all."""

@@ -6,10 +6,11 @@ import itertools
 import logging
 import random
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 from smartcam._client.correlation import Correlation, Match, SentTrigger
 from smartcam._client.deadline import DeadlineTimer
+from smartcam._client.interpretation import new_tuple
 from smartcam.exceptions import (
     CameraFaultError,
     InputContainerError,
@@ -24,7 +25,6 @@ from smartcam.protocols import messages as m
 
 if TYPE_CHECKING:
     import asyncio
-    from collections.abc import Callable
     from datetime import datetime
 
     from smartcam._client.camera_state import CameraState
@@ -42,9 +42,6 @@ _FAILING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERR
 
 _CURRENT = {"triggered", "nobody"}
 """Fates of what is not known to be an older trigger's."""
-
-# half the time of a NamedTuple's own; the cast because a bare tuple is generic
-_new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
 
 @dataclass(slots=True, eq=False)
@@ -68,16 +65,6 @@ class PendingTrigger(SentTrigger):
     triggered_at: datetime
     application: int | None
     results: list[Result]
-
-    def take(self, result: Result) -> None:
-        """One of its results has come."""
-        self.results.append(result)
-        self.came += 1
-
-    def succeed(self) -> None:
-        """Give its caller the results."""
-        self.ended = True
-        self.outcome.set_result(self.results)
 
     def fail(self, error: Exception) -> None:
         """Give its caller the reason why there are none."""
@@ -139,9 +126,8 @@ class Results:
 
     # ------------------------------------------------------------------ the trigger under way
 
-    @property
-    def pending(self) -> PendingTrigger | None:
-        """The trigger under way, as long as its caller waits."""
+    def _awaited(self) -> PendingTrigger | None:
+        """Return the trigger under way, as long as its caller waits."""
         pending = self._pending
         if pending is None or pending.ended:
             return None
@@ -169,7 +155,7 @@ class Results:
 
     def give_up(self, error: Exception) -> None:
         """End the trigger under way with an error; its results are late from this moment on."""
-        pending = self.pending
+        pending = self._awaited()
         if pending is not None:
             self.correlation.give_up(pending)
             pending.fail(error)
@@ -185,12 +171,14 @@ class Results:
         self.input_in_doubt = False
         self.correlation.settled()
 
-    def on_query_answer(self, *, fence: bool) -> None:
-        """A Query is answered; ``fence``: the one in front of the last trigger."""
-        if fence:
-            self.correlation.on_query_answer(self._state.bits, fence=True)
-        elif self._held:
-            self.correlation.on_query_answer(self._state.bits, fence=False)
+    def on_fence(self) -> None:
+        """The Query in front of the last trigger is answered."""
+        self.correlation.on_fence(self._state.bits)
+
+    def on_query_answer(self) -> None:
+        """Another Query is answered."""
+        if self._held:
+            self.correlation.on_query_answer()
             self._release_held()
 
     def on_trigger_answer(self) -> bool:
@@ -220,7 +208,7 @@ class Results:
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
         """End the trigger under way where the status says that its result cannot be trusted."""
-        pending = self.pending
+        pending = self._awaited()
         if pending is None:
             return
         error: SmartCamError | None = None
@@ -295,7 +283,7 @@ class Results:
         names, applications, ats = map(itertools.repeat, (name, application, at))
         fields = (names, applications, none, numbers, none, ats, none, burst.data, values)
         rows = zip(*fields, strict=False)
-        return list(map(_new_tuple, itertools.repeat(Result), rows))
+        return list(map(new_tuple, itertools.repeat(Result), rows))
 
     def _release_held(self) -> None:
         """Give the containers their fate of which it was not known whether they are the trigger's.
@@ -303,7 +291,7 @@ class Results:
         They are, if nothing of it was seen to begin since; what came before that is older.
         """
         held, self._held = self._held, []
-        pending = self.pending
+        pending = self._awaited()
         older = pending is None or pending.progress.begun
         for container, now, at in held:
             self.on_result(container, now, at, older=older)
@@ -319,7 +307,7 @@ class Results:
             at: the same on the wall clock.
             older: it is known not to be of the trigger under way.
         """
-        state, counters, pending = self._state, self._counters, self.pending
+        state, counters, pending = self._state, self._counters, self._awaited()
         active, expected = state.active, state.expected
         if container.application < 0:  # a quirk: it does not say whose it is
             known = m.UNNAMED_APPLICATION if active is None else active
@@ -382,7 +370,8 @@ class Results:
         counters.count(fate)
         listeners.offer_result(result, now, current=current, late=fate == "late")
         if owner is not None:
-            owner.take(result)
+            owner.results.append(result)
+            owner.came += 1
             self._complete(owner, now)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
@@ -422,33 +411,32 @@ class Results:
         if owner is not None:
             triggered_at, latency = owner.triggered_at, now - owner.sent_at
         fields = (name, application, sequence, number, triggered_at, at, latency, data, value)
-        result: Result = _new_tuple(Result, fields)
+        result: Result = new_tuple(Result, fields)
         return result
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
         """End the trigger under way if it has all its results, and nothing speaks against it."""
         if owner.came < owner.wanted or not owner.progress.confirmed or owner.outcome.done():
             return
-        self._end_input_doubt(owner)
+        if owner.has_input:
+            self.input_in_doubt = False
         self._counters.processing.add(now - owner.sent_at)
         self.correlation.done(owner)
-        owner.succeed()
+        owner.ended = True
+        owner.outcome.set_result(owner.results)
 
     def _fail_unread(
         self, owner: PendingTrigger, error: InterpretationError, number: int | None
     ) -> None:
         """End a trigger whose result came and cannot be read."""
-        self._end_input_doubt(owner)
+        if owner.has_input:
+            self.input_in_doubt = False
         # where its number cannot be read, it may be another's, and its own still come
         certain = owner.number is None or number == owner.number
         self.correlation.give_up(owner, unread=int(certain))
         if not owner.given_up:
             self.correlation.done(owner)
         owner.fail(error)
-
-    def _end_input_doubt(self, owner: PendingTrigger) -> None:
-        if owner.has_input:
-            self.input_in_doubt = False
 
     def _wrong_application(
         self, container: m.ResultContainer, expected: int

@@ -99,9 +99,9 @@ class Line:
         """A Query is answered: the fence, or another one."""
         if self.fence_open:
             self.fence_open = False
-            self.at.on_query_answer(int(self.status or 0), fence=True)
+            self.at.on_fence(int(self.status or 0))
         elif self.held:
-            self.at.on_query_answer(int(self.status or 0), fence=False)
+            self.at.on_query_answer()
             self.release()
 
     def hear(self, *statuses: Status) -> None:

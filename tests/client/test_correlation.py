@@ -177,7 +177,7 @@ def test_held_container_of_a_trigger_that_is_given_up_pays_its_debt(how: str) ->
 def test_query_of_before_tells_nothing_of_what_the_camera_shows() -> None:
     line = ready()
     line.send()
-    line.at.on_query_answer(0, fence=False)  # its own fence is not answered
+    line.at.on_query_answer()  # its own fence is not answered
     line.answer()
     assert line.result() == HELD
 
@@ -191,7 +191,7 @@ def test_query_tells_nothing_of_what_the_camera_shows_where_nothing_is_held(what
         line.hear(WORKING)  # the first status of a session: whether it dropped is not known
         line.result()
         line.leave()
-    line.at.on_query_answer(0, fence=False)
+    line.at.on_query_answer()
     line.hear(READY)
     line.trigger()
     assert line.result() == HELD
@@ -744,7 +744,7 @@ def test_session_begins_without_doubt_and_without_an_old_fence() -> None:
     assert line.at.doubted
     line.reconnect()
     assert (line.at.doubted, line.at.judge(None).extra, line.fence_open) == (False, False, False)
-    line.at.on_query_answer(int(READY), fence=True)
+    line.at.on_fence(int(READY))
     line.at.on_answer()
     assert not pending.progress.reached
 
