@@ -181,7 +181,8 @@ class SmartCamera(Camera[ValueT]):
             if application is not None:
                 async with lock.hold_in(application, timeout) as deadline:
                     return await triggers.trigger(request, deadline)
-            deadline = await lock.take(timeout)  # as hold() does, without an object for it
+            deadline = self._connection.deadline(timeout)
+            await lock.turn(deadline, timeout)  # as hold() does, without an object for it
             try:
                 return await triggers.trigger(request, deadline)
             finally:

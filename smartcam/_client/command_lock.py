@@ -139,22 +139,23 @@ class CommandLock:
 
     async def take(self, timeout: float) -> float:
         """Take the turn and return the deadline; for :class:`Hold`, which gives it back."""
-        connection = self._connection
-        deadline = connection.deadline(timeout)
-        connection.require_link()
-        if self._lock.locked() or self._in_line or self._leaving:
-            await self._take_in_line(deadline, timeout)
-        else:
-            await self._lock.acquire()  # it is free
-        try:
-            connection.require_link()  # it may have been lost meanwhile
-            self._raise_failed()
-            if self._commands.unconfirmed:
-                await self._commands.catch_up(deadline)
-        except BaseException:
-            self._lock.release()
-            raise
+        deadline = self._connection.deadline(timeout)
+        await self.turn(deadline, timeout)
         return deadline
+
+    def turn(self, deadline: float, timeout: float) -> Coroutine[Any, Any, object]:
+        """Have the turn when the coroutine that this returns is done; then :meth:`give_back`.
+
+        Raises:
+            LinkError: there is no session.
+        """
+        self._connection.require_link()
+        lock = self._lock
+        if lock.locked() or self._in_line or self._leaving:
+            return self._take_in_line(deadline, timeout)
+        if self._failed is not None or self._commands.unconfirmed:
+            return self._take_in_line(deadline, timeout)
+        return lock.acquire()  # it is free: nothing is waited for
 
     def give_back(self) -> None:
         """Give the turn to the next in line."""
@@ -172,6 +173,14 @@ class CommandLock:
             ) from exc
         finally:
             self._in_line -= 1
+        try:
+            self._connection.require_link()  # it may have been lost meanwhile
+            self._raise_failed()
+            if self._commands.unconfirmed:
+                await self._commands.catch_up(deadline)
+        except BaseException:
+            self._lock.release()
+            raise
 
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""

@@ -56,11 +56,10 @@ class Commands:
     @property
     def runs(self) -> bool:
         """Running, or stopped only by a trigger that was interrupted before it started again."""
-        return self.halted or Status.RUNNING in self._status.last
+        return self.is_halted() or Status.RUNNING in self._status.last
 
-    @property
-    def halted(self) -> bool:
-        """A trigger's fence has stopped it and not started it again, nor has anybody loaded it."""
+    def is_halted(self) -> bool:
+        """Whether a trigger's fence has stopped it, and neither it nor a load has ended that."""
         return self._halted_at == self._state.loads_by_others
 
     # ------------------------------------------------------------------ run state
@@ -80,7 +79,7 @@ class Commands:
     async def void_inspection(self, deadline: float) -> None:
         """Stop and start again, and have heard all that was said before the start.
 
-        Cancellation: it may stay stopped; it is :attr:`halted` then.
+        Cancellation: it may stay stopped; it is halted then.
         """
         self._halted_at = self._state.loads_by_others
         await self._confirm_stop(deadline)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError
 from smartcam.protocols import messages as m
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from smartcam.protocols._base import Dialect
 
 
-class Features(NamedTuple):
+@dataclass(slots=True)
+class Features:
     """What the protocol of a session has, as far as it matters in every trigger.
 
     Attributes:

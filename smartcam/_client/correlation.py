@@ -22,7 +22,7 @@ trigger that was given up, and after its inspection began, pays it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from smartcam.models import Status
 
@@ -49,19 +49,19 @@ class Progress:
     Attributes:
         reached: the fence was answered: what came before is older than the trigger. True from the
             beginning where there is no fence.
-        begun: Waiting for Trigger has dropped behind it.
-        over: it has dropped once more, for another inspection: what has no number is that one's.
-        shown: it has to drop: the camera did not wait for a trigger at the fence.
         confirmed: nothing says that it was not taken, where a status behind its answer would.
         answered: that answer has come.
+        begun: Waiting for Trigger has dropped behind the fence.
+        over: it has dropped once more, for another inspection: what has no number is that one's.
+        shown: it has to drop: the camera did not wait for a trigger at the fence.
     """
 
     reached: bool = True
+    confirmed: bool = True
+    answered: bool = False
     begun: bool = False
     over: bool = False
     shown: bool = False
-    confirmed: bool = True
-    answered: bool = False
 
 
 @dataclass(slots=True, eq=False)
@@ -89,7 +89,8 @@ class SentTrigger:
     ended: bool = field(init=False, default=False)
 
 
-class Match(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Match:
     """Whose a container is.
 
     Attributes:
@@ -129,6 +130,7 @@ class Correlation:
     Attributes:
         pending: the trigger under way.
         satisfied: the last trigger has its results, and no other inspection was seen since.
+        owed: results of triggers that were given up, which may still come; the oldest first.
         doubted: the status may be older than the last trigger, which was given up: it may say that
             the camera waits for one although it has one.
     """
@@ -140,7 +142,7 @@ class Correlation:
         self._drops_waiting: bool | None = None  # whether it shows a trigger; None: not known yet
         self.satisfied: bool = False
         self._last: Progress | None = None  # of the last trigger, until it has its results
-        self._owed: list[_Owed] = []
+        self.owed: list[_Owed] = []
         self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
         self._last_number: int | None = None  # of the last trigger that had its results
         self._turn = int(chance * WIDE)
@@ -149,7 +151,7 @@ class Correlation:
     @property
     def debt(self) -> Debt | None:
         """Fate of the result of an earlier trigger that may still come."""
-        return self._owed[0].fate if self._owed else None
+        return self.owed[0].fate if self.owed else None
 
     # ------------------------------------------------------------------ the session
 
@@ -158,12 +160,12 @@ class Correlation:
         self._ordered = ordered
         self.satisfied = self.doubted = False
         self._last = None
-        for one in self._owed:  # whether it began may have been told to nobody
+        for one in self.owed:  # whether it began may have been told to nobody
             one.progress = Progress(begun=True)
 
     def settled(self) -> None:
         """Nothing of before can come: the application was stopped, and all of that was heard."""
-        self._owed.clear()
+        self.owed.clear()
         self.satisfied = self.doubted = False
         self._last = None
 
@@ -174,7 +176,7 @@ class Correlation:
         """
         self.doubted = False
         if self._ordered and self._drops_waiting:
-            self._owed = [one for one in self._owed if one.progress.begun]
+            self.owed = [one for one in self.owed if one.progress.begun]
             self._last = None
 
     # ------------------------------------------------------------------ the trigger
@@ -225,8 +227,8 @@ class Correlation:
             return
         pending.given_up = True
         self.doubted = self.doubted or not pending.progress.begun
-        self._owed.append(_Owed(fate, pending.number, missing, pending.progress))
-        del self._owed[:-MAX_OWED]
+        self.owed.append(_Owed(fate, pending.number, missing, pending.progress))
+        del self.owed[:-MAX_OWED]
         if pending.number is not None:
             self._given_up[pending.number] = fate
             if len(self._given_up) > MAX_OWED:
@@ -320,15 +322,15 @@ class Correlation:
 
     def _judge_other(self, number: int | None) -> Match:
         if number is not None and number in self._given_up:
-            self._pay([one for one in self._owed if one.number == number])
+            self._pay([one for one in self.owed if one.number == number])
             return Match(self._given_up[number])
         if number is not None and number == self._last_number:
             return EXTRA
         # a number that is none of ours may be that of a trigger that was sent without one
-        if self._owed:
+        if self.owed:
             open_ = [
                 one
-                for one in self._owed
+                for one in self.owed
                 if (number is None or one.number is None) and self._may_pay(one.progress)
             ]
             if open_:
@@ -341,5 +343,5 @@ class Correlation:
             return "late"
         owed[0].missing -= 1
         if owed[0].missing == 0:
-            self._owed.remove(owed[0])
+            self.owed.remove(owed[0])
         return owed[0].fate

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 from asyncio import CancelledError
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from smartcam.exceptions import (
@@ -96,6 +97,9 @@ class Interpretation:
         y_down: the camera's y axis points down.
         calibration: what ``calibration`` accepts.
 
+    Attributes:
+        by_application: each application has its own interpreter.
+
     Raises:
         ConfigurationError: the specification is wrong (a layout text with the position), or the
             calibration is none, or was made with y taken the other way, or cannot apply to what
@@ -125,15 +129,11 @@ class Interpretation:
                 self._calibrations.check(None, self._one.interpreter)
             for application, way in self._by_application.items():
                 self._calibrations.check(application, way.interpreter)
-
-    @property
-    def by_application(self) -> bool:
-        """Whether each application has its own interpreter."""
-        return self._one is None
+        self.by_application: bool = self._one is None
 
     def numbering(self, application: int | None) -> Numbering | None:
         """Return the place of the number in this application's containers, None without one."""
-        way = self._way(application)
+        way = self._one or self._way(application)
         return way.numbering if way is not None else None
 
     def numbered_layouts(self) -> str | dict[int, str] | None:
@@ -180,11 +180,11 @@ class Interpretation:
             WrongApplicationError: a mapping does not know its application.
         """
         way = self._one or self._known(container.application)
-        interpreter, simple, sequenced, _ = way
+        interpreter, simple = way.interpreter, way.simple
         data = container.data
         if container.cells is not None:
             data = _from_cells(container, interpreter)
-        if simple is not None and not sequenced:
+        if simple is not None and not way.sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
             if self._calibrations is not None:
@@ -199,7 +199,7 @@ class Interpretation:
         value = run(interpreter, reader)
         if self._calibrations is not None:
             value = self._calibrations.apply(value, container.application)
-        sequence = run_sequence(interpreter, reader) if sequenced else None
+        sequence = run_sequence(interpreter, reader) if way.sequenced else None
         return Interpreted(value, sequence, context.empty_slots)
 
     def _context(
@@ -399,7 +399,8 @@ def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
     return pack_texts(interpreter.layout, container.cells)
 
 
-class _ApplicationReader(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _ApplicationReader:
     """How the containers of one application are read.
 
     Attributes:

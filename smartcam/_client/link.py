@@ -14,9 +14,10 @@ import contextlib
 import logging
 import socket
 import weakref
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from time import perf_counter, thread_time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from smartcam._client.doorbell import Doorbell
 from smartcam._datagrams import read_no_more_than_needed
@@ -70,7 +71,8 @@ MAX_REST = 256
 """Bytes of an unfinished frame that a trace shows: it may be as long as the largest frame."""
 
 
-class Chunk(NamedTuple):
+@dataclass(slots=True)
+class Chunk:
     """Events that one delivery of bytes gave, or some of them.
 
     Attributes:
@@ -96,6 +98,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             nothing (TCP keep-alive and user timeout, where it has them); None for its own default.
 
     Attributes:
+        loop: the event loop that it is used in.
         heard_at: loop time of the last byte received.
     """
 
@@ -113,8 +116,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.host = host
         self.port = port
         self._liveness_timeout = liveness_timeout
-        self._loop = asyncio.get_running_loop()
-        self.heard_at: float = self._loop.time()
+        self.loop: asyncio.AbstractEventLoop = asyncio.get_running_loop()
+        self.heard_at: float = self.loop.time()
         self._transport: Any = None
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
@@ -123,8 +126,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._most = FIRST_CHUNK  # frames of the next chunk
         self._busy_since: float | None = None  # with the last chunk, where it was a large one
         self._busy_with = 0
-        self._doorbell = Doorbell(self._loop)  # of the task that receives
-        self._closed: asyncio.Future[None] = self._loop.create_future()
+        self._doorbell = Doorbell(self.loop)  # of the task that receives
+        self._closed: asyncio.Future[None] = self.loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
         self._writable.set()
@@ -144,7 +147,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             LocalProtocolError: the protocol's state forbids one; those before it were written.
             ConnectionLostError: the link is gone.
         """
-        if self._closed.done() or self._loss is not None:
+        if self._loss is not None:
             raise self.lost_error()
         try:
             for message in messages:
@@ -152,8 +155,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         finally:
             self._flush()
 
-    @property
-    def writable(self) -> bool:
+    def is_writable(self) -> bool:
         """Whether the transport takes more at once: :meth:`drain` would not wait."""
         return self._writable.is_set()
 
@@ -253,7 +255,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """asyncio: the link is open."""
         self._transport = transport
-        links[self._loop] = links.get(self._loop, 0) + 1
+        links[self.loop] = links.get(self.loop, 0) + 1
         if self.machine.transport is Transport.UDP:
             read_no_more_than_needed(transport)
         sock = transport.get_extra_info("socket")
@@ -269,7 +271,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def buffer_updated(self, nbytes: int) -> None:
         """asyncio: bytes of a TCP link."""
-        self.heard_at = self._loop.time()
+        self.heard_at = self.loop.time()
         if self.machine.filled(nbytes, self.heard_at):
             self._hand_on()
         if self._replies and self._loss is None:
@@ -277,7 +279,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
-        self.heard_at = self._loop.time()
+        self.heard_at = self.loop.time()
         if len(self._chunks) >= MAX_DATAGRAMS:
             self.machine.counters.ignored_frames += 1
             return
@@ -299,7 +301,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """asyncio: the link is over."""
         self._lose(exc or ConnectionResetError("the camera closed the connection"))
-        links[self._loop] -= 1
+        links[self.loop] -= 1
         if not self._closed.done():
             self._closed.set_result(None)
 
@@ -348,7 +350,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     async def _give_way(self) -> None:
         """Let the loop go round; more often where it is shared and the others are at work."""
-        for _ in range(PASSES if links[self._loop] > 1 else 1):
+        for _ in range(PASSES if links[self.loop] > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)
             if perf_counter() - left < SHARED_TURN:
@@ -358,7 +360,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """Have the next chunks hold as much as one turn takes, by how long the last one took."""
         self._busy_since = None
         took = thread_time() - since
-        turn = SHARED_TURN if links[self._loop] > 1 else TURN
+        turn = SHARED_TURN if links[self.loop] > 1 else TURN
         frames = int(self._busy_with * turn / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # once is no rule
         self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
@@ -401,8 +403,8 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
             left -= 1
         some.append(event)
     taken = frames - left
-    first = chunk._replace(events=some, frames=taken)
-    return first, chunk._replace(events=list(rest), frames=chunk.frames - taken)
+    first = replace(chunk, events=some, frames=taken)
+    return first, replace(chunk, events=list(rest), frames=chunk.frames - taken)
 
 
 async def open_link(

@@ -72,7 +72,7 @@ class Requests:
         """
         link = self._connection.require_link()
         link.send(message, answered=answered)
-        if link.writable:
+        if link.is_writable():
             return
         try:
             async with asyncio.timeout_at(deadline):

@@ -254,7 +254,7 @@ class Results:
         None of it can be a trigger's or pay a debt, nor count as an extra result.
         """
         correlation = self.correlation
-        ours = self._pending or self._numbering or correlation.debt or correlation.satisfied
+        ours = self._pending or self._numbering or correlation.owed or correlation.satisfied
         return not ours and self._listeners.streams_results
 
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
@@ -264,7 +264,7 @@ class Results:
         what cannot be interpreted is an item of its own.
         """
         application = burst.application
-        if self._pending or self._numbering or self.correlation.debt:
+        if self._pending or self._numbering or self.correlation.owed:
             return None
         if not self._listeners.streams_results:
             return None

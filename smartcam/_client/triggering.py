@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from smartcam._client.correlation import Progress
 from smartcam._client.results import PendingTrigger
@@ -67,7 +67,8 @@ _WHY_READY = "; it does not while it inspects, and an application that runs free
 _FENCE, _TRIGGER = m.Query(), m.Trigger()
 
 
-class TriggerRequest(NamedTuple):
+@dataclass(slots=True)
+class TriggerRequest:
     """What a trigger is to do.
 
     Attributes:
@@ -157,7 +158,8 @@ class Triggers:
         if features.polled:
             await self._status.refresh(deadline)
             correlation.heard()
-        self._raise_fault()
+        if state.bits & _SYSTEM_ERROR:
+            raise self._fault()
         cleared = False
         if request.input_data is not None and self._results.input_in_doubt:
             raise InputContainerError(
@@ -180,7 +182,7 @@ class Triggers:
         if correlation.doubted:  # the trigger before may not show in the status yet
             await self._requests.fence(deadline)
             correlation.heard()
-        if self._commands.halted or correlation.debt is not None:
+        if correlation.owed or self._commands.is_halted():
             await self._settle_debt(deadline, wait=request.wait, decided=decided)
         while True:
             status = state.bits
@@ -197,12 +199,12 @@ class Triggers:
         if numbering is not None:
             number, certain = correlation.take_number(numbering.highest)
         fenced = features.fences and not (certain and decided)
-        loop = connection.loop
+        loop = connection.require_link().loop
         pending = PendingTrigger(
             request.results,
             number,
             certain,
-            Progress(reached=not fenced, confirmed=not features.confirms),
+            Progress(not fenced, not features.confirms),
             loop.create_future(),
             interpretation,
             request.input_data is not None,
@@ -212,13 +214,14 @@ class Triggers:
             request.expected if interpretation.by_application else state.active,
             [],
         )
-        return await self._await_results(pending, request.input_data, deadline, fenced=fenced)
+        return await self._await_results(pending, request.input_data, deadline)
 
     async def _await_results(
-        self, pending: PendingTrigger, input_data: bytes | None, deadline: float, *, fenced: bool
+        self, pending: PendingTrigger, input_data: bytes | None, deadline: float
     ) -> list[Result]:
         requests, features = self._requests, self._connection.features
         outcome, link = pending.outcome, self._connection.require_link()
+        fenced = not pending.progress.reached
         words: list[m.Message] = [_FENCE] if fenced else []
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
@@ -242,7 +245,7 @@ class Triggers:
                 self._results.input_sent()
             if features.polled:
                 self._polling.begin_trigger()
-            if not link.writable:
+            if not link.is_writable():
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):
                         await link.drain()
@@ -311,7 +314,8 @@ class Triggers:
         """Wait until the camera takes a trigger, or say why it never will."""
         begin = asyncio.get_running_loop().time()
         while True:
-            self._raise_fault()
+            if self._state.bits & _SYSTEM_ERROR:
+                raise self._fault()
             status = self._status.last
             if takes_trigger(status):
                 return
@@ -335,9 +339,8 @@ class Triggers:
                     waited=waited,
                 ) from exc
 
-    def _raise_fault(self) -> None:
-        if self._state.bits & _SYSTEM_ERROR:
-            raise CameraFaultError(f"{self._name}: the camera reports System Error")
+    def _fault(self) -> CameraFaultError:
+        return CameraFaultError(f"{self._name}: the camera reports System Error")
 
     async def _settle_debt(self, deadline: float, *, wait: bool, decided: bool) -> None:
         """Await the result of an earlier trigger, or make it impossible, unless a number decides.
@@ -348,7 +351,7 @@ class Triggers:
         Source: that Stop voids the inspection is inferred.
         """
         correlation, commands = self._correlation, self._commands
-        if not commands.halted and (decided or correlation.debt is None):
+        if not commands.is_halted() and (decided or correlation.debt is None):
             return
         dialect = self._connection.dialect
         if dialect.in_order or not dialect.has(m.Stop):
@@ -357,7 +360,7 @@ class Triggers:
             correlation.settled()
             return
         now = asyncio.get_running_loop().time()
-        if not commands.halted and Status.RUNNING in self._status.last:
+        if not commands.is_halted() and Status.RUNNING in self._status.last:
             grace = min(deadline, now + min(LATE_GRACE, 0.5 * (deadline - now)))
             with contextlib.suppress(TimeoutError):
                 await self._status.wait(_is_decided, grace)

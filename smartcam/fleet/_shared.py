@@ -57,11 +57,7 @@ class Carrier(Interpretation):
     ) -> None:
         super().__init__(layouts, lenient=True, y_down=False)
         self._carried = Carried(owner, b"")
-        self._each = by_application
-
-    @property
-    def by_application(self) -> bool:
-        return self._each
+        self.by_application = by_application
 
     def of(self, owner: Owner) -> Carrier:
         """Return the same for another's trigger, which costs less than a new one."""

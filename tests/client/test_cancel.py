@@ -226,7 +226,7 @@ async def test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_res
 
 def _owe(camera: Camera) -> None:
     """Have the client owe a result, as after a trigger that was given up."""
-    inside(camera)._results.correlation._owed.append(_Owed("late", None, 1, Progress(begun=True)))
+    inside(camera)._results.correlation.owed.append(_Owed("late", None, 1, Progress(begun=True)))
 
 
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])

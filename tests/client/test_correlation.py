@@ -381,7 +381,7 @@ def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> No
     line.answer()
     line.at.heard()
     assert not line.at.doubted
-    assert [one.fate for one in line.at._owed] == ["late"]
+    assert [one.fate for one in line.at.owed] == ["late"]
     line.hear(WORKING)
     assert line.others == 1  # no trigger of ours is left that it could be
 
@@ -712,7 +712,7 @@ def test_numbers_owed_are_bounded_and_the_oldest_are_forgotten() -> None:
     for number in range(MAX_OWED + 10):
         line.trigger(number)
         line.give_up()
-    assert len(line.at._owed) == len(line.at._given_up) == MAX_OWED
+    assert len(line.at.owed) == len(line.at._given_up) == MAX_OWED
     assert line.result(9) == NOBODY
     assert line.result(10) == LATE
 

@@ -367,7 +367,7 @@ class CameraAndClient(RuleBasedStateMachine):
 
     @invariant()
     def bounded(self) -> None:
-        assert len(self.line.at._owed) <= MAX_OWED
+        assert len(self.line.at.owed) <= MAX_OWED
 
 
 class CameraAndClientAlone(CameraAndClient):
