@@ -66,12 +66,12 @@ class CameraState:
         self.statuses_heard: int = 0
         self._name = name
         self._listeners = listeners
-        self._heard_status = False  # in this session
+        self._told: int | None = None  # the last status of this session
         self._loaded_by_us = False
 
     def begin_session(self) -> None:
         """Forget what only the session before has told."""
-        self._heard_status = self.active_in_doubt = False
+        self._told, self.active_in_doubt = None, False
 
     def report(self, report: StatusReport, awaited: Container[object]) -> int | None:
         """Take a status.
@@ -85,10 +85,10 @@ class CameraState:
         """
         status = report.status
         # int(status) costs three times as much, with each status that comes
-        bits, was = status._value_, self.bits if self._heard_status else None
+        bits, was = status._value_, self._told
         self.statuses_heard += 1
-        self.status, self.bits, self.endian = status, bits, report.endian
-        self._heard_status = True
+        self.status, self.endian = status, report.endian
+        self.bits = self._told = bits
         if bits & _RUNNING_OR_BUSY == _BUSY:  # it loads an application
             self._loaded_by_us = False
         elif (

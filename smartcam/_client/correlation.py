@@ -286,15 +286,14 @@ class Correlation:
         self._given = None  # that run has it
         return self._ordered and previous is not None
 
-    def judge(self, number: int | None, *, older: bool = False) -> Match:
+    def judge(self, number: int | None) -> Match:
         """Say whose a container of the right application is.
 
         Args:
             number: its sequence number, None where it has none or none of ours is about.
-            older: it is not the pending trigger's.
         """
         pending = self.pending
-        if pending is not None and not pending.ended and not older:
+        if pending is not None and not pending.ended:
             if not pending.progress.reached:
                 pending.early += 1
             elif pending.came == pending.wanted:
@@ -313,14 +312,15 @@ class Correlation:
                     return OURS
                 if self._drops_waiting is None and not run.shown:
                     return HELD
-        return self._judge_other(number)
+        return self.judge_older(number)
 
     def _may_pay(self, run: Progress) -> bool:
         """Whether a container that comes now may be of a run: where it shows, it has begun."""
         shows = self._ordered and self._drops_waiting
         return run.begun or (run.reached and not run.shown and not shows)
 
-    def _judge_other(self, number: int | None) -> Match:
+    def judge_older(self, number: int | None) -> Match:
+        """Say the same of one that is known not to be of the trigger under way."""
         if number is not None and number in self._given_up:
             self._pay([one for one in self.owed if one.number == number])
             return Match(self._given_up[number])

@@ -78,12 +78,12 @@ class Dispatch:
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
-        events = chunk.events
+        events, takers = chunk.events, self._takers
         self._notes_events = self._listeners.notes_events()
         if len(events) >= FEWEST_GATHERED and self._only_streams():
             events = gathered(events, self._state.endian)
         for event in events:
-            take = self._takers.get(type(event))
+            take = takers.get(type(event))
             if take is not None:  # LinkFailed and LinkEnded: the receive task ends by them
                 take(event, now, at)
             if answers and isinstance(event, m.Message):

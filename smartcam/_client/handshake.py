@@ -140,7 +140,8 @@ class _Collector:
     async def ask(self, *first: Message) -> None:
         """Send a Query behind ``first`` and wait for its answer."""
         before = self.answers
-        self.link.send(*first, answered=False)
+        for message in first:
+            self.link.send(message, answered=False)
         self.link.send(Query())
         while self.answers == before:
             await self.take()
@@ -223,7 +224,7 @@ async def attempt(
     )
     collector = _Collector(link, MAX_EARLY + max_length)
     try:
-        link.send(*([Disconnect()] if disconnect_first else []), Connect())
+        link.send_all([Disconnect(), Connect()] if disconnect_first else [Connect()])
         progress.reach(CONNECTING)
         while collector.version is None:
             await collector.take()

@@ -28,7 +28,7 @@ from smartcam.protocols._framed.machine import Event, LinkFailed, LinkMachine, R
 from smartcam.protocols.messages import Disconnect, Message, Sender
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from smartcam.protocols._base import Protocol
     from smartcam.protocols._framed.framing import Frame
@@ -136,12 +136,24 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     # ------------------------------------------------------------------ for the client
 
-    def send(self, *messages: Message, answered: bool | None = None) -> None:
-        """Write messages at once: one write on TCP, a datagram each on UDP.
+    def send(self, message: Message, *, answered: bool | None = None) -> None:
+        """Write a message.
 
         Args:
-            *messages: what to say.
-            answered: whether they are answered, where the protocol does not know.
+            message: what to say.
+            answered: whether it is answered, where the protocol does not know.
+
+        Raises:
+            LocalProtocolError: the protocol's state forbids it.
+            ConnectionLostError: the link is gone.
+        """
+        if self._loss is not None:
+            raise self.lost_error()
+        self.machine.send(message, answered=answered)
+        self._flush()
+
+    def send_all(self, messages: Iterable[Message]) -> None:
+        """Write messages at once: one write on TCP, a datagram each on UDP.
 
         Raises:
             LocalProtocolError: the protocol's state forbids one; those before it were written.
@@ -151,7 +163,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             raise self.lost_error()
         try:
             for message in messages:
-                self.machine.send(message, answered=answered)
+                self.machine.send(message)
         finally:
             self._flush()
 

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
 # as plain integers: what an IntFlag does in Python costs more than all else that a status needs
-_RUNNING = int(Status.RUNNING)
-_FAILING = int(Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR)
+_TELLING = int(
+    Status.OVERTRIGGERED | Status.INPUT_CONTAINER | Status.SYSTEM_ERROR | Status.RUNNING
+)  # a change of these may mean that the trigger under way has failed
 
 _CURRENT = {"triggered", "nobody"}
 """Fates of what is not known to be an older trigger's."""
@@ -196,7 +197,7 @@ class Results:
             now: loop time.
         """
         was = previous or 0
-        if bits & ~was & _FAILING or was & ~bits & _RUNNING:
+        if (bits ^ was) & _TELLING:
             self._fail_trigger(bits & ~was, was & ~bits)
         if self.correlation.on_status(previous, bits):
             self._note_others()
@@ -325,13 +326,14 @@ class Results:
             return
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
-        match = self.correlation.judge(number, older=older)
+        correlation = self.correlation
+        match = correlation.judge_older(number) if older else correlation.judge(number)
         if match.fate == "held":
             if pending is not None and len(self._held) < pending.wanted:
                 self._held.append((container, now, at))
                 self._requests.ask_what_is_active()
                 return
-            match = self.correlation.judge(number, older=True)
+            match = correlation.judge_older(number)
         if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:

@@ -199,28 +199,27 @@ class Triggers:
         if numbering is not None:
             number, certain = correlation.take_number(numbering.highest)
         fenced = features.fences and not (certain and decided)
-        loop = connection.require_link().loop
+        link = connection.require_link()
         pending = PendingTrigger(
             request.results,
             number,
             certain,
             Progress(not fenced, not features.confirms),
-            loop.create_future(),
+            link.loop.create_future(),
             interpretation,
             request.input_data is not None,
-            loop.time(),
+            link.loop.time(),
             datetime.now(UTC),
             # where each application has its own interpreter none is read with another's layout
             request.expected if interpretation.by_application else state.active,
             [],
         )
-        return await self._await_results(pending, request.input_data, deadline)
+        return await self._await_results(pending, link, request.input_data, deadline)
 
     async def _await_results(
-        self, pending: PendingTrigger, input_data: bytes | None, deadline: float
+        self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
     ) -> list[Result]:
-        requests, features = self._requests, self._connection.features
-        outcome, link = pending.outcome, self._connection.require_link()
+        requests, features, outcome = self._requests, self._connection.features, pending.outcome
         fenced = not pending.progress.reached
         words: list[m.Message] = [_FENCE] if fenced else []
         if pending.number is not None:
@@ -234,9 +233,10 @@ class Triggers:
                 await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
         elif input_data is not None:
             words.append(m.SetInput(data=input_data))
+        words.append(_TRIGGER)
         self._results.begin_trigger(pending, deadline)
         try:
-            link.send(*words, _TRIGGER)
+            link.send_all(words)
             if fenced:
                 requests.expect_fence(pending.sent_at, deadline)
             if features.acknowledged:

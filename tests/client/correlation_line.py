@@ -126,14 +126,14 @@ class Line:
         """A container comes; what is held gets its fate later."""
         self.look()
         pending = self.pending
-        match = self.at.judge(number, older=older)
+        match = self.at.judge_older(number) if older else self.at.judge(number)
         if match.fate == "held":
             assert pending is not None
             if len(self.held) < pending.wanted:
                 self.held.append((number, container))
                 self.wants_query = True
                 return match
-            match = self.at.judge(number, older=True)
+            match = self.at.judge_older(number)
         self.judged.append((container, match))
         if match.fate == "triggered":
             assert pending is not None

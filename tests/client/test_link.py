@@ -141,7 +141,7 @@ async def test_receive_frame_in_pieces_is_one_event(server: Listener) -> None:
 
 async def test_send_several_messages_is_one_write_in_order(server: Listener) -> None:
     link, peer = await session(server)
-    link.send(m.Query(), m.Trigger())
+    link.send_all([m.Query(), m.Trigger()])
     assert await peer.read(24) == QUERY + TRIGGER
     link.abort()
 
@@ -154,7 +154,7 @@ async def test_send_illegal_message_raises_after_the_legal_ones_were_written(
     with pytest.raises(LocalProtocolError, match="Query cannot be sent"):
         link.send(m.Query())
     with pytest.raises(LocalProtocolError, match="QueryAnswer cannot be sent"):
-        link.send(m.Connect(), m.QueryAnswer(application=1))
+        link.send_all([m.Connect(), m.QueryAnswer(application=1)])
     assert await peer.read(12) == CONNECT
     link.abort()
 
@@ -559,7 +559,7 @@ async def test_trace_is_logged_where_debugging_is_on(
 
 async def udp_session(port: int) -> Link:
     link = await open_to(port, Transport.UDP)
-    link.send(m.Disconnect(), m.Connect())
+    link.send_all([m.Disconnect(), m.Connect()])
     assert await take(link, 1) == [m.ConnectAnswer(version=1)]
     return link
 
