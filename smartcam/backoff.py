@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Callable, Iterator  # noqa: TC003 - old pydantic looks them up
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from smartcam.exceptions import (
     CommandRejectedError,
@@ -14,6 +14,9 @@ from smartcam.exceptions import (
     PluginError,
     SmartCamError,
 )
+
+if TYPE_CHECKING:
+    import random
 
 __all__ = ["Backoff"]
 
@@ -78,7 +81,10 @@ class Backoff:
                 later, or a link that breaks as soon as it is made would be made without a pause.
             chance: where the jitter comes from; seed it for the same delays again.
         """
-        chance = chance or random.Random()  # noqa: S311 - spreads load, keeps no secret
+        if chance is None:
+            from random import Random  # which takes longer than all of this module
+
+            chance = Random()  # noqa: S311 - spreads load, keeps no secret
         delay, tried = self.initial, 0
         for _ in range(short_lived):
             delay = min(delay * self.factor, self.maximum)

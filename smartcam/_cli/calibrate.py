@@ -17,12 +17,7 @@ from smartcam._cli.calibrate_terminal import drive, listing_text
 from smartcam._cli.frame_sources import is_source, opened
 from smartcam._cli.options import CONNECTS, OUTPUT, Options, naming, option, runs
 from smartcam._cli.page import PageOptions, page_options
-from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import CalibrationError, ConfigurationError, UnsupportedError
-from smartcam.frames import FrameAddress
-from smartcam.models import Localization
-from smartcam.registry import FRAMES, PROTOCOLS
-from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
@@ -32,6 +27,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._sequence import Wizard
     from smartcam.calibration.wizards._services import CalibrationService
     from smartcam.frames import FrameSource
+    from smartcam.models import Localization
 
 ABORTED = 130
 """Exit code after an abort: as after Ctrl-C there is no calibration."""
@@ -144,6 +140,8 @@ async def wizard_command(
     if wizard is not None and check is not None:
         raise click.UsageError("--check asks for touches of marks: no --wizard beside it")
     if url is not None and _only_frames(url):
+        from smartcam.frames import FrameAddress
+
         said = FrameAddress.parse(url).shown
         raise ConfigurationError(
             f"{said} gives frames, no localizations: expected the URL of a camera that does, or "
@@ -196,6 +194,9 @@ async def _run(
 
 def _only_frames(url: str) -> bool:
     """Tell whether a URL is that of a source of frames, and of no camera."""
+    from smartcam.registry import FRAMES, PROTOCOLS
+    from smartcam.settings import is_fleet
+
     scheme = url.partition("://")[0] if is_source(url) else ""
     return scheme in FRAMES and scheme not in PROTOCOLS and not is_fleet(url)
 
@@ -323,6 +324,9 @@ class _Sources:
         return [*found, sheet_wizard(**pictures, connect=connect), hand_eye_wizard(**pictures)]
 
     async def localize(self) -> list[Localization]:
+        from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+        from smartcam.models import Localization
+
         options = self.options
         with options.camera(str(self.url)) as unopened:
             async with unopened as camera:
@@ -353,6 +357,7 @@ class _Sources:
 
     async def take_picture(self) -> Any:
         from smartcam.calibration.wizards._pictures import decode_picture
+        from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
         # the picture counts, not what the application says of it
         options = replace(self.options, interpret_as=None)

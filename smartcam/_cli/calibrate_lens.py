@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
-import numpy as np
 
 from smartcam._cli.frame_sources import is_source, opened
 from smartcam._cli.options import OUTPUT, Options, naming, option, runs
@@ -60,6 +59,8 @@ class Collecting:
 
 def _apart(one: TargetView, other: TargetView) -> float:
     """Return by how many pixels common points are apart, root of the mean square."""
+    import numpy as np
+
     _, here, there = np.intersect1d(one.ids, other.ids, return_indices=True)
     if not len(here):
         return np.inf

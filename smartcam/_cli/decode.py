@@ -8,19 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import OUTPUT, Options, from_hex, option, runs
+from smartcam._cli.options import DIALECTS, OUTPUT, Options, from_hex, option, runs
 from smartcam._cli.texts import table_text, value_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
-from smartcam.interpreters._base import Context, Interpreter, Reader, resolve, run
-from smartcam.protocols._bvs import BVS
-from smartcam.protocols._framed.constructs import view_fields
-from smartcam.protocols._framed.framing import Framer
-from smartcam.protocols.messages import ResultContainer, Sender
 
 if TYPE_CHECKING:
+    from smartcam.interpreters._base import Interpreter
     from smartcam.models import ByteOrder
     from smartcam.protocols._framed.dialect import FramedDialect
     from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols.messages import Sender
 
 
 @click.command(
@@ -34,7 +31,7 @@ if TYPE_CHECKING:
 @click.option(
     "--dialect",
     "dialect_name",
-    type=click.Choice(tuple(BVS.dialects)),
+    type=click.Choice(DIALECTS),
     help="Whose frames they are.",
 )
 @click.option("--quirks", metavar="NAMES", default="", help="The dialect's quirks, as in a URL.")
@@ -43,6 +40,9 @@ async def decode(
     data: str, big_endian: bool, dialect_name: str | None, quirks: str, options: Options
 ) -> None:
     """Print what bytes mean; a frame with a magic number shows its dialect by itself."""
+    from smartcam.interpreters._base import resolve
+    from smartcam.protocols._bvs import BVS
+
     payload = _load(data)
     if not payload:
         raise ConfigurationError("decode: there are no bytes to decode")
@@ -85,6 +85,8 @@ def _load(data: str) -> bytes:
 
 
 def _dialect_of(payload: bytes) -> FramedDialect | None:
+    from smartcam.protocols._bvs import BVS
+
     for dialect in BVS.dialects.values():
         if dialect.header.magic and payload.startswith(dialect.header.magic):
             return dialect
@@ -98,6 +100,8 @@ def _decode_frames(
     byte_order: ByteOrder,
     options: Options,
 ) -> None:
+    from smartcam.protocols._framed.framing import Framer
+
     framer = Framer(dialect.header, dialect.header.max_payload)
     framer.feed(payload)
     offset = 0
@@ -122,6 +126,9 @@ def _show_frame(
     options: Options,
 ) -> None:
     """Print one frame field by field, as each message that it can be."""
+    from smartcam.protocols._framed.constructs import view_fields
+    from smartcam.protocols.messages import ResultContainer
+
     raw = dialect.encode_frame(frame)
     for sender in _senders(dialect, frame):
         name = type(dialect.decode(sender, frame)).__name__  # says plainly if it is too short
@@ -148,6 +155,8 @@ def _show_frame(
 
 def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
     """Return the senders that the frame can have, by id and size; both where neither fits."""
+    from smartcam.protocols.messages import Sender
+
     exact = [
         sender
         for sender in Sender
@@ -158,5 +167,7 @@ def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
 
 
 def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:
+    from smartcam.interpreters._base import Context, Reader, run
+
     reader = Reader(payload, Context(byte_order=byte_order), interpreter.layout)
     return run(interpreter, reader)

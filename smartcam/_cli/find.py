@@ -14,20 +14,16 @@ import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.texts import table_text
-from smartcam.doctor._search import (
-    MAX_ADDRESSES,
-    MOST_ADDRESSES,
-    MOST_AT_ONCE,
-    MOST_RATE,
-    MOST_SECONDS,
-    CameraSearch,
-)
-from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
     from smartcam.doctor import FoundPort
+    from smartcam.doctor._search import CameraSearch
+
+MAX_ADDRESSES, MOST_ADDRESSES = 65_536, 1 << 24
+MOST_AT_ONCE, MOST_RATE, MOST_SECONDS = 1_000, 10_000.0, 60.0
+"""Bounds of a search, as the library has them: they stand here, too, for ``--help``."""
 
 PERIOD = 1.0
 """Seconds between two looks of the line that tells how far the search is."""
@@ -127,6 +123,8 @@ async def find(
 
     Raises ConfigurationError: something given cannot work, or consent is missing.
     """
+    from smartcam.doctor._search import CameraSearch
+
     if as_yaml and options.as_json:
         raise click.UsageError("--json and --yaml do not go together")
     known: dict[str, dict[str, str]] = {}
@@ -157,6 +155,7 @@ async def find(
 def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
     """Return the hosts of a fleet file's cameras, with names and URLs of these; and all names."""
     from smartcam.fleet import load_fleet
+    from smartcam.settings import parse_address
 
     found: dict[str, dict[str, str]] = {}
     plan = load_fleet(path).plan()

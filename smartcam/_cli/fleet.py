@@ -16,10 +16,7 @@ from smartcam._cli.terminal import tinted
 from smartcam._cli.texts import result_text, table_text
 from smartcam._cli.usage import JsonErrors, error_json
 from smartcam.backoff import Backoff
-from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import ConnectFailedError, SmartCamError
-from smartcam.fleet._keys import meets
-from smartcam.models import jsonable
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -153,6 +150,9 @@ async def _show_results(results: FleetResults[Any], options: Options) -> None:
 
 
 async def _show_events(events: Subscription[FleetEvent], pattern: str, options: Options) -> None:
+    from smartcam.fleet._keys import meets
+    from smartcam.models import jsonable
+
     async for event in events:
         fields: dict[str, Any] = jsonable(event)
         if meets(pattern, fields.get("camera", pattern)):
@@ -253,6 +253,8 @@ async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
 @click.option("--input", "input_hex", metavar="HEX", help="Input data for the inspections.")
 @runs(*_READING, "--timeout", *OUTPUT)
 async def trigger(url: str, pattern: str, input_hex: str | None, options: Options) -> None:
+    from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+
     data = None if input_hex is None else from_hex(input_hex, "--input")
     timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
     async with _opened(url, options) as opened:

@@ -12,8 +12,6 @@ from smartcam._cli.options import OUTPUT, Options, option, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.running import first
 from smartcam.exceptions import ConfigurationError
-from smartcam.frames import open as open_frames
-from smartcam.frames._reader import FRAME_TIMEOUT
 
 if TYPE_CHECKING:
     from smartcam.depth import ColourRange
@@ -42,6 +40,8 @@ LINGER: Final = 3.0
 @runs(*OUTPUT)
 async def colours(url: str, begin: str | None, web: PageOptions, options: Options) -> None:
     """Serve the page."""
+    from smartcam.frames import open as open_frames
+    from smartcam.frames._reader import FRAME_TIMEOUT
     from smartcam.web import ColourSite
 
     seconds = options.step(FRAME_TIMEOUT)

@@ -7,11 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from smartcam.exceptions import ConfigurationError
-from smartcam.frames._optional_imports import load
-from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -60,6 +56,10 @@ def numbered(file: str, count: int) -> list[str]:
 
 
 def _levels(frame: Frame, how: Encoding) -> NDArray[Any]:
+    import numpy as np
+
+    from smartcam.web._jpeg import picture
+
     seen = picture(frame, grey=how.grey)
     if how.eight and seen.dtype != np.uint8:
         seen = (seen >> (frame.format.depth - 8)).astype(np.uint8)
@@ -71,6 +71,8 @@ def _raw(frame: Frame, _how: Encoding) -> bytes:
 
 
 def _npy(frame: Frame, how: Encoding) -> bytes:
+    import numpy as np
+
     levels = _levels(frame, how) if how.grey or how.eight else frame.array()
     stream = io.BytesIO()
     np.save(stream, levels, allow_pickle=False)
@@ -78,6 +80,10 @@ def _npy(frame: Frame, how: Encoding) -> bytes:
 
 
 def _jpeg(frame: Frame, how: Encoding) -> bytes:
+    import numpy as np
+
+    from smartcam.web._jpeg import encoded, is_whole_jpeg
+
     if not how.grey and is_whole_jpeg(frame):
         return bytes(frame.data)
     levels = _levels(frame, how)
@@ -99,6 +105,10 @@ def _jxl(frame: Frame, how: Encoding) -> bytes:
 
 
 def _lossless(frame: Frame, how: Encoding, format: str, encode: str, **options: Any) -> bytes:
+    import numpy as np
+
+    from smartcam.frames._optional_imports import load
+
     if frame.format.name == format and not (how.grey or how.eight):
         return bytes(frame.data)
     levels = np.ascontiguousarray(_levels(frame, how))

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import FrameSourceError
-from smartcam.frames._synthetic import read_stamp
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -91,6 +90,8 @@ class _Stamps:
 
 
 def _stamp_of(frame: Frame) -> float | None:
+    from smartcam.frames._synthetic import read_stamp
+
     try:
         found = read_stamp(frame.grey()[:STAMP_ROWS])
     except FrameSourceError:  # of no brightness, or wrong bytes: no stamp

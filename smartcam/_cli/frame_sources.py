@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smartcam.frames import open as open_frames
-from smartcam.frames._reader import FRAME_TIMEOUT
-
 if TYPE_CHECKING:
     from smartcam._cli.options import Options
     from smartcam.frames import FrameSource
@@ -26,5 +23,8 @@ def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
 
     Raises ConfigurationError: the URL is wrong.
     """
+    from smartcam.frames import open as open_frames
+    from smartcam.frames._reader import FRAME_TIMEOUT
+
     seconds = options.step(FRAME_TIMEOUT)
     return open_frames(url, timeout=seconds, stall=seconds, linger=linger)

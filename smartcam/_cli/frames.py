@@ -22,10 +22,6 @@ from smartcam.exceptions import (
     FrameSourceError,
     SmartCamError,
 )
-from smartcam.frames import FrameDriver, discover
-from smartcam.frames._reader import FRAME_TIMEOUT
-from smartcam.models import jsonable
-from smartcam.registry import FRAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -67,6 +63,9 @@ frames.add_command(show)
 @option("--timeout", help="Bound of the search.  [default: 5]")
 @runs(*OUTPUT)
 async def list_(scheme: str | None, options: Options) -> None:
+    from smartcam.frames._reader import FRAME_TIMEOUT
+    from smartcam.registry import FRAMES
+
     known = [info.name for info in FRAMES.available()]
     schemes = known if scheme is None else [scheme]
     looks = await asyncio.gather(*(_look(one, options.step(FRAME_TIMEOUT)) for one in schemes))
@@ -97,6 +96,9 @@ async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | 
 
     A broken one costs only its own line.
     """
+    from smartcam.frames import discover
+    from smartcam.registry import FRAMES
+
     try:
         if scheme in FRAMES and _usual_discover(FRAMES.load(scheme)):
             return None
@@ -109,6 +111,8 @@ async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | 
 
 
 def _usual_discover(driver: Any) -> bool:
+    from smartcam.frames import FrameDriver
+
     return next(kind for kind in driver.__mro__ if "discover" in vars(kind)) is FrameDriver
 
 
@@ -194,6 +198,8 @@ async def grab(
     quality: int,
     options: Options,
 ) -> None:
+    from smartcam.frames._reader import FRAME_TIMEOUT
+
     suffix = Path(output).suffix.lower()
     if suffix == ".raw" and (grey or eight):
         raise click.UsageError("a .raw file has the bytes as they came: no --grey or --8-bit")
@@ -278,6 +284,8 @@ def _write(file: str, data: bytes) -> None:
 @option("--timeout", help=TIMEOUT)
 @runs(*OUTPUT)
 async def measure_command(url: str, options: Options) -> None:
+    from smartcam.models import jsonable
+
     async with opened(url, options) as source:
         value = await measure(source, options.seconds or 5.0)
     options.show(jsonable(value), measured_text)

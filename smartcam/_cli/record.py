@@ -16,7 +16,6 @@ from smartcam._cli.serve import share
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
 from smartcam.backoff import Backoff
-from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 from smartcam.exceptions import (
     CameraFaultError,
     ConfigurationError,
@@ -29,17 +28,12 @@ from smartcam.exceptions import (
     TriggerError,
     UnsupportedError,
 )
-from smartcam.fleet import FleetCamera
-from smartcam.recording import BagRecorder, FleetReplay, Recorder, load_recording, write_pcap
-from smartcam.recording import replay as replay_camera
-from smartcam.recording._bag_recording import BagConversion
-from smartcam.ros2._camera_reading import in_pixels, own_interpreter
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from smartcam.camera import Camera
-    from smartcam.recording import BagCounts, Recording
+    from smartcam.recording import BagCounts, FleetReplay, Recorder, Recording
 
 
 def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
@@ -94,6 +88,8 @@ async def record(
 
 def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Recorder]:
     """Return what is to be written."""
+    from smartcam.recording import BagRecorder, Recorder
+
     recorders: list[Recorder] = []
     if output is not None:
         recorders.append(Recorder(output, overwrite=force))
@@ -109,6 +105,10 @@ def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Reco
 async def _record(
     unopened: Camera, recorders: list[Recorder], every: float | None, options: Options
 ) -> None:
+    from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+    from smartcam.fleet import FleetCamera
+    from smartcam.ros2._camera_reading import in_pixels, own_interpreter
+
     opened: list[Recorder] = []
     facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
     try:
@@ -155,6 +155,8 @@ def _describe(recorders: list[Recorder], camera: str, **facts: object) -> None:
 
 
 def _word(recorder: Recorder) -> str:
+    from smartcam.recording import BagRecorder
+
     return "bag" if isinstance(recorder, BagRecorder) else "file"
 
 
@@ -205,6 +207,8 @@ async def _end_all(recorders: list[Recorder], camera: Camera, options: Options) 
 
 async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
     """End the file, and tell what is in it; without a session there is no file."""
+    from smartcam.recording import BagRecorder
+
     path = recorder.path
     await asyncio.to_thread(recorder.close)
     if isinstance(recorder, BagRecorder):
@@ -267,6 +271,9 @@ async def replay(
     options: Options,
 ) -> None:
     """Play a recording."""
+    from smartcam.recording import FleetReplay
+    from smartcam.recording import replay as replay_camera
+
     loaded = _loaded(recording, since, until)
     if loaded.files != (loaded.path,):
         if transport is not None:
@@ -330,6 +337,8 @@ async def pcap(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
     """Show a recording to Wireshark."""
+    from smartcam.recording import write_pcap
+
     count = write_pcap(_loaded(recording), output, camera=camera, overwrite=force)
     options.show({"file": output, "packets": count}, f"{output}: {count} packets")
 
@@ -351,6 +360,8 @@ async def bag(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
     """Show a recording to ROS 2."""
+    from smartcam.recording._bag_recording import BagConversion
+
     loaded = _loaded(recording)
     reading = options.reading(fleet=True) if options.calibration or options.y_down else {}
     conversion = BagConversion(
@@ -378,6 +389,8 @@ async def bag(
 
 def _loaded(path: str, since: datetime | None = None, until: datetime | None = None) -> Recording:
     """Return a recording; where it stops being readable stands on stderr."""
+    from smartcam.recording import load_recording
+
     loaded = load_recording(Path(path), since=since, until=until)
     for remark in loaded.remark.splitlines():
         click.echo(f"smartcam: note: {path}: {remark}", err=True)

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from smartcam._cli import find as command
 from smartcam._cli.find import fleet_lines, telling
 from smartcam.doctor import FoundPort
+from smartcam.doctor import _search as library
 from smartcam.doctor._search import CameraSearch
 from smartcam.fleet import load_fleet
 from tests.cli.commandline import emulators, run
@@ -58,6 +60,12 @@ def opened(server: socket.socket) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+def test_bounds_of_options_are_those_of_the_library() -> None:
+    bounds = ("MAX_ADDRESSES", "MOST_ADDRESSES", "MOST_AT_ONCE", "MOST_RATE", "MOST_SECONDS")
+    for name in bounds:
+        assert getattr(command, name) == getattr(library, name)
 
 
 def test_find_prints_a_table_and_how_it_went(port: int) -> None:

@@ -108,6 +108,32 @@ def test_help_imports_what_it_shows_and_nothing_else(main: str, argument: str) -
     assert {name.split(".")[1] for name in own} <= {"_cli", "_lazy", "exceptions"}
 
 
+HELPS = """
+import io, contextlib, click
+from smartcam._cli.smartcam import command
+def commands(group, *names):
+    yield names
+    for name in group.list_commands(None) if isinstance(group, click.Group) else ():
+        yield from commands(group.get_command(None, name), *names, name)
+for names in commands(command):
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        sys.argv = ["smartcam", *names, "--help"]
+        main(cli.main)
+    assert out.getvalue().startswith(" ".join(["Usage: smartcam", *names[:1]])), names
+    print(*names)
+"""
+"""Every command's help, those of groups too, in one process."""
+
+
+def test_help_of_a_command_imports_no_room() -> None:
+    found = imported_for(HELPS)
+    assert not found & (HEAVY - {"asyncio", "logging", "socket"})
+    own = {name for name in found if name.startswith("smartcam.")}
+    assert own >= {f"smartcam._cli.{listed.module}" for listed in LISTED.values()}
+    light = {"_cli", "_lazy", "backoff", "exceptions", "models"}
+    assert {name.split(".")[1] for name in own} <= light
+
+
 @pytest.mark.long
 def test_completion_knows_commands_and_options() -> None:
     for words, cword, wanted in (
