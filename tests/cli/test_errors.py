@@ -375,7 +375,7 @@ def test_command_interrupted_during_import_exits_130(
 ) -> None:
     (tmp_path / f"{name}.py").write_text("raise KeyboardInterrupt\n", encoding="utf-8")
     env = {"PYTHONPATH": str(tmp_path)}
-    given = [] if command == "protocols" else ["00"]
+    given = [] if command == "protocols" else ["505356420000000030000000"]  # decode: a Query
     with Process("smartcam", command, *given, env=env, fresh=True) as process:
         assert process.wait() == (130, "", "")
 
