@@ -81,7 +81,8 @@ class Storm:
         Args:
             what: whose account it is.
             losses: how often results may be in no account: what an agent that was killed had told
-                nobody, or what a camera made while no agent had a session. Each is a gap.
+                nobody, or what a camera made while no agent had a session. Each is a gap. On a
+                computer that has much to do an agent may give a session up, and begin anew.
             account: the program's; None: it has none.
         """
         if account is None:

@@ -60,6 +60,7 @@ class Site:
         here: those that each program sees connected.
         kills: of agents, by host.
         recording: whether each agent records, as it said last.
+        sessions: how many each camera has had, those of the pair apart.
         pair: who has the cameras of the pair.
         told: how often each program was told that one of these was lost.
     """
@@ -76,6 +77,7 @@ class Site:
         self.accounts: dict[int, Any] = {}
         self.kills: Counter[int] = Counter()
         self.recording: dict[int, bool] = {}
+        self.sessions: Counter[str] = Counter()
         self.clocks = FAKETIME.exists()
         self.boxes: dict[int, Part] = {}
         self.agents: dict[int, Part] = {}
@@ -207,6 +209,8 @@ class Site:
             self._changed.set()
         elif "session" in said:
             number, of = said["session"]
+            if of is not None and host != LINE:
+                self.sessions[f"host{host}/cam{number + 1}"] += 1
             if host == LINE:
                 self.pair.hear(PAIRED[number], of)
                 self._changed.set()
@@ -299,10 +303,13 @@ class Site:
             await self._end(part, START)
         for site, accounts in self.accounts.items():
             for name in self.names:
-                paired = name in PAIRED
-                losses = self.told[site][name] if paired else self.kills[int(name[4])]
+                # what a camera has sent into a session that ends may be lost with it
+                losses = self.told[site][name] if name in PAIRED else self.sessions[name] - 1
                 what = f"program {site}: {name}"
                 self.storm.judge_account(what, losses, accounts.get(name))
+        for name, sessions in self.sessions.items():
+            if sessions != 1 + self.kills[int(name[4])]:
+                self.storm.notes.append(f"{name} has had {sessions} sessions")
         self.storm.judge_memory()
 
     async def _end(self, part: Part, seconds: float, *, number: int | None = None) -> None:
