@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["Took", "imports_of", "median", "start"]
+__all__ = ["ENVIRONMENT", "Took", "imports_of", "median", "start"]
 
 PYTHON = [sys.executable, "-P", "-s"]
 
@@ -28,6 +28,12 @@ OURS = "smartcam"
 
 PATIENCE = 120.0
 """Seconds until a process that does not end is an error."""
+
+
+_NEVER_WRITTEN = "PYTHONDONTWRITEBYTECODE"
+"""Where that is set, each start would compile all that it imports, and be measured for it."""
+
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name != _NEVER_WRITTEN}
 
 
 class Took(NamedTuple):
@@ -42,7 +48,7 @@ class Took(NamedTuple):
     wall: float
 
 
-def start(arguments: Sequence[str], environment: Mapping[str, str] = os.environ) -> Took:
+def start(arguments: Sequence[str], environment: Mapping[str, str] = ENVIRONMENT) -> Took:
     """Run Python with these arguments and without output; return what it took."""
     command = [*PYTHON, *arguments]
     with Path(os.devnull).open("wb") as nowhere:

@@ -8,7 +8,6 @@ smartcam's, in the same order, and does nothing with them: numpy is in it only i
 
 from __future__ import annotations
 
-import os
 import tempfile
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.measure import Comparison, Goal, Plan, Series, take_turns
 from benchmarks.peers import peer
-from benchmarks.starts import imports_of, median, start
+from benchmarks.starts import ENVIRONMENT, imports_of, median, start
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -86,7 +85,7 @@ def _plugin(plan: Plan, plugins: list[str], starts: int) -> Comparison:
         test = Path(folder, "test_nothing.py")
         test.write_text("def test_nothing():\n    pass\n", encoding="ascii")
         command = [*PYTEST, "--rootdir", folder, str(test)]
-        environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
+        environment = {**ENVIRONMENT, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
         series = take_turns(
             plan,
             {
