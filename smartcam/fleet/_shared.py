@@ -127,8 +127,7 @@ class TappedListeners(Listeners):
             self.tap.end()
 
     def offer_status(self, status: Status, now: float) -> None:
-        if self.statuses.references:
-            super().offer_status(status, now)
+        super().offer_status(status, now)
         if self.tap is not None:
             self.tap.status(status)
 
