@@ -354,10 +354,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if isinstance(last, LinkFailed):
             self._lose(last.error)
             self._transport.abort()
-        elif not self._paused and self.machine.transport is Transport.TCP:
-            self._paused = frames > self._most or len(self._chunks) >= MAX_CHUNKS
-            if self._paused:
-                self._transport.pause_reading()
+        elif frames > self._most or len(self._chunks) >= MAX_CHUNKS:
+            self._pause()
         self._doorbell.ring()
 
     async def _give_way(self) -> None:
@@ -376,6 +374,11 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         frames = int(self._busy_with * turn / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # once is no rule
         self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
+
+    def _pause(self) -> None:
+        if not self._paused and self.machine.transport is Transport.TCP:
+            self._paused = True
+            self._transport.pause_reading()
 
     def _resume(self) -> None:
         if self._paused:

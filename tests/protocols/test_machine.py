@@ -45,6 +45,7 @@ from tests.machines import (
     feed,
     label,
     machine,
+    request_for,
 )
 from tests.strategies import over
 
@@ -600,7 +601,7 @@ def test_trace_says_nothing_of_what_could_not_be_sent() -> None:
     assert seen == []
 
 
-# ---------------------------------------------------------------------- statuses that came before
+# ---------------------------------------------------------------------- messages that came before
 
 
 @pytest.mark.parametrize("dialect", DIALECTS, ids=label)
@@ -656,7 +657,79 @@ def test_statuses_of_many_kinds_are_all_told() -> None:
     said = [m.StatusReport(status=Status(0x80), endian=number) for number in range(200)] * 2
     made.receive_data(b"".join(map(HANDBOOK.encode, said)))
     assert made.events() == said
-    assert len(made._familiar) == MAX_FAMILIAR
+    assert len(made._familiar[0x12]) == MAX_FAMILIAR
+
+
+TOLD_UNASKED_TOO = (m.ConnectAnswer, m.DisconnectAnswer, m.StatusReport)
+ANSWERS = [
+    (dialect, answer)
+    for dialect, answer in EVERYTHING
+    if request_for(answer, dialect) is not None and type(answer) not in TOLD_UNASKED_TOO
+]
+
+
+@pytest.mark.parametrize(
+    ("dialect", "answer"),
+    ANSWERS,
+    ids=[f"{dialect.label}-{label(answer)}" for dialect, answer in ANSWERS],
+)
+def test_answer_that_came_before_is_told_once_a_request_and_else_counted(
+    dialect: FramedDialect, answer: m.Message
+) -> None:
+    request = request_for(answer, dialect)
+    assert request is not None
+    made, frame = client(dialect), dialect.encode(answer)
+    for turn in range(1, 4):
+        made.send(request)
+        with pytest.raises(LocalProtocolError, match="still owed"):
+            made.send(request)
+        made.receive_data(frame * 2)
+        assert made.events() == [answer]
+        assert made._open == set()
+        assert made.counters.unexpected_messages == turn
+        assert made.counters.frames_received == 1 + 2 * turn
+
+
+def test_message_that_another_link_knows_is_refused_where_it_is_above_the_limit() -> None:
+    feed(client(), STATUS * 2)
+    made = client(max_length=7)
+    made.receive_data(STATUS)
+    assert "announces 8 bytes of payload; 0 to 7 are accepted" in str(failure(made.events()))
+
+
+def test_answer_that_came_before_is_refused_where_none_may_come() -> None:
+    made = client()
+    made.send(m.Query())
+    assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+    made.send(m.Disconnect())
+    assert feed(made, QUERY_ANSWER) == []
+    made.send(m.Connect())
+    made.receive_data(QUERY_ANSWER)
+    assert "where it is not expected" in str(failure(made.events()))
+
+
+def test_answer_that_came_before_waits_for_its_last_byte() -> None:
+    made = client()
+    made.send(m.Query())
+    assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+    for cut in range(1, len(QUERY_ANSWER)):
+        made.send(m.Query())
+        assert feed(made, QUERY_ANSWER[:cut]) == []
+        assert made.pending == QUERY_ANSWER[:cut]
+        assert feed(made, QUERY_ANSWER[cut:]) == [m.QueryAnswer(application=21)]
+
+
+def test_answer_that_refuses_is_not_taken_for_what_stood_in_front_of_it() -> None:
+    """It is a code alone: a frame as long as the answer's begins in the one before it."""
+    made = client(BID)
+    made.send(m.GetClock())
+    refusal = bytes.fromhex("3200 0200 1a00")
+    frame = BID.header.pack(0x32, 14) + bytes(8) + refusal
+    made.receive_data(BID.encode(result(frame.removesuffix(refusal))) + refusal)
+    assert isinstance(made.events()[1], m.ClockAnswer)
+    made.send(m.GetClock())
+    made.receive_data(frame)
+    assert made.events() == [BID.decode(CAMERA, Frame(0x32, frame[4:]))]
 
 
 def test_status_that_came_before_is_traced_each_time() -> None:

@@ -18,24 +18,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.exceptions import FrameError, MessageError
+from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Policy
 from smartcam.protocols._bvs import HANDBOOK, THESIS
 from smartcam.protocols._framed import framing, machine
 from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import (
-    ALIKE,
-    DEFAULT_MAX_LENGTH,
-    Frame,
-    Framer,
-    HeaderLayout,
-)
+from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
 from smartcam.protocols._framed.machine import LinkFailed, Machine, ResultBurst, State
 from tests.machines import DIALECTS, client, label, one_by_one
 
-LARGE, FIRST_READ, MOST_READ = 32, 32, 128
+LARGE, FIRST_READ, MOST_READ, ALIKE = 32, 32, 128, 3
 SIZES = st.one_of(
     st.integers(0, 40),
     st.integers(0, 300),
@@ -57,7 +51,9 @@ each_header = pytest.mark.parametrize(
 
 @contextlib.contextmanager
 def small_buffers() -> Iterator[None]:
-    with mock.patch.multiple(framing, LARGE=LARGE, FIRST_READ=FIRST_READ, MOST_READ=MOST_READ):
+    with mock.patch.multiple(
+        framing, LARGE=LARGE, FIRST_READ=FIRST_READ, MOST_READ=MOST_READ, ALIKE=ALIKE
+    ):
         yield
 
 
@@ -258,9 +254,20 @@ def words(dialect: FramedDialect, limit: int) -> st.SearchStrategy[bytes]:
         ),
         results.map(lambda frame: b"?" + frame[1:]),
     )
-    runs = st.lists(results, min_size=1, max_size=6).map(b"".join)
-    alike = st.builds(bytes.__mul__, results, st.integers(ALIKE - 1, 2 * ALIKE + 2))
-    return st.lists(st.one_of(runs, runs, alike, other), max_size=6).map(b"".join)
+    alike = st.builds(
+        lambda word, count, times: b"".join(
+            framed(0x20, word + bytes([number]) * count) for number in range(times)
+        ),
+        word,
+        st.integers(0, 9),
+        st.integers(ALIKE - 1, 3 * ALIKE + 2),
+    )
+    statuses = [m.StatusReport(status=Status(bits)) for bits in (0x80, 0x280)]
+    again = st.sampled_from(
+        [dialect.encode(one) for one in (*statuses, m.QueryAnswer(application=5))]
+    )
+    runs = st.lists(st.one_of(results, alike, again), min_size=1, max_size=6).map(b"".join)
+    return st.lists(st.one_of(runs, runs, other), max_size=6).map(b"".join)
 
 
 def outcome(made: Machine, events: list[Any]) -> tuple[Any, ...]:
@@ -274,10 +281,10 @@ def outcome(made: Machine, events: list[Any]) -> tuple[Any, ...]:
 
 @each_dialect
 @given(data=st.data(), limit=st.sampled_from([24, 100, 300]), reads=READS, strict=st.booleans())
-def test_bursts_are_the_containers_that_come_one_by_one(
+def test_bursts_and_what_came_before_are_the_frames_that_come_one_by_one(
     dialect: FramedDialect, limit: int, reads: list[int], strict: bool, data: st.DataObject
 ) -> None:
-    stream = data.draw(words(dialect, limit))
+    parts = data.draw(st.lists(words(dialect, limit), min_size=1, max_size=3))
     # where frames that are broken are dropped, nothing else may be: how often depends on the cuts
     fatal = (FrameError, MessageError) if strict else (FrameError,)
     options: Any = {"max_length": limit, "policy": Policy(fatal=fatal, exact_length=False)}
@@ -285,27 +292,34 @@ def test_bursts_are_the_containers_that_come_one_by_one(
     with small_buffers():
         alone, fed, written = (client(dialect, **options) for _ in range(3))
         looked_at = client(dialect, trace=lambda *what: traced.append(what), **options)
-        traced.clear()
+        machines = (alone, fed, written, looked_at)
         events: list[list[Any]] = [[], [], [], []]
-        for place in range(len(stream)):
-            alone.receive_data(stream[place : place + 1])
-            events[0] += alone.events()
-        assert not any(isinstance(one, ResultBurst) for one in events[0])
-        turns, at = cycle(reads), 0
-        while at < len(stream):
-            count = read_into(written, stream[at:], next(turns))
-            fed.receive_data(stream[at : at + count])
-            looked_at.receive_data(stream[at : at + count])
-            at += count
-            for made, seen in zip((fed, written, looked_at), events[1:], strict=True):
-                seen += made.events()
+        turns = cycle(reads)
+        for part in parts:
+            for made in machines:
+                with contextlib.suppress(LocalProtocolError):  # it is still owed, or has failed
+                    made.send(m.Query())
+            for place in range(len(part)):
+                alone.receive_data(part[place : place + 1])
+                events[0] += alone.events()
+            at = 0
+            while at < len(part):
+                count = read_into(written, part[at:], next(turns))
+                fed.receive_data(part[at : at + count])
+                looked_at.receive_data(part[at : at + count])
+                at += count
+                for made, seen in zip(machines[1:], events[1:], strict=True):
+                    seen += made.events()
+    assert not any(isinstance(one, ResultBurst) for one in events[0])
     expected = outcome(alone, events[0])
     assert outcome(fed, one_by_one(events[1])) == expected
     assert outcome(written, one_by_one(events[2])) == expected
     assert outcome(looked_at, events[3]) == expected  # not a burst among them
-    frames = [what for _, what in traced if isinstance(what, Frame)]
-    assert len(frames) == looked_at.counters.frames_received - 1  # and the answer to Connect
-    assert stream.startswith(b"".join(map(dialect.encode_frame, frames)))
+    heard = [what for sender, what in traced if sender is m.Sender.CAMERA]
+    frames = [what for what in heard if isinstance(what, Frame)]
+    assert len(frames) == looked_at.counters.frames_received
+    frames = frames[1:]  # without the answer to Connect
+    assert b"".join(parts).startswith(b"".join(map(dialect.encode_frame, frames)))
 
 
 SMALL = m.ResultContainer(application=5, data=bytes(40))

@@ -47,7 +47,7 @@ from smartcam.protocols.messages import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 
 class MessageRow(NamedTuple):
@@ -169,11 +169,12 @@ class Codec:
         self._meaning = dialect.code
         self._known: dict[bytes, Message] = {}  # bodies that came before: messages are immutable
         # what fills the slots of a frozen message, in half the time of its own constructor
-        names = [name for name, _ in fields]
-        others = [one for one in dataclasses.fields(row.type) if one.name not in names]
-        names += [one.name for one in others]
-        self._fill = [vars(_owner(row.type, name))[name].__set__ for name in names]
-        self._omitted = tuple(one.default for one in others)
+        self._fill = [_filler(row.type, name) for name in self.names]
+        self._omitted = [
+            (_filler(row.type, one.name), one.default)
+            for one in dataclasses.fields(row.type)
+            if one.name not in self.names
+        ]
 
     @property
     def may_be_a_code(self) -> bool:
@@ -238,14 +239,18 @@ class Codec:
 
     def _make(self, values: tuple[Any, ...]) -> Message:
         message = object.__new__(self.type)
-        for fill, value in zip(self._fill, values + self._omitted, strict=True):
+        for at, fill in enumerate(self._fill):
+            fill(message, values[at])
+        for fill, value in self._omitted:
             fill(message, value)
         return message
 
 
-def _owner(message_type: type[Message], name: str) -> type[Message]:
-    """Return the class of the slot: slots of a base class stand there."""
-    return next(one for one in message_type.__mro__ if name in vars(one))
+def _filler(message_type: type[Message], name: str) -> Callable[[Message, Any], None]:
+    """Return what fills a slot; those of a base class stand there."""
+    owner = next(one for one in message_type.__mro__ if name in vars(one))
+    fill: Callable[[Message, Any], None] = vars(owner)[name].__set__
+    return fill
 
 
 class WireQuirk(NamedTuple):

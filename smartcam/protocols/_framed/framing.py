@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from smartcam.exceptions import FrameError, hex_excerpt
 
@@ -29,9 +29,6 @@ manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."
 LARGE = 1 << 12
 """Bytes of a frame from which on its rest is collected in a buffer of its own. Below it an
 unfinished frame is copied in front of the next chunk, which costs less."""
-
-
-T = TypeVar("T")
 
 Buffer: TypeAlias = bytes | memoryview
 Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
@@ -52,7 +49,7 @@ LEAST_READ = 1 << 10
 
 
 ALIKE = 16
-"""Frames that begin with the same bytes and are cut at once."""
+"""Frames that are cut at once where they begin with the same bytes, the length among them."""
 
 
 class Frame(NamedTuple):
@@ -121,8 +118,8 @@ class Framer:
     """
 
     __slots__ = (
-        *("buffer", "_always", "_filled", "_header", "_large", "_lengths", "_max_length"),
-        *("_most", "_read", "_start", "_store", "_window"),
+        *("buffer", "start", "_always", "_filled", "_header", "_large", "_lengths"),
+        *("_max_length", "_most", "_read", "_store", "_window"),
     )
 
     def __init__(self, header: HeaderLayout, max_length: int = DEFAULT_MAX_LENGTH) -> None:
@@ -134,7 +131,7 @@ class Framer:
         self.buffer: Buffer = (
             b""  # a chunk as it came, or one large frame: of it cut() tells places
         )
-        self._start = 0
+        self.start: int = 0  # where in it the next frame begins
         self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
         self._filled = 0
         self._store = memoryview(b"")  # where a transport writes; large frames stay there
@@ -153,29 +150,29 @@ class Framer:
     @property
     def buffered(self) -> int:
         """Bytes kept for the next frame."""
-        return self._filled if self._large is not None else len(self.buffer) - self._start
+        return self._filled if self._large is not None else len(self.buffer) - self.start
 
     @property
     def pending(self) -> bytes:
         """Copy of the bytes kept, for traces and error texts."""
         if self._large is not None:
             return bytes(self._large[: self._filled])
-        return bytes(self.buffer[self._start :])
+        return bytes(self.buffer[self.start :])
 
     def feed(self, data: bytes | bytearray | memoryview) -> None:
         """Take bytes; call :meth:`cut` or :meth:`next_frame` until it returns None."""
         large = self._large
         if large is None:
-            buffer, start = self.buffer, self._start
+            buffer, start = self.buffer, self.start
             rest = bytes(buffer[start:]) if start < len(buffer) else b""
-            self.buffer, self._start = rest + data if rest else bytes(data), 0
+            self.buffer, self.start = rest + data if rest else bytes(data), 0
             return
         filled, missing = self._filled, len(large) - self._filled
         if len(data) <= missing:
             large[filled : filled + len(data)] = data
             self._fill(len(data))
             return
-        self.buffer, self._start, self._large = b"".join((large[:filled], data)), 0, None
+        self.buffer, self.start, self._large = b"".join((large[:filled], data)), 0, None
 
     def room(self) -> memoryview:
         """Return the buffer for a transport's next bytes; call :meth:`filled` next.
@@ -202,13 +199,13 @@ class Framer:
             self._most = MOST_READ
         elif count < self._most:
             self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
-        if self._start < len(self.buffer):
+        if self.start < len(self.buffer):
             self.feed(data)
         elif count >= LARGE and self._header_at(data, 0)[1] >= LARGE:
-            self.buffer, self._start = data, 0  # not copied: it is cut before the next bytes come
+            self.buffer, self.start = data, 0  # not copied: it is cut before the next bytes come
             self._window = self._store
         else:
-            self.buffer, self._start = bytes(data), 0
+            self.buffer, self.start = bytes(data), 0
             if len(self._window) > MOST_READ:
                 self._window = self._store[:MOST_READ]
         return True
@@ -229,7 +226,7 @@ class Framer:
         """
         if self._large is not None:
             return None
-        header, buffer, start = self._header, self.buffer, self._start
+        header, buffer, start = self._header, self.buffer, self.start
         available = len(buffer) - start
         if available < header.size:
             if available:
@@ -252,27 +249,12 @@ class Framer:
             else:
                 self._keep(start)
             return None
-        self._start = end
+        self.start = end
         return message_id, begin, end
 
     def take(self, begin: int, end: int) -> bytes:
         """Return the bytes at a place that :meth:`cut` told."""
         return bytes(self.buffer[begin:end])
-
-    def familiar(self, known: Mapping[bytes, T], size: int) -> list[T]:
-        """Return what is known of the frames that come next, as long as one is known.
-
-        ``known``: by their bytes, ``size`` each, header included.
-        """
-        buffer, start = self.buffer, self._start
-        found: list[T] = []
-        if isinstance(buffer, memoryview):
-            return found
-        while (one := known.get(buffer[start : start + size])) is not None:
-            found.append(one)
-            start += size
-        self._start = start
-        return found
 
     def following(self, read: Read, like: int, size: int) -> list[bytes]:
         """Return the payloads of the whole frames that come next and are of the same kind.
@@ -281,7 +263,7 @@ class Framer:
         ``like``; their other bytes are returned. The first that differs ends it, errors included.
         ``read``: a header's reader with ``size`` bytes more.
         """
-        header, buffer, start = self._header, self.buffer, self._start
+        header, buffer, start = self._header, self.buffer, self.start
         found: list[bytes] = []
         available, id_first, before = len(buffer), header.id_first, header.size
         least, last = before + size, available - before - size
@@ -292,9 +274,11 @@ class Framer:
             wanted, other = other, wanted
         before -= header.length_includes
         longest = self._max_length + header.length_includes
-        head = buffer[like : like + header.size + size]
-        if other <= longest and buffer.startswith(head, start):
-            start = _cut_alike(buffer, start, head, before + other, found)
+        length = before + other
+        if start + ALIKE * length <= available and length >= least and other <= longest:
+            head, end = buffer[like : like + least], start + (ALIKE - 1) * length
+            if buffer[start : start + least] == head == buffer[end : end + least]:
+                start = _cut_alike(buffer, start, head, length, found)
         while start <= last:
             mark, message_id, length, begins = read(buffer, start)
             if not id_first:
@@ -311,7 +295,7 @@ class Framer:
                 break
             found.append(buffer[start + least : end])
             start = end
-        self._start = start
+        self.start = start
         return found
 
     def unfinished(self) -> tuple[int, int] | None:
@@ -319,7 +303,7 @@ class Framer:
 
         None where not even the header is there. To be asked when :meth:`cut` has returned None.
         """
-        buffer, start = (self.buffer, self._start) if self._large is None else (self._large, 0)
+        buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         if self.buffered < self._header.size:
             return None
         message_id, size = self._header_at(buffer, start)
@@ -333,7 +317,7 @@ class Framer:
         begin.
         """
         header = self._header
-        buffer, start = (self.buffer, self._start) if self._large is None else (self._large, 0)
+        buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         begin = max(begin, header.size)
         data = bytes(buffer[start + begin : start + self.buffered])
         at = data.find(header.magic) if header.magic else -1
@@ -360,27 +344,27 @@ class Framer:
         """
         magic = self._header.magic
         if self._large is not None:
-            self.buffer, self._start, self._large = self.pending, 0, None
-        begin = self._start
+            self.buffer, self.start, self._large = self.pending, 0, None
+        begin = self.start
         found = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
             keep = min(len(magic) - 1, max(self.buffered - 1, 0)) if magic else 0
             while keep and not magic.startswith(bytes(self.buffer[-keep:])):
                 keep -= 1
             found = len(self.buffer) - keep
-        self._start = found
+        self.start = found
         return found - begin
 
     def clear(self) -> None:
         """Drop everything kept."""
-        self.buffer, self._start, self._large = b"", 0, None
+        self.buffer, self.start, self._large = b"", 0, None
 
     def _fill(self, count: int) -> None:
         """Count bytes of a large frame that came, and finish it if it is whole."""
         self._filled += count
         large = self._large
         if large is not None and self._filled == len(large):
-            self.buffer, self._start, self._large = large, 0, None
+            self.buffer, self.start, self._large = large, 0, None
 
     def _header_at(self, buffer: Buffer, at: int) -> tuple[int, int]:
         """Return message id and bytes of payload that the header at a place announces."""
@@ -392,26 +376,26 @@ class Framer:
     def _keep(self, start: int) -> None:
         """Keep the rest of a chunk that was a view."""
         if isinstance(self.buffer, memoryview):
-            self.buffer, self._start = bytes(self.buffer[start:]), 0
+            self.buffer, self.start = bytes(self.buffer[start:]), 0
 
     def _collect(self, size: int) -> None:
         """Collect the rest of a large frame of ``size`` bytes in all where a transport writes."""
-        begun = self.buffer[self._start :]
+        begun = self.buffer[self.start :]
         in_place = isinstance(begun, memoryview) and begun.obj is self._store.obj
         if len(self._store) < size:
             self._window = self._store = memoryview(bytearray(size))
             in_place = False
-        if not in_place or self._start:
+        if not in_place or self.start:
             self._store[: len(begun)] = begun
         self._large, self._filled = self._store[:size], len(begun)
-        self.buffer, self._start = b"", 0
+        self.buffer, self.start = b"", 0
 
     def _check_length(self, message_id: int, size: int) -> None:
         longest = self._max_length
         if message_id in self._lengths:
             longest = min(longest, self._lengths[message_id].stop - 1)
         if not 0 <= size <= longest:
-            header, start = self._header, self._start
+            header, start = self._header, self.start
             raise FrameError(
                 f"a frame of message {message_id:#04x} announces {size} bytes of payload; "
                 f"0 to {longest} are accepted",
@@ -432,23 +416,26 @@ class Framer:
 
 
 def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[bytes]) -> int:
-    """Cut frames that begin with ``head``, sixteen at a time; return the place of the next one.
+    """Cut frames of ``length`` bytes that begin with ``head``, in which that length is told.
 
-    The length is in the head, so each has ``length`` bytes. Those behind the head go to ``found``.
+    Sixteen at a time, all or none of them: the first that differs may have another length, and what
+    would be cut behind it is no frame. What is behind the heads goes to ``found``.
+
+    Returns:
+        The place of the next frame.
     """
-    end = len(buffer) - ALIKE * length
-    if start <= end and length >= len(head):
-        cut = _cutter(len(head), length - len(head))
-        while start <= end:
-            parts = cut(buffer, start)
-            if parts[::2].count(head) < ALIKE:
-                break
-            found += parts[1::2]
-            start += ALIKE * length
+    cut = _cutter(ALIKE, len(head), length - len(head))
+    last = len(buffer) - ALIKE * length
+    while start <= last:
+        parts = cut(buffer, start)
+        if parts[::2].count(head) < ALIKE:
+            break
+        found += parts[1::2]
+        start += ALIKE * length
     return start
 
 
 @functools.lru_cache(maxsize=64)
-def _cutter(head: int, rest: int) -> Read:
-    """Return what cuts so many frames into heads and the bytes behind them, by turns."""
-    return struct.Struct(f"{head}s{rest}s" * ALIKE).unpack_from
+def _cutter(count: int, head: int, rest: int) -> Read:
+    """Return what cuts ``count`` frames into heads and the bytes behind them, by turns."""
+    return struct.Struct(f"{head}s{rest}s" * count).unpack_from

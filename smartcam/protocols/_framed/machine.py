@@ -41,7 +41,8 @@ the receive task takes in a turn, so that reading would have to pause after each
 
 
 MAX_FAMILIAR = 64
-"""Statuses that are known by their frames: a camera has a handful, and a peer could send any."""
+"""Messages of a kind that are known by their frames: of statuses and answers a camera has a handful
+each, and a peer could send any."""
 
 
 class State(enum.Enum):
@@ -140,7 +141,7 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 """The same by state and sender, for the way of every message."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(slots=True, kw_only=True)
 class ResultBurst:
     """Result containers of one application, one right after the other; two or more as they come.
 
@@ -312,6 +313,7 @@ class Machine:
         self.counters: Counters = Counters()
         self._policy = policy or POLICIES[role, transport]
         self._bounded = self._policy.bounded
+        self._header_size = dialect.header.size
         self._framer = Framer(dialect.header, max_length)
         self._begun, self._begun_at = -1, 0.0  # number of the unfinished frame, when it was seen
         self._unfinished = frame_age.Unfinished()
@@ -320,11 +322,14 @@ class Machine:
         self._outbox: list[bytes] = []
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
         self._sender = role.receives
+        self._plain = role is Role.CLIENT and trace is None
         self._decoders: dict[int, Codec] = {}
-        # whole frames of statuses that came before, and what they are; of this state only
-        self._familiar: dict[bytes, Message] = {}
-        self._take_up(dialect)
+        # by ids: whole frames that came before, and what they are; of this state only
+        self._familiar: dict[int, dict[bytes, Message]] = {}
+        self._statuses: dict[bytes, Message] = {}  # those of statuses
+        self._status_id = self._status_size = 0
         self.state = State.IDLE
+        self._take_up(dialect)
 
     def adopt(self, dialect: Dialect) -> None:
         """Speak this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
@@ -348,9 +353,8 @@ class Machine:
         self._burst_reader = dialect.header.reader(result.size)
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
-        self._familiar = {}
-        plain = self.role is Role.CLIENT and self._trace is None
-        self._takes_bursts = plain and result.size > 0
+        self._takes_bursts = self._plain and result.size > 0
+        self._forget_familiar()
 
     @property
     def state(self) -> State:
@@ -361,9 +365,10 @@ class Machine:
     def state(self, state: State) -> None:
         self._state = state
         self._deaf = state is State.FAILED or state is State.CLOSED
+        self._narrows = state is State.CONNECTING
         self._may_come = _SAID[state, self._sender]
         self._may_go = _SAID[state, self.role.sends]
-        self._familiar = {}
+        self._forget_familiar()
 
     # ------------------------------------------------------------------ bytes in
 
@@ -410,14 +415,14 @@ class Machine:
         if self._deaf:
             return False
         self.counters.bytes_received += count
-        cut = self._framer.filled(count)
+        cut, left = self._framer.filled(count), True
         if cut:
             before = self.counters.frames_received
-            self._receive_frames()
+            left = self._receive_frames()
             came = self.counters.frames_received - before
             if came > MANY_FRAMES or len(self._events) > MANY_EVENTS:
                 self._framer.read_less()
-        if self._bounded and self._framer.buffered:
+        if left and self._bounded:
             number = self.counters.frames_received
             if number != self._begun:
                 self._begun, self._begun_at = number, now
@@ -492,43 +497,69 @@ class Machine:
 
     # ------------------------------------------------------------------ inside
 
-    def _receive_frames(self) -> None:
-        """Make events of the whole frames that are there."""
+    def _receive_frames(self) -> bool:
+        """Make events of the whole frames that are there; return whether a part of one is left."""
         framer = self._framer
         self._receive_familiar()
-        while True:
+        while framer.start < len(framer.buffer):
             try:
                 found = framer.cut()
             except RemoteProtocolError as error:
                 if self._reject(error):
-                    return
+                    return False
                 framer.resync()
                 continue
             if found is None:
-                return
+                return True
             message = self._receive_frame(*found)
-            if self._deaf:
-                return
-            if self._receive_familiar() or not self._takes_bursts:
+            if framer.start == len(framer.buffer) or self._receive_familiar():
                 continue
-            if isinstance(message, m.ResultContainer) and self._receive_burst(message, found[1]):
+            if (
+                self._takes_bursts
+                and isinstance(message, m.ResultContainer)
+                and self._receive_burst(message, found[1])
+            ):
                 self._receive_familiar()
+        return False
 
     def _receive_familiar(self) -> bool:
-        """Take the statuses that come next and came before, byte for byte; say whether any did.
+        """Take the messages that come next and came before, byte for byte; say whether any did.
 
-        A camera has few of them, and sends two around each result.
+        A camera has few statuses, and sends two around each result. Of answers those that are owed.
         """
-        if not self._familiar:
+        statuses, framer = self._statuses, self._framer
+        buffer, start = framer.buffer, framer.start
+        if not self._plain or isinstance(buffer, memoryview):
             return False
-        found = self._framer.familiar(self._familiar, self._status_size)
-        if not found:
-            return False
-        self._events += found
-        self.counters.frames_received += len(found)
-        if self._open:
-            self._open.discard(self._status_id)
-        return True
+        size, owed, frames = self._status_size, self._open, 0
+        while True:
+            end = start + size
+            message = statuses.get(buffer[start:end])
+            if message is not None:
+                if owed:
+                    owed.discard(self._status_id)
+            elif not owed or (answer := self._find_answer(buffer, start)) is None:
+                break
+            else:
+                message, end = answer
+            self._events.append(message)
+            start = end
+            frames += 1
+        framer.start = start
+        self.counters.frames_received += frames
+        return frames > 0
+
+    def _find_answer(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
+        """Return the next message and its end if it came before, is an answer and owed."""
+        for message_id in self._open:
+            frames = self._familiar.get(message_id)
+            if frames:
+                end = start + self._header_size + self._decoders[message_id].size
+                message = frames.get(buffer[start:end])
+                if message is not None:
+                    self._open.remove(message_id)
+                    return message, end
+        return None
 
     def _is_overdue(self, now: float) -> bool:
         """Return whether the frame that is begun will not become whole; then it is rejected."""
@@ -570,7 +601,7 @@ class Machine:
         """Make a message of a frame whose payload is at a place of the framer's; None: dropped."""
         counters, framer, size = self.counters, self._framer, end - begin
         counters.frames_received += 1
-        if self._state is State.CONNECTING and len(self.kin) > 1:
+        if self._narrows and len(self.kin) > 1:
             self._narrow(message_id, size)
         if self._trace is not None:
             self._trace(self._sender, Frame(message_id, framer.take(begin, end)))
@@ -594,10 +625,10 @@ class Machine:
             return None
         if surplus > 0:
             counters.long_bodies += 1
-        elif kind is m.StatusReport:
-            self._note_familiar(message, end)
         if following is not self._state:
             self.state = following
+        elif self._plain and codec is not None and size == codec.size and not codec.has_data:
+            self._note_familiar(codec, message, end)
         if kind in _BY_ITSELF:
             if self._open:  # asked for, in a dialect or by a raw request
                 self._open.discard(message_id)
@@ -628,14 +659,16 @@ class Machine:
             )
         return codec.decode(payload, 0, len(payload)), surplus
 
-    def _note_familiar(self, status: Message, end: int) -> None:
-        """Know a status by its frame from now on, as long as this state lasts; the frame ends here.
+    def _note_familiar(self, codec: Codec, message: Message, end: int) -> None:
+        """Know a message by its frame, which ends here, as long as this state lasts."""
+        frames = self._familiar.setdefault(codec.message_id, {})
+        if len(frames) < MAX_FAMILIAR:
+            frames[self._framer.take(end - self._header_size - codec.size, end)] = message
 
-        Not where each frame is to be traced, nor for the camera, to which no client sends one.
-        """
-        plain = self.role is Role.CLIENT and self._trace is None
-        if plain and len(self._familiar) < MAX_FAMILIAR:
-            self._familiar[self._framer.take(end - self._status_size, end)] = status
+    def _forget_familiar(self) -> None:
+        """Look at each message again, since it may mean another thing or be none now."""
+        self._statuses = {}
+        self._familiar = {self._status_id: self._statuses}
 
     def _narrow(self, message_id: int, size: int) -> None:
         """Leave out the kin that have no such message, or another length of it."""
@@ -654,15 +687,13 @@ class Machine:
 
         ``begin``: of the payload of the first, which is the last event.
         """
-        like = begin - self.dialect.header.size
-        framer = self._framer
-        before = framer.buffered
-        more = framer.following(self._burst_reader, like, self._burst_size)
+        framer, head = self._framer, self._header_size + self._burst_size
+        start = framer.start
+        more = framer.following(self._burst_reader, begin - self._header_size, self._burst_size)
         if not more:
             return False
         self.counters.frames_received += len(more)
-        size = before - framer.buffered - len(more) * (begin - like + self._burst_size)
-        size += len(first.data)
+        size = len(first.data) + framer.start - start - len(more) * head
         more.insert(0, first.data)
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
         return True
