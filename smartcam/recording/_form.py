@@ -32,11 +32,12 @@ from smartcam.recording._json import frame_text, object_text, result_text, with_
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-FORMAT = "2"
+FORMAT = "3"
 """Version of the form that is written."""
 
-FORMATS = ("1", FORMAT)
-"""Those that are read; another one is refused. In 1 a frame's body repeats the frame's end."""
+FORMATS = ("1", "2", FORMAT)
+"""Those that are read; another one is refused. In 1 a frame's body repeats the frame's end, and
+in both 1 and 2 a result the bytes of its frame."""
 
 PROFILE = "x-smartcam"
 """Profile in the file's header."""
@@ -103,7 +104,7 @@ class Kind(NamedTuple):
     about: str  # what it is, for the schema
     properties: Mapping[str, Any]  # the schema's, by field
     required: tuple[str, ...]  # fields that are always there
-    to_text: Callable[[Any], str]  # makes the message of an item, in ASCII
+    to_text: Callable[..., str]  # makes the message of an item, in ASCII
     # makes the item of an object; raises whatever comes where it does not fit
     from_json: Callable[[dict[str, Any]], Item]
 
@@ -162,13 +163,19 @@ def count_values(data: bytes) -> int:
     return values
 
 
-def message_of(kind: str, item: Item) -> bytes:
+def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
     """Return an item's message.
+
+    Args:
+        kind: which one it is.
+        item: it.
+        raw_from: of a result: the frame whose data is its ``raw``, which then is not written.
 
     Raises:
         ValueError: nobody could read it back.
     """
-    data = KINDS[kind].to_text(item).encode()
+    to_text = KINDS[kind].to_text
+    data = (to_text(item) if raw_from is None else to_text(item, raw_from)).encode()
     if len(data) > min(MAX_MESSAGE, MAX_VALUES):  # a shorter one has fewer values
         count_values(data)
     return data
@@ -184,6 +191,12 @@ def message_fields(data: bytes) -> dict[str, Any]:
     if not isinstance(parsed, dict):
         raise ValueError(f"a message is a {type(parsed).__name__}, expected an object")  # noqa: TRY004
     return cast("dict[str, Any]", parsed)
+
+
+def body_of(entry: TraceEntry) -> str:
+    """Return the data that a frame of the camera has, as hex; "" where it has none."""
+    data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
+    return data if type(data) is str else ""
 
 
 def topic_of(camera: str, kind: str) -> str:
@@ -225,14 +238,18 @@ def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
     Raises:
         ValueError: it is not there, or something else.
     """
-    value = _optional(fields, name, kind)
+    value = optional(fields, name, kind)
     if value is None:
         raise ValueError(f"{name}: nothing is there, expected {kind.__name__}")
     return value
 
 
-def _optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
-    """Return a field that may be missing."""
+def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
+    """Return a field that may be missing.
+
+    Raises:
+        ValueError: it is something else.
+    """
     value: object = fields.get(name)
     if value is None:
         return None
@@ -241,7 +258,8 @@ def _optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
     return value
 
 
-def _camera_name(fields: Mapping[str, Any]) -> str:
+def camera_name(fields: Mapping[str, Any]) -> str:
+    """Return whose message it is; raises as :func:`_get`."""
     name = _get(fields, "camera", str)
     if len(name) > MAX_NAME:
         raise ValueError(f"camera: a name of {len(name)} characters, expected {MAX_NAME} at most")
@@ -265,7 +283,7 @@ def _when_of(fields: Mapping[str, Any], name: str) -> datetime:
 
 
 def _optional_when(fields: Mapping[str, Any], name: str) -> datetime | None:
-    text = _optional(fields, name, str)
+    text = optional(fields, name, str)
     return None if text is None else time_of(text)
 
 
@@ -296,15 +314,15 @@ def _frame(fields: dict[str, Any]) -> TraceEntry:
     if direction not in {">", "<", "!"}:
         raise ValueError(f"direction: {direction!r:.60} came, expected >, < or !")
     bytes.fromhex(data)
-    body = cast("dict[str, Any] | None", _optional(fields, "fields", dict))
-    data_from = _optional(fields, "data_from", int)
+    body = cast("dict[str, Any] | None", optional(fields, "fields", dict))
+    data_from = optional(fields, "data_from", int)
     if data_from is not None:
         body = with_data(body, data, data_from)
     return TraceEntry(
         _when_of(fields, "at"),
-        _camera_name(fields),
+        camera_name(fields),
         direction,
-        _optional(fields, "message_id", int),
+        optional(fields, "message_id", int),
         _get(fields, "message", str),
         body,
         data,
@@ -315,21 +333,25 @@ def _result(fields: dict[str, Any]) -> Result:
     latency = fields.get("latency")
     if latency is not None and not (type(latency) in {int, float} and math.isfinite(latency)):
         raise ValueError(f"latency: {latency!r:.60} came, expected seconds")
+    raw = bytes.fromhex(_get(fields, "raw", str))
+    value_from = optional(fields, "value_from", str)
+    if value_from not in {None, "raw"}:
+        raise ValueError(f"value_from: {value_from!r:.60} came, expected raw")
     return Result(
-        _camera_name(fields),
+        camera_name(fields),
         _get(fields, "application", int),
-        _optional(fields, "sequence", int),
+        optional(fields, "sequence", int),
         _get(fields, "number", int),
         _optional_when(fields, "triggered_at"),
         _when_of(fields, "received_at"),
         latency,
-        bytes.fromhex(_get(fields, "raw", str)),
-        fields.get("value"),
+        raw,
+        fields.get("value") if value_from is None else raw.hex(),
     )
 
 
 def _event(fields: dict[str, Any]) -> CameraEvent:
-    camera, at = _camera_name(fields), _when_of(fields, "at")
+    camera, at = camera_name(fields), _when_of(fields, "at")
     match _get(fields, "event", str):
         case "Connected":
             return Connected(camera=camera, at=at, url=_get(fields, "url", str))
@@ -355,7 +377,7 @@ def _event(fields: dict[str, Any]) -> CameraEvent:
                 camera=camera,
                 at=at,
                 application=_get(fields, "application", int),
-                previous=_optional(fields, "previous_application", int),
+                previous=optional(fields, "previous_application", int),
             )
         case _:
             return CameraEvent(camera=camera, at=at)
@@ -363,13 +385,13 @@ def _event(fields: dict[str, Any]) -> CameraEvent:
 
 def _error(fields: dict[str, Any]) -> RecordedError:
     return RecordedError(
-        _camera_name(fields),
+        camera_name(fields),
         _when_of(fields, "at"),
         _get(fields, "error", str),
         _get(fields, "text", str),
         _optional_when(fields, "triggered_at"),
         _optional_when(fields, "since"),
-        _optional(fields, "records", int),
+        optional(fields, "records", int),
     )
 
 
@@ -425,8 +447,10 @@ KINDS: dict[str, Kind] = {
             "received_at": _when("when its last byte arrived"),
             "latency": {"type": "number", "description": "seconds from trigger to arrival"},
             "raw": _text("the container's bytes behind the application id, as hex"),
+            "raw_from": _integer("the frame that has them as its data: its sequence in its topic"),
+            "value_from": _text("raw: the value is these bytes"),
         },
-        ("camera", "application", "number", "received_at", "raw"),
+        ("camera", "application", "number", "received_at"),
         result_text,
         _result,
     ),

@@ -1,8 +1,8 @@
 """Frames and results as JSON, put together: they are nearly all that is in a recording.
 
 The text is that of ``json.dumps(jsonable(item))`` without white space and without what is None,
-character for character, but that a frame's bytes are in it once (:func:`frame_text`). What is not
-of the types that a client makes goes that way itself.
+character for character, but that bytes are in it once (:func:`frame_text`, :func:`result_text`).
+What is not of the types that a client makes goes that way itself.
 """
 
 from __future__ import annotations
@@ -33,11 +33,13 @@ LONG = 1024
 quoting: that takes most of the time of a large container."""
 
 NULL = "null"
+VALUE_IS_RAW = '"raw"'
 
 _HEX = b"0123456789abcdef"
 EPOCH = datetime.fromtimestamp(0, UTC)
 _PLAIN = frozenset({str, int, float, bool, type(None)})
 _FLOAT = frozenset({float})
+_INTEGERS = frozenset({int})
 _COLUMNS = frozenset("iufbS")
 """Kinds of a table's columns whose values numpy gives as Python's."""
 
@@ -46,7 +48,7 @@ _encode = json.JSONEncoder(separators=(",", ":")).encode
 _encode_finite = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
 
 _FRAME = tuple(f'"{name}":' for name in (*TraceEntry._fields, "data_from"))
-_RESULT = tuple(f'"{name}":' for name in Result._fields)
+_RESULT = tuple(f'"{name}":' for name in (*Result._fields, "raw_from", "value_from"))
 
 _HEADER = '{"seq":%s,"stamp":%s,"frame_id":%s}'
 _PART = (
@@ -94,12 +96,22 @@ def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[
     return {**(fields or {}), "data": end}
 
 
-def result_text(result: Result[Any]) -> str:
-    """Return a result's text; where the value is ``raw`` itself it is turned to hex once."""
+def result_text(result: Result[Any], raw_from: int | None = None) -> str:
+    """Return a result's text, without what is said elsewhere.
+
+    Args:
+        result: it.
+        raw_from: number of the frame whose ``data`` is :attr:`~smartcam.Result.raw`; None: write
+            it.
+    """
     raw, value = result.raw, result.value
-    raw_text = f'"{raw.hex()}"' if type(raw) is bytes else _text(raw)
-    value_text = raw_text if value is raw else _value_text(value)
-    return _object_of(_RESULT, (*map(_text, result[:-2]), raw_text, value_text))
+    if raw_from is not None:
+        raw_text = NULL
+    else:
+        raw_text = f'"{raw.hex()}"' if type(raw) is bytes else _text(raw)
+    value_text, value_from = (NULL, VALUE_IS_RAW) if value is raw else (_value_text(value), NULL)
+    last = raw_text, value_text, _text(raw_from), value_from
+    return _object_of(_RESULT, (*map(_text, result[:-2]), *last))
 
 
 def _object_of(names: tuple[str, ...], texts: tuple[str, ...]) -> str:
@@ -142,6 +154,8 @@ def _value_text(value: object) -> str:
         text = _parts_text(value)
         if text is not None:
             return text
+    elif type(value) is dict and _INTEGERS.issuperset(map(type, value.values())):
+        return f"{{{','.join([f'{_quoted(str(name))}:{one}' for name, one in value.items()])}}}"
     try:
         return _encode_finite(_plain(value))
     except (TypeError, ValueError):  # NaN, infinity, or what numpy knows and Python does not

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, overload
 
 from smartcam.exceptions import (
     ConfigurationError,
@@ -15,6 +15,7 @@ from smartcam.exceptions import (
 )
 from smartcam.models import CameraEvent, Result
 from smartcam.observers import TraceEntry
+from smartcam.recording._bodies import LastBodies
 from smartcam.recording._folder import ENDING, FileName, files_of
 from smartcam.recording._form import (
     CAMERA_METADATA,
@@ -24,8 +25,11 @@ from smartcam.recording._form import (
     KINDS,
     MAX_CAMERAS,
     RecordedError,
+    body_of,
+    camera_name,
     count_values,
     message_fields,
+    optional,
 )
 from smartcam.recording._recorder import Counts
 from smartcam.recording._records import (
@@ -359,6 +363,10 @@ class _Scan:
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     remark: str = ""  # where it stops being readable, and why
     values: int = 0  # in its messages so far
+    # data of the last frames, by camera and number
+    bodies: LastBodies[tuple[str, int], str] = field(
+        default_factory=LastBodies[tuple[str, int], str]
+    )
 
     @overload
     def items(self) -> Iterator[Item]: ...
@@ -389,7 +397,7 @@ class _Scan:
             while True:
                 try:
                     record = next(records)
-                    item = self._take(record, schemas, kinds, reader.place)
+                    item = self._take(record, schemas, kinds, reader)
                 except StopIteration:
                     break
                 except SmartCamError:
@@ -409,7 +417,7 @@ class _Scan:
             self._check_ours(schemas)
 
     def _take(
-        self, record: Record, schemas: dict[int, str], kinds: dict[int, Kind], place: int
+        self, record: Record, schemas: dict[int, str], kinds: dict[int, Kind], reader: RecordReader
     ) -> Item | RecordedState | None:
         match record:
             case Schema(number, name):
@@ -419,10 +427,15 @@ class _Scan:
                 kind = next((one for one in KINDS.values() if one.schema == name), None)
                 if kind is not None:
                     kinds[number] = kind
-            case McapMessage(channel, data) if channel in kinds:
+            case McapMessage(channel, sequence, data) if channel in kinds:
                 body = bytes(data)
-                self._count_values(count_values(body), place)
-                return kinds[channel].from_json(message_fields(body))
+                self._count_values(count_values(body), reader.place)
+                fields = message_fields(body)
+                self._find_raw(fields, reader)
+                item = kinds[channel].from_json(fields)
+                if isinstance(item, TraceEntry) and (hex_data := body_of(item)):
+                    self.bodies.add((item.camera, sequence), hex_data, len(hex_data))
+                return item
             case Metadata(name, facts) if name == FILE_METADATA:
                 self.file_facts = facts
                 self._check_format()
@@ -434,6 +447,17 @@ class _Scan:
             case _:
                 pass
         return None
+
+    def _find_raw(self, fields: dict[str, Any], reader: RecordReader) -> None:
+        """Put a result's bytes where they belong, if they stand in its frame."""
+        raw_from = optional(fields, "raw_from", int)
+        if raw_from is None:
+            return
+        raw = self.bodies.get((camera_name(fields), raw_from))
+        if raw is None:
+            raise ValueError(f"raw_from: {raw_from} came, expected a frame before that has data")
+        reader.count_unpacked(len(raw))
+        fields["raw"] = raw
 
     def _count_values(self, count: int, place: int) -> None:
         self.values += count

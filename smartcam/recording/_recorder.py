@@ -25,6 +25,7 @@ from smartcam._locks import try_lock
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer, TraceEntry
+from smartcam.recording._bodies import LastBodies
 from smartcam.recording._form import (
     CAMERA_METADATA,
     FILE_METADATA,
@@ -32,6 +33,7 @@ from smartcam.recording._form import (
     KINDS,
     PROFILE,
     RecordedError,
+    body_of,
     load_compress,
     message_of,
     nanoseconds,
@@ -352,6 +354,7 @@ class RecordingFile:
         self._channels: dict[tuple[str, str], int] = {}
         self._numbers: dict[int, int] = {}
         self._facts: dict[str, dict[str, str]] = {}
+        self._bodies: LastBodies[tuple[str, str], int] = LastBodies()  # numbers, by data
         self._size = 0  # when it was closed
 
     def start(self) -> None:
@@ -366,9 +369,13 @@ class RecordingFile:
         """Write one thing; it is on the disk after the next :meth:`flush`."""
         match item:
             case TraceEntry():
-                self._message("frames", item.camera, item.at, item)
+                number = self._message("frames", item.camera, item.at, item)
+                data = body_of(item)
+                if data:
+                    self._bodies.add((item.camera, data), number, len(data))
             case Result():
-                self._message("results", item.camera, item.received_at, item)
+                frame = self._bodies.get((item.camera, item.raw.hex()))
+                self._message("results", item.camera, item.received_at, item, frame)
             case Description(facts):
                 self._describe(facts)
             case RecordedError():
@@ -425,11 +432,15 @@ class RecordingFile:
         with contextlib.suppress(OSError):
             self._stream.close()
 
-    def _message(self, kind: str, camera: str, at: datetime, item: Item) -> None:
+    def _message(
+        self, kind: str, camera: str, at: datetime, item: Item, raw_from: int | None = None
+    ) -> int:
+        """Write a message; return its number, which is the topic's own count."""
         channel = self._channel(camera, kind)
         when = nanoseconds(at)
-        self._numbers[channel] = number = self._numbers[channel] + 1
-        self._writer.add_message(channel, when, message_of(kind, item), number & 0xFFFFFFFF)
+        self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
+        self._writer.add_message(channel, when, message_of(kind, item, raw_from), number)
+        return number
 
     def _channel(self, camera: str, kind: str) -> int:
         known = self._channels.get((camera, kind))

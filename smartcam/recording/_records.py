@@ -72,9 +72,10 @@ class Channel(NamedTuple):
 
 
 class McapMessage(NamedTuple):
-    """A message and its channel; ``data`` is of the chunk."""
+    """A message, its channel and its number there; ``data`` is of the chunk."""
 
     channel_id: int
+    sequence: int
     data: memoryview
 
 
@@ -99,7 +100,7 @@ class RecordReader:
         self.place: int = 0  # bytes read so far
         self._count = 0  # records read
         self._messages = 0  # of these
-        self._unpacked = 0  # bytes that chunks unpacked to
+        self._unpacked = 0  # bytes that chunks unpacked to, and that results have of frames
         self._crc = 0
 
     def records(self) -> Iterator[Record]:
@@ -141,6 +142,20 @@ class RecordReader:
             else:
                 self._skip(length)
 
+    def count_unpacked(self, size: int) -> None:
+        """Count bytes that something in the file stands for.
+
+        Raises:
+            RecordingError: with them it goes beyond the bound.
+        """
+        self._unpacked += size
+        if self._unpacked > max(MIN_UNPACKED, UNPACKED_PER_BYTE * self.place):
+            raise RecordingError(
+                f"recording {self._name}: the first {self.place} bytes of the file unpack to "
+                f"{self._unpacked}, expected {UNPACKED_PER_BYTE} for each at most, or "
+                f"{MIN_UNPACKED}"
+            )
+
     def _unpack(self, body: memoryview) -> Iterator[Record]:
         """Yield the records of a chunk; its bytes are kept until the last was taken."""
         data = self._inflated(body)
@@ -181,13 +196,7 @@ class RecordReader:
         data = bytearray()
         while piece := inflate(PIECE):
             data += piece
-            self._unpacked += len(piece)
-            if self._unpacked > max(MIN_UNPACKED, UNPACKED_PER_BYTE * self.place):
-                raise RecordingError(
-                    f"recording {self._name}: the first {self.place} bytes of the file unpack to "
-                    f"{self._unpacked}, expected {UNPACKED_PER_BYTE} for each at most, or "
-                    f"{MIN_UNPACKED}"
-                )
+            self.count_unpacked(len(piece))
             if len(data) > MAX_CHUNK:
                 raise RecordingError(
                     f"recording {self._name}: a chunk unpacks to more than {len(data) - 1} bytes, "
@@ -279,7 +288,8 @@ def _channel(data: memoryview) -> Channel:
 def _message(data: memoryview) -> McapMessage:
     if len(data) < _MESSAGE_HEAD.size:
         raise ValueError(f"a message of {len(data)} bytes, expected {_MESSAGE_HEAD.size} at least")
-    return McapMessage(int.from_bytes(data[:2], "little"), data[_MESSAGE_HEAD.size :])
+    channel, sequence, *_ = _MESSAGE_HEAD.unpack_from(data)
+    return McapMessage(channel, sequence, data[_MESSAGE_HEAD.size :])
 
 
 def _metadata(fields: _Body) -> Metadata:

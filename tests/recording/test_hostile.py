@@ -24,7 +24,7 @@ from smartcam.recording import _reader as reader
 from smartcam.recording import _records as bounds
 from smartcam.recording import _schedule as plans
 from smartcam.recording._form import FORMAT, KINDS, MAX_VALUES, message_fields, message_of
-from tests.recording.recordingkit import frame, session, status, write
+from tests.recording.recordingkit import container, frame, session, status, write
 
 RESULT = {
     "camera": "left",
@@ -126,6 +126,18 @@ def test_load_recording_many_chunks_of_nothing_new_are_refused(
         load_recording(written(tmp_path / "bomb.mcap", *[chunk(padding)] * 2))
 
 
+def test_load_recording_results_of_one_frame_again_and_again_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bounds, "MIN_UNPACKED", 1 << 20)
+    large = message(message_of("frames", container(0, bytes(1 << 16))), 2)
+    small = {**RESULT, "raw_from": 0}
+    del small["raw"]
+    path = written(tmp_path / "bomb.mcap", chunk(large + message(small) * 100))
+    with pytest.raises(RecordingError, match=r"bytes of the file unpack to .*, expected 10000 for"):
+        load_recording(path)
+
+
 def test_load_recording_message_of_too_many_values_ends_it(tmp_path: Path) -> None:
     good, bad = message(RESULT), message(b"[" + b"[]," * MAX_VALUES + b"1]")
     recording = load_recording(written(tmp_path / "bomb.mcap", chunk(good + bad)))
@@ -220,6 +232,7 @@ def messages() -> list[tuple[int, dict[str, Any]]]:
         *((2, one) for one in frames),
         *((3, message_fields(message_of("events", one))) for one in told),
         (1, result),
+        (1, {**result, "raw_from": 0, "value_from": "raw"}),
         (4, error),
     ]
 

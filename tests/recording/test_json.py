@@ -106,8 +106,25 @@ def test_result_fields_are_written_as_the_slow_way_writes_them(
     first: tuple[Any, ...], triggered_at: datetime | None, latency: float | None, raw: bytes
 ) -> None:
     received_at = at(0).astimezone(timezone(timedelta(hours=2)))
-    one: Result[Any] = Result._make((*first, triggered_at, received_at, latency, raw, raw))
+    one: Result[Any] = Result._make((*first, triggered_at, received_at, latency, raw, None))
     assert message_of("results", one) == plainly(one)
+
+
+@given(st.binary(), st.none() | st.integers(1, 9))
+def test_bytes_of_a_result_are_written_once_or_not_at_all(raw: bytes, raw_from: int | None) -> None:
+    came = json.loads(message_of("results", result(raw, raw=raw), raw_from))
+    assert came.pop("value_from") == "raw"
+    assert ("raw" in came) == (raw_from is None)
+    assert came.pop("raw_from", None) == raw_from
+    assert {**came, "raw": raw.hex(), "value": raw.hex()} == json.loads(
+        plainly(result(raw, raw=raw))
+    )
+
+
+def test_value_of_a_result_is_from_nothing_but_its_bytes() -> None:
+    fields = {**message_fields(message_of("results", result(None))), "value_from": "frame"}
+    with pytest.raises(ValueError, match="value_from: 'frame' came, expected raw"):
+        KINDS["results"].from_json(fields)
 
 
 TABLE = np.array(

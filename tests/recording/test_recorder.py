@@ -52,12 +52,15 @@ async def test_recorder_run_is_read_by_the_mcap_library(tmp_path: Path) -> None:
         ("/left/results", "smartcam.Result"),
         ("/left/events", "smartcam.Event"),
     }
+    frames = [body for topic, _, body in found if topic == "/left/frames"]
     results = [body for topic, _, body in found if topic == "/left/results"]
-    assert [(one["value"], one["raw"], one["number"]) for one in results] == [
+    came = [frames[one["raw_from"] - 1] for one in results]
+    raws = [one["hex"][2 * one["data_from"] :] for one in came]
+    assert [(one["value"], raw, one["number"]) for one, raw in zip(results, raws, strict=True)] == [
         ({"n": 0}, "00000000", 1),
         ({"n": 1}, "01000000", 2),
     ]
-    assert "sequence" not in results[0]  # None is left out
+    assert not {"sequence", "raw"} & results[0].keys()  # None is left out
 
 
 @pytest.mark.long
@@ -104,7 +107,7 @@ async def test_recorder_header_and_metadata_tell_the_run(tmp_path: Path) -> None
         assert reader.get_header().library == f"smartcam {smartcam.__version__}"
         told = [(one.name, one.metadata) for one in reader.iter_metadata()]
     assert told[0][0] == "smartcam"
-    assert told[0][1]["format"] == "2"
+    assert told[0][1]["format"] == "3"
     assert told[-1] == (
         "smartcam.camera",
         {
