@@ -237,6 +237,22 @@ class Codec:
                 self._known[body] = message
         return message
 
+    def like(self, message: Message) -> Callable[[bytes], Message]:
+        """Return what makes messages that differ from one in nothing but their data."""
+        new, kind, data_name = object.__new__, self.type, self._data or ""
+        names = [one.name for one in dataclasses.fields(kind) if one.name != data_name]
+        others = [(_filler(kind, name), getattr(message, name)) for name in names]
+        fill_data = _filler(kind, data_name)
+
+        def make(data: bytes) -> Message:
+            made = new(kind)
+            for fill, value in others:
+                fill(made, value)
+            fill_data(made, data)
+            return made
+
+        return make
+
     def _make(self, values: tuple[Any, ...]) -> Message:
         message = object.__new__(self.type)
         for at, fill in enumerate(self._fill):

@@ -327,6 +327,8 @@ class Machine:
         # by ids: whole frames that came before, and what they are; of this state only
         self._familiar: dict[int, dict[bytes, Message]] = {}
         self._statuses: dict[bytes, Message] = {}  # those of statuses
+        # by what stands in front of the data: bytes of the frame, what makes the message
+        self._results: dict[bytes, tuple[int, Callable[[bytes], Message]]] = {}
         self._status_id = self._status_size = 0
         self.state = State.IDLE
         self._take_up(dialect)
@@ -350,6 +352,7 @@ class Machine:
             self._framer.expect(dialect.lengths(self._sender))
         result = dialect.encoder(m.ResultContainer)
         self._burst_size = result.size
+        self._result_id, self._result_head = result.message_id, dialect.header.size + result.size
         self._burst_reader = dialect.header.reader(result.size)
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
@@ -512,42 +515,60 @@ class Machine:
             if found is None:
                 return True
             message = self._receive_frame(*found)
-            if framer.start == len(framer.buffer) or self._receive_familiar():
-                continue
-            if (
-                self._takes_bursts
-                and isinstance(message, m.ResultContainer)
-                and self._receive_burst(message, found[1])
-            ):
-                self._receive_familiar()
+            if framer.start == len(framer.buffer):
+                break
+            if self._takes_bursts and isinstance(message, m.ResultContainer):
+                self._receive_burst(message, found[1])
+            self._receive_familiar()
         return False
 
-    def _receive_familiar(self) -> bool:
-        """Take the messages that come next and came before, byte for byte; say whether any did.
+    def _receive_familiar(self) -> None:
+        """Take the messages that come next and came before.
 
-        A camera has few statuses, and sends two around each result. Of answers those that are owed.
+        A camera has few statuses, and sends two around each result. Statuses, and answers that are
+        owed, are known byte for byte; results by all that stands in front of their data.
         """
-        statuses, framer = self._statuses, self._framer
+        statuses, framer, events = self._statuses, self._framer, self._events
         buffer, start = framer.buffer, framer.start
         if not self._plain or isinstance(buffer, memoryview):
-            return False
-        size, owed, frames = self._status_size, self._open, 0
-        while True:
+            return
+        size, owed, frames, available = self._status_size, self._open, 0, len(buffer)
+        while start < available:
             end = start + size
             message = statuses.get(buffer[start:end])
             if message is not None:
                 if owed:
                     owed.discard(self._status_id)
-            elif not owed or (answer := self._find_answer(buffer, start)) is None:
-                break
             else:
-                message, end = answer
-            self._events.append(message)
+                found = self._find_result(buffer, start) or (
+                    self._find_answer(buffer, start) if owed else None
+                )
+                if found is None:
+                    break
+                message, end = found
+            events.append(message)
             start = end
             frames += 1
         framer.start = start
         self.counters.frames_received += frames
-        return frames > 0
+
+    def _find_result(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
+        """Return the next message and its end if it is a result as there was one before.
+
+        That is one of the same application with as many bytes. Only in front of a known status, or
+        at the end: in front of another one it may begin a burst.
+        """
+        data = start + self._result_head
+        known = self._results.get(buffer[start:data])
+        if known is None:
+            return None
+        length, make = known
+        end = start + length
+        if end != len(buffer) and buffer[end : end + self._status_size] not in self._statuses:
+            return None
+        if self._open:
+            self._open.discard(self._result_id)
+        return make(buffer[data:end]), end
 
     def _find_answer(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
         """Return the next message and its end if it came before, is an answer and owed."""
@@ -627,8 +648,8 @@ class Machine:
             counters.long_bodies += 1
         if following is not self._state:
             self.state = following
-        elif self._plain and codec is not None and size == codec.size and not codec.has_data:
-            self._note_familiar(codec, message, end)
+        elif self._plain and codec is not None and surplus == 0:
+            self._note_familiar(codec, message, begin, end)
         if kind in _BY_ITSELF:
             if self._open:  # asked for, in a dialect or by a raw request
                 self._open.discard(message_id)
@@ -659,15 +680,21 @@ class Machine:
             )
         return codec.decode(payload, 0, len(payload)), surplus
 
-    def _note_familiar(self, codec: Codec, message: Message, end: int) -> None:
-        """Know a message by its frame, which ends here, as long as this state lasts."""
-        frames = self._familiar.setdefault(codec.message_id, {})
-        if len(frames) < MAX_FAMILIAR:
-            frames[self._framer.take(end - self._header_size - codec.size, end)] = message
+    def _note_familiar(self, codec: Codec, message: Message, begin: int, end: int) -> None:
+        """Know a message by its frame, as long as this state lasts; here is its payload."""
+        frame = begin - self._header_size
+        if type(message) is m.ResultContainer:
+            if self._takes_bursts and len(self._results) < MAX_FAMILIAR:
+                head = self._framer.take(frame, begin + codec.size)
+                self._results[head] = end - frame, codec.like(message)
+        elif not codec.has_data and end - begin == codec.size:
+            frames = self._familiar.setdefault(codec.message_id, {})
+            if len(frames) < MAX_FAMILIAR:
+                frames[self._framer.take(frame, end)] = message
 
     def _forget_familiar(self) -> None:
         """Look at each message again, since it may mean another thing or be none now."""
-        self._statuses = {}
+        self._statuses, self._results = {}, {}
         self._familiar = {self._status_id: self._statuses}
 
     def _narrow(self, message_id: int, size: int) -> None:
@@ -682,8 +709,8 @@ class Machine:
             self.kin = fitting
             self._take_up(fitting[0])
 
-    def _receive_burst(self, first: m.ResultContainer, begin: int) -> bool:
-        """Take the result containers of the same application that come next; say whether any do.
+    def _receive_burst(self, first: m.ResultContainer, begin: int) -> None:
+        """Take the result containers of the same application that come next.
 
         ``begin``: of the payload of the first, which is the last event.
         """
@@ -691,12 +718,11 @@ class Machine:
         start = framer.start
         more = framer.following(self._burst_reader, begin - self._header_size, self._burst_size)
         if not more:
-            return False
+            return
         self.counters.frames_received += len(more)
         size = len(first.data) + framer.start - start - len(more) * head
         more.insert(0, first.data)
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
-        return True
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
         """Return whether the client sees it: an answer that nothing asked for is counted only."""
