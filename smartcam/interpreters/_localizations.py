@@ -46,6 +46,9 @@ _POSE = ("x", "y", "z", "theta")
 BEST = 1.0 + 1e-6
 """Largest quality: 1, as a float of 32 bits may be rounded."""
 
+MAX_NAMES = 64
+"""Names of features that are kept as texts: an application has a handful, a peer could send any."""
+
 # half the time of the NamedTuples' own; the cast because a bare tuple is generic
 _new_tuple = cast("Callable[..., Any]", tuple.__new__)  # pyright: ignore[reportUnknownMemberType]
 
@@ -86,6 +89,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         self._scales = use.scales
         self._checks = use.checks
         self._empty = bytes(self.layout.size)
+        self._names: dict[bytes, str] = {}  # of features, by what is on the wire
 
     def read(self, data: bytes, context: Context) -> list[Localization]:
         """Return the parts in the camera's order.
@@ -99,7 +103,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         """
         header = _new_tuple(Header, (context.number, context.received_at, context.camera))
         sin, cos, new = math.sin, math.cos, _new_tuple
-        scales, y_down, best = self._scales, context.y_down, BEST
+        scales, y_down, best, names = self._scales, context.y_down, BEST, self._names
         rows: Iterable[Any] = self.layout.wire_records(data, context.byte_order)
         if self._missing is not None:
             rows = map(operator.concat, rows, self._missing)
@@ -125,7 +129,11 @@ class LocalizationsInterpreter(PlainInterpreter):
                 half = 0.5 * theta
                 orientation = new(Quaternion, (0.0, 0.0, sin(half), cos(half)))
                 pose = new(Pose, (header, new(Position, (x, y, z)), orientation))
-                feature_id = text.partition(b"\0")[0].decode()
+                feature_id = names.get(text)
+                if feature_id is None:
+                    feature_id = text.partition(b"\0")[0].decode()
+                    if len(names) < MAX_NAMES:
+                        names[text] = feature_id
                 found.append(new(Localization, (feature_id, quality, photo_index, pose)))
         except ValueError:  # a text that is not UTF-8, the sine of infinity
             self._check_numbers(data, context)

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.interpreters import Context, Reader, resolve, run
+from smartcam.interpreters._localizations import MAX_NAMES
 from smartcam.models import Localization
 
 PART = struct.Struct("<50sfifff")
@@ -40,6 +41,19 @@ def test_default_layout_is_the_thesis() -> None:
 
 def test_no_bytes_are_no_parts() -> None:
     assert interpret(b"") == []
+
+
+def test_names_of_features_are_right_however_many_there_are() -> None:
+    reader = resolve("localizations")
+    names = [*(f"part {number}" for number in range(2 * MAX_NAMES)), "", "ä", "n" * 50]
+    for _ in range(3):
+        for some in (names, names[::-1]):
+            data = b"".join(PART.pack(name.encode(), 1, 0, 1, 2, 0) for name in some)
+            value: Any = run(reader, Reader(data, Context()))
+            assert [part.feature_id for part in value] == some
+    behind = PART.pack(b"bolt\0nut", 1, 0, 1, 2, 0) + PART.pack(b"bolt\0pin", 1, 0, 1, 2, 0)
+    read: Any = run(reader, Reader(behind, Context()))
+    assert [part.feature_id for part in read] == ["bolt", "bolt"]
 
 
 def test_values_follow_the_byte_order() -> None:

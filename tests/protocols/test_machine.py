@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import struct
 
 import pytest
@@ -749,6 +750,55 @@ APPLICATION = b"\x15\0\0" + MAGIC[:1]
 
 def result(data: bytes, application: int = 21) -> m.ResultContainer:
     return m.ResultContainer(application=application, data=data)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS, ids=label)
+def test_result_as_there_was_one_before_has_its_own_data(dialect: FramedDialect) -> None:
+    made, traced = client(dialect), client(dialect, trace=lambda *_: None)
+    told = (b"abcd", b"efgh", b"abcd", b"", bytes(200), b"ij", b"", b"efgh"), (21, 22)
+    said = [result(data, one) for data, one in itertools.product(*told)] * 3
+    for one in said:
+        for message in (STATUS_MESSAGE, one, STATUS_MESSAGE), (one,), (one, STATUS_MESSAGE):
+            heard = b"".join(map(dialect.encode, message))
+            assert feed(made, heard) == feed(traced, heard)
+    assert made.counters == traced.counters
+    assert len(made._results) == (0 if dialect is NO_ID else 8)
+
+
+def test_result_as_there_was_one_before_waits_for_its_last_byte() -> None:
+    made, other = client(), HANDBOOK.encode(result(b"efgh"))
+    assert feed(made, STATUS, HANDBOOK.encode(result(b"abcd"))) == [STATUS_MESSAGE, result(b"abcd")]
+    for cut in range(1, len(other)):
+        assert feed(made, other[:cut]) == []
+        assert made.pending == other[:cut]
+        assert feed(made, other[cut:] + STATUS) == [result(b"efgh"), STATUS_MESSAGE]
+
+
+def test_result_as_there_was_one_before_is_refused_where_none_may_come() -> None:
+    made, frame = client(), HANDBOOK.encode(result(b"abcd"))
+    feed(made, frame, frame)
+    made.send(m.Disconnect())
+    assert feed(made, frame) == [result(b"abcd")]
+    made.send(m.Connect())
+    made.receive_data(frame)
+    assert "where it is not expected" in str(failure(made.events()))
+
+
+def test_result_as_there_was_one_before_is_told_to_who_asked_for_it() -> None:
+    made, frame = client(), HANDBOOK.encode(result(b"abcd"))
+    request = m.UnknownMessage(message_id=0x20, payload=b"")
+    for _ in range(3):
+        made.send(request, answered=True)
+        feed(made, frame)
+        assert made._open == set()
+
+
+def test_results_of_many_kinds_are_all_told() -> None:
+    made = client()
+    said = [result(b"abcd", number) for number in range(200)] * 2
+    for one in said:
+        assert feed(made, HANDBOOK.encode(one)) == [one]
+    assert len(made._results) == MAX_FAMILIAR
 
 
 @pytest.mark.parametrize("dialect", [one for one in DIALECTS if one is not NO_ID], ids=label)

@@ -322,7 +322,8 @@ class Machine:
         self._outbox: list[bytes] = []
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
         self._sender = role.receives
-        self._plain = role is Role.CLIENT and trace is None
+        self._asks = role is Role.CLIENT
+        self._plain = self._asks and trace is None
         self._decoders: dict[int, Codec] = {}
         # by ids: whole frames that came before, and what they are; of this state only
         self._familiar: dict[int, dict[bytes, Message]] = {}
@@ -348,6 +349,7 @@ class Machine:
     def _take_up(self, dialect: FramedDialect) -> None:
         self.dialect = dialect
         self._decoders = dialect.decoders(self._sender)
+        self._constant = dialect.constant
         if self._bounded:
             self._framer.expect(dialect.lengths(self._sender))
         result = dialect.encoder(m.ResultContainer)
@@ -467,17 +469,11 @@ class Machine:
                 f"{kind.__name__} cannot be sent by the {self.role.value} "
                 f"in state {self.state.value}"
             )
-        constant = self.dialect.constant.get(kind)
-        if constant is not None:
-            data, message_id, owed = constant
-        else:
-            data, message_id = self.dialect.encode(message), self.dialect.message_id(message)
-            owed = self.dialect.answer_id(message_id)
-        if self.role is Role.CAMERA or answered is False:
-            owed = None
-        elif answered:
-            owed = message_id
-        if owed is not None:
+        constant = self._constant.get(kind)
+        data, message_id, owed = self._frame_of(message) if constant is None else constant
+        if answered is not None:
+            owed = message_id if answered else None
+        if owed is not None and self._asks:
             if owed in self._open:
                 raise LocalProtocolError(
                     f"an answer to message {message_id:#04x} is still owed; one request of an id "
@@ -499,6 +495,11 @@ class Machine:
         return outbox
 
     # ------------------------------------------------------------------ inside
+
+    def _frame_of(self, message: Message) -> tuple[bytes, int, int | None]:
+        """Return a message's frame, its id and that of its answer."""
+        message_id = self.dialect.message_id(message)
+        return self.dialect.encode(message), message_id, self.dialect.answer_id(message_id)
 
     def _receive_frames(self) -> bool:
         """Make events of the whole frames that are there; return whether a part of one is left."""
@@ -653,7 +654,7 @@ class Machine:
         if kind in _BY_ITSELF:
             if self._open:  # asked for, in a dialect or by a raw request
                 self._open.discard(message_id)
-        elif self.role is Role.CLIENT and not self._wanted(message_id, known=codec is not None):
+        elif self._asks and not self._wanted(message_id, known=codec is not None):
             return None
         self._events.append(message)
         return message
@@ -686,7 +687,8 @@ class Machine:
         if type(message) is m.ResultContainer:
             if self._takes_bursts and len(self._results) < MAX_FAMILIAR:
                 head = self._framer.take(frame, begin + codec.size)
-                self._results[head] = end - frame, codec.like(message)
+                if head not in self._results:
+                    self._results[head] = end - frame, codec.like(message)
         elif not codec.has_data and end - begin == codec.size:
             frames = self._familiar.setdefault(codec.message_id, {})
             if len(frames) < MAX_FAMILIAR:
