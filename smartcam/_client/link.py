@@ -119,6 +119,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.loop: asyncio.AbstractEventLoop = asyncio.get_running_loop()
         self.heard_at: float = self.loop.time()
         self._transport: Any = None
+        self._datagrams = machine.transport is Transport.UDP
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
@@ -215,7 +216,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             if self._transport is None or self._closed.done():
                 return
             self._say_goodbye()
-            if self.machine.transport is Transport.UDP:
+            if self._datagrams:
                 self._transport.close()
             elif not self._transport.is_closing():
                 self._resume()
@@ -268,10 +269,10 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """asyncio: the link is open."""
         self._transport = transport
         links[self.loop] = links.get(self.loop, 0) + 1
-        if self.machine.transport is Transport.UDP:
+        if self._datagrams:
             read_no_more_than_needed(transport)
         sock = transport.get_extra_info("socket")
-        if sock is not None and self.machine.transport is Transport.TCP:
+        if sock is not None and not self._datagrams:
             # the camera sets it and advises it (SC manual p. 40: published)
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             if self._liveness_timeout is not None:
@@ -331,7 +332,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         frames = self.machine.data_to_send()
         if not frames:
             return
-        if self.machine.transport is Transport.UDP:
+        if self._datagrams:
             for frame in frames:
                 self._transport.sendto(frame)
         else:
@@ -376,7 +377,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _pause(self) -> None:
-        if not self._paused and self.machine.transport is Transport.TCP:
+        if not (self._paused or self._datagrams):
             self._paused = True
             self._transport.pause_reading()
 

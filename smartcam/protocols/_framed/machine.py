@@ -529,29 +529,28 @@ class Machine:
         A camera has few statuses, and sends two around each result. Statuses, and answers that are
         owed, are known byte for byte; results by all that stands in front of their data.
         """
-        statuses, framer, events = self._statuses, self._framer, self._events
+        framer, events = self._framer, self._events
         buffer, start = framer.buffer, framer.start
         if not self._plain or isinstance(buffer, memoryview):
             return
-        size, owed, frames, available = self._status_size, self._open, 0, len(buffer)
+        known, size, owed = self._statuses.get, self._status_size, self._open
+        before, available = len(events), len(buffer)
         while start < available:
             end = start + size
-            message = statuses.get(buffer[start:end])
-            if message is not None:
-                if owed:
-                    owed.discard(self._status_id)
-            else:
-                found = self._find_result(buffer, start) or (
-                    self._find_answer(buffer, start) if owed else None
-                )
+            message = known(buffer[start:end])
+            if message is None:
+                found = self._find_result(buffer, start)
+                if found is None and owed:
+                    found = self._find_answer(buffer, start)
                 if found is None:
                     break
                 message, end = found
+            elif owed:
+                owed.discard(self._status_id)
             events.append(message)
             start = end
-            frames += 1
         framer.start = start
-        self.counters.frames_received += frames
+        self.counters.frames_received += len(events) - before
 
     def _find_result(self, buffer: bytes, start: int) -> tuple[Message, int] | None:
         """Return the next message and its end if it is a result as there was one before.
