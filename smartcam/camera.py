@@ -594,8 +594,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Ask the camera which application is active.
 
         Raises:
-            ResponseTimeoutError: no answer; the link is given up, since a later answer could pass
-                for the next one's.
+            ResponseTimeoutError: no answer. The next question waits for it first, so that it does
+                not pass for its own; after ``request_timeout`` the link is given up for it.
 
         Cancellation: safe; the answer is dropped when it comes.
         """
@@ -606,7 +606,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera cannot be asked; its status comes by itself.
-            ResponseTimeoutError: no answer; the link is given up.
+            ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe.
         """
@@ -619,7 +619,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera's bits fall by themselves.
-            ResponseTimeoutError: no answer; the link is given up.
+            ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe; the command may have been sent.
         Source: BVS ID guide p. 227 (published).
@@ -632,7 +632,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Raises:
             UnsupportedError: the protocol has no message for it, as BVS.
             CommandRejectedError: the camera refused.
-            ResponseTimeoutError: no answer; the link is given up.
+            ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe; the answer is dropped when it comes.
         """
@@ -739,7 +739,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Return the camera's clock: a naive datetime, since it carries no time zone.
 
         Raises:
-            ResponseTimeoutError: no answer; the link is given up.
+            ResponseTimeoutError: no answer, as for :meth:`query_application`.
             InterpretationError: what came is no date.
 
         Cancellation: safe; the answer is dropped when it comes.
@@ -813,7 +813,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Raises:
             LocalProtocolError: Connect and Disconnect (sessions are the client's own).
             UnsupportedError: an id of another kind than the protocol's.
-            ResponseTimeoutError: no answer; the link is given up.
+            ResponseTimeoutError: no answer, as for :meth:`query_application`.
 
         Cancellation: safe; the answer is dropped when it comes.
         """

@@ -61,8 +61,8 @@ class SmartCamera(Camera[ValueT]):
         self._state = state = self._make_state()
         self._waits = waits = Waits(counters)
         self._connection = connection = Connection(settings.name, waits)
-        patience = settings.request_timeout
-        self._requests = requests = Requests(connection, waits, state, patience)
+        patience, limit = settings.request_timeout, settings.switch_timeout
+        self._requests = requests = Requests(connection, waits, state, patience, limit)
         polling = Polling(connection, state, waits, listeners, patience)
         self._status = status = StatusRequests(connection, requests, polling, state, waits)
         self._commands = commands = Commands(connection, requests, status, state)
@@ -75,7 +75,6 @@ class SmartCamera(Camera[ValueT]):
         self._triggers = Triggers(
             connection, requests, status, commands, results, state, waits, polling
         )
-        limit = settings.switch_timeout
         self._lock = CommandLock(connection, commands, status, state, waits, limit)
         keepalive = KeepAlive(requests, waits, state, settings.liveness_timeout, limit)
         self._supervisor = Supervisor(

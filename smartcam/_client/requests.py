@@ -2,7 +2,9 @@
 
 The wire has no correlation: an answer is matched by its kind, at most one request of a kind is
 open, and one that was cancelled leaves an owed answer which the next request of that kind awaits
-first. An answer that never comes leaves the link untrustworthy, so it is given up.
+first. An answer that never comes leaves the link untrustworthy, so it is given up. But not before
+``request_timeout`` is over (``switch_timeout`` of a switch): who asks may have as little time as he
+likes, and the link is not his alone.
 
 Every ``deadline`` is loop time. Whose command it is (one at a time) is the command lock's business.
 """
@@ -44,7 +46,9 @@ class Requests:
     _connection: Connection
     _waits: Waits
     _state: CameraState
-    _patience: float  # seconds that an answer may take, however short the deadline of who asks
+    # seconds that an answer may take, however short the deadline of who asks
+    _patience: float
+    _switch_patience: float  # the same of the answer to a switch
 
     def __post_init__(self) -> None:
         self.name: str = self._connection.name
@@ -84,26 +88,19 @@ class Requests:
             link.give_up(error)
             raise error from exc
 
-    async def command(
-        self, message: m.Request, deadline: float, *, due: float | None = None
-    ) -> None:
+    async def command(self, message: m.Request, deadline: float) -> None:
         """Send a command; where the dialect acknowledges it, wait for that.
-
-        Args:
-            message: the command.
-            deadline: loop time.
-            due: as for :meth:`exchange`.
 
         Raises:
             UnsupportedError: the dialect, or the camera, does not know it.
             CommandRejectedError: the camera refused it.
-            ResponseTimeoutError: no answer; the link is given up.
+            ResponseTimeoutError: no answer, as for :meth:`exchange`.
         """
         answer = type(message).answer
         if answer is None or not self._connection.dialect.answers(type(message)):
             await self.tell(message, deadline)
             return
-        got = await self.exchange(message, answer, deadline, due=due)
+        got = await self.exchange(message, answer, deadline)
         self.check(type(message), got)
 
     def check(self, request: type[m.Message], answer: m.Message) -> None:
@@ -134,7 +131,7 @@ class Requests:
         """Send a request and return its answer, which may come among statuses and results.
 
         Raises:
-            ResponseTimeoutError: it did not come; the link is given up.
+            ResponseTimeoutError: it did not come, as for :meth:`exchange`.
         """
         got = await self.exchange(message, answer, deadline)
         if not isinstance(got, answer):
@@ -142,18 +139,15 @@ class Requests:
         return got
 
     async def exchange(
-        self,
-        message: m.Message,
-        key: type[m.Message] | int,
-        deadline: float,
-        *,
-        due: float | None = None,
+        self, message: m.Message, key: type[m.Message] | int, deadline: float
     ) -> m.Message:
         """Send a request and return the answer registered under ``key``; as :meth:`ask`.
 
-        With ``due`` behind the deadline, an answer that has not come at the deadline stays owed.
+        Raises:
+            ResponseTimeoutError: it did not come. It stays owed where it may come yet; if it is
+                overdue, too, the link is given up.
         """
-        answer = await self.post(message, key, deadline, due=due)
+        answer = await self.post(message, key, deadline)
         try:
             return await self._take_answer(answer, deadline)
         except TimeoutError as exc:
@@ -162,12 +156,7 @@ class Requests:
             raise error from exc
 
     async def post(
-        self,
-        message: m.Message,
-        key: type[m.Message] | int,
-        deadline: float,
-        *,
-        due: float | None = None,
+        self, message: m.Message, key: type[m.Message] | int, deadline: float
     ) -> asyncio.Future[Answer]:
         """Send a request as soon as none of its kind is open; its answer is owed from then on.
 
@@ -175,7 +164,6 @@ class Requests:
             message: the request.
             key: what its answer is registered under.
             deadline: loop time until when to wait for earlier ones.
-            due: until when the answer may come before the link is given up; default ``deadline``.
 
         Raises:
             ResponseTimeoutError: an earlier one was open until ``deadline``.
@@ -189,49 +177,46 @@ class Requests:
         try:
             await self.await_owed(key, message, deadline)
             self._connection.require_link().send(message)
-            return self.expect(key, deadline if due is None else due)
+            return self.expect(key, deadline)
         finally:
             lock.release()
 
-    def expect(self, key: type[m.Message] | int, due: float) -> asyncio.Future[Answer]:
-        """Register for the answer to a request that was just sent; it is owed until ``due``."""
-        self._due[key] = due
+    def expect(self, key: type[m.Message] | int, deadline: float) -> asyncio.Future[Answer]:
+        """Register for the answer to a request that was just sent, awaited until ``deadline``.
+
+        It may come later: it is due when an answer of its kind has had its usual time, too.
+        """
+        patience = self._switch_patience if key is m.SwitchAnswer else self._patience
+        self._due[key] = max(deadline, asyncio.get_running_loop().time() + patience)
         return self._waits.next_answer(key)
 
     # ------------------------------------------------------------------ Query, and what it fences
 
     async def fence(self, deadline: float) -> None:
-        """Have heard everything that the camera said before now.
-
-        The deadline may be a trigger's and as short as it likes: it does not cost the link.
-        """
+        """Have heard everything that the camera said before now."""
         await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
-        await self.exchange(m.Query(), m.QueryAnswer, deadline, due=self.due_after(deadline))
+        await self.exchange(m.Query(), m.QueryAnswer, deadline)
 
     def expect_fence(self, sent_at: float, deadline: float) -> None:
         """Note that a Query went out in front of a trigger: its answer is owed to nobody."""
         self._waits.expect_fence()
         self._due[m.QueryAnswer] = max(deadline, sent_at + self._patience)
 
-    def due_after(self, deadline: float) -> float:
-        """Return until when an answer may come that a trigger waits for, however short that is."""
-        return max(deadline, asyncio.get_running_loop().time() + self._patience)
-
-    def ask_for_life(self, due: float) -> bool:
-        """Send a Query unless one is open; its answer is owed until ``due`` (loop time)."""
+    def ask_for_life(self, deadline: float) -> bool:
+        """Send a Query unless one is open; its answer is awaited until ``deadline``."""
         if self._waits.owes(m.QueryAnswer):
             return False
         link = self._connection.require_link()
         if self._connection.features.polled:
             link.send(m.GetStatus(), answered=False)  # so that it does not grow old
         link.send(m.Query())
-        self.expect(m.QueryAnswer, due)
+        self.expect(m.QueryAnswer, deadline)
         return True
 
     def ask_what_is_active(self) -> None:
         """Send a Query after somebody else's switch, as soon as none is open from before it."""
         with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
-            if self.ask_for_life(asyncio.get_running_loop().time() + self._patience):
+            if self.ask_for_life(asyncio.get_running_loop().time()):
                 self._state.asked()
 
     def is_busy(self, answer: m.Acknowledgement) -> bool:

@@ -227,8 +227,7 @@ class Triggers:
         if features.acknowledged:
             await requests.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
-            due = requests.due_after(deadline)
-            await requests.command(m.SetInput(data=input_data), deadline, due=due)
+            await requests.command(m.SetInput(data=input_data), deadline)
             if fenced and self._waits.owes(m.QueryAnswer):
                 await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
         elif input_data is not None:
@@ -291,8 +290,7 @@ class Triggers:
             except SmartCamError as exc:  # the link is over
                 pending.fail(exc)
 
-        due = self._requests.due_after(deadline)
-        self._requests.expect(m.TriggerAnswer, due).add_done_callback(on_answer)
+        self._requests.expect(m.TriggerAnswer, deadline).add_done_callback(on_answer)
 
     async def _check_application(self, expected: int, deadline: float) -> None:
         """See to it that an application is the active one.
@@ -378,8 +376,7 @@ class Triggers:
         until it is reset (BVS ID guide p. 227, published).
         """
         if self._connection.dialect.has(m.ResetErrors):
-            due = self._requests.due_after(deadline)
-            await self._requests.command(m.ResetErrors(), deadline, due=due)
+            await self._requests.command(m.ResetErrors(), deadline)
             await self._status.refresh(deadline)
             return
         now = asyncio.get_running_loop().time()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections.abc import Callable, Coroutine
 from datetime import datetime
 from typing import Any
@@ -83,16 +84,43 @@ async def test_clock_that_was_set_is_read_again() -> None:
 
 
 async def test_get_clock_never_answered_gives_the_link_up() -> None:
-    async with by_hand() as (box, camera):
+    async with by_hand(request_timeout=SHORT) as (box, camera):
         box.script[GET_CLOCK] = quiet
         with pytest.raises(ResponseTimeoutError, match=r"no answer to GetClock \(0x32\)") as caught:
-            await camera.get_clock(timeout=SHORT)
+            await camera.get_clock()
         assert caught.value.message_id == GET_CLOCK
         await until(lambda: not camera.connected)
         with pytest.raises(ConnectionLostError) as later:
             await camera.query_application()
         assert later.value.__cause__ is caught.value
         await box.wait_for(DISCONNECT, 2)
+
+
+@pytest.mark.parametrize("seconds", [0.0, SHORT])
+async def test_requests_that_are_awaited_for_too_short_a_time_keep_the_link(seconds: float) -> None:
+    """The camera answers all of them, later; the next ones get their own answers."""
+    async with by_hand() as (box, camera):
+        calls: dict[int, Callable[..., Coroutine[Any, Any, Any]]] = {
+            QUERY: camera.query_application,
+            GET_CLOCK: camera.get_clock,
+            UNKNOWN: functools.partial(camera.request, UNKNOWN),
+        }
+        box.script[UNKNOWN] = lambda _: box.said(UNKNOWN)
+        held = {message_id: box.script[message_id] for message_id in calls}
+        for message_id, call in calls.items():
+            box.script[message_id] = quiet
+            with pytest.raises(ResponseTimeoutError):
+                await call(timeout=seconds)
+            await box.wait_for(message_id)
+        again = [asyncio.create_task(call()) for call in calls.values()]
+        await asyncio.sleep(SHORT)
+        assert not any(task.done() for task in again)
+        box.script |= held
+        for answer in held.values():
+            box.send(answer(b""))
+        application, clock, answer = await asyncio.gather(*again)
+        assert (application, type(clock), answer) == (7, datetime, b"")
+        assert (camera.connected, camera.statistics().sessions) == (True, 1)
 
 
 async def test_request_timeout_of_the_settings_bounds_requests() -> None:
@@ -192,9 +220,9 @@ async def test_request_of_an_unknown_id_gives_the_answer_under_the_same_id() -> 
 
 
 async def test_request_of_an_unknown_id_never_answered_gives_the_link_up() -> None:
-    async with by_hand() as (_, camera):
+    async with by_hand(request_timeout=SHORT) as (_, camera):
         with pytest.raises(ResponseTimeoutError, match=r"no answer to UnknownMessage \(0x77\)"):
-            await camera.request(UNKNOWN, timeout=SHORT)
+            await camera.request(UNKNOWN)
         await until(lambda: not camera.connected)
 
 

@@ -174,18 +174,31 @@ async def test_switch_answer_that_names_another_application_raises() -> None:
 
 
 async def test_switch_never_answered_gives_the_link_up() -> None:
-    async with by_hand(box={"status": 0}) as (box, camera):
+    async with by_hand(box={"status": 0}, switch_timeout=SHORT) as (box, camera):
         box.script[SWITCH] = lambda _: b""
         with pytest.raises(
             ResponseTimeoutError, match=r"no answer to SwitchApplication \(0x31\)"
         ) as caught:
-            await camera.switch_application(3, timeout=SHORT)
+            await camera.switch_application(3)
         assert caught.value.message_id == SWITCH
         await box.wait_for(DISCONNECT, 2)
         await until(lambda: not camera.connected)
         with pytest.raises(ConnectionLostError) as later:
             await camera.trigger()
         assert later.value.__cause__ is caught.value
+
+
+async def test_switch_that_is_awaited_for_too_short_a_time_keeps_the_link() -> None:
+    async with by_hand(box={"status": 0}, request_timeout=SHORT) as (box, camera):
+        catch_up = _silence(box, SWITCH)
+        with pytest.raises(ResponseTimeoutError, match="no answer to SwitchApplication"):
+            await camera.switch_application(3, timeout=SHORT)
+        switching = asyncio.create_task(camera.switch_application(1))
+        await asyncio.sleep(2 * SHORT)
+        assert box.ids.count(SWITCH) == 1  # the second waits for the answer to the first
+        catch_up()
+        await switching
+        assert (box.active, camera.statistics().sessions) == (1, 1)
 
 
 # ---------------------------------------------------------------------- interrupted
@@ -259,9 +272,9 @@ async def test_query_too_short_for_a_switch_under_way_leaves_the_link() -> None:
 
 
 async def test_owed_answer_beyond_its_own_time_gives_the_link_up() -> None:
-    async with by_hand(box={"status": 0}) as (box, camera):
+    async with by_hand(box={"status": 0}, switch_timeout=SHORT) as (box, camera):
         box.script[SWITCH] = lambda _: b""
-        switching = asyncio.create_task(camera.switch_application(3, timeout=SHORT))
+        switching = asyncio.create_task(camera.switch_application(3))
         await box.wait_for(SWITCH)
         await cancelled(switching)
         with pytest.raises(ResponseTimeoutError, match="an earlier answer is owed"):

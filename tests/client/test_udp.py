@@ -135,10 +135,10 @@ async def test_answer_over_udp_that_comes_twice_is_used_once() -> None:
 
 
 async def test_answer_over_udp_that_is_lost_gives_the_link_up() -> None:
-    async with by_hand(box=UDP) as (box, camera):
+    async with by_hand(box=UDP, request_timeout=SHORT) as (box, camera):
         box.script[GET_CLOCK] = lambda _: b""
         with pytest.raises(ResponseTimeoutError, match=r"no answer to GetClock \(0x32\)"):
-            await camera.get_clock(timeout=SHORT)
+            await camera.get_clock()
         with pytest.raises(ConnectionLostError):
             await camera.get_clock()
         await box.wait_for(DISCONNECT, 2)
