@@ -19,7 +19,7 @@ from smartcam.protocols._base import Verdict
 from smartcam.protocols._framed.machine import ResultBurst
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
     from smartcam._client.camera_state import CameraState
     from smartcam._client.counters import ClientCounters
@@ -75,8 +75,21 @@ class Dispatch:
         complete = ordered and dialect.capabilities.status_by_itself
         self._results.begin_session(ordered=ordered, complete=complete)
 
+    def dispatch_early(self, chunks: Iterable[Chunk]) -> None:
+        """Hand on what came while the session was made.
+
+        Nothing is asked before all of it is: an answer among it is to a question of the handshake.
+        """
+        for chunk in chunks:
+            self._hand_on(chunk)
+        self._ask_in_doubt()
+
     def dispatch(self, chunk: Chunk) -> None:
         """Hand on every event of a chunk, in order; never waits, never raises."""
+        self._hand_on(chunk)
+        self._ask_in_doubt()
+
+    def _hand_on(self, chunk: Chunk) -> None:
         at, now, answers = datetime.now(UTC), chunk.received_at, self._waits.answers
         events, takers = chunk.events, self._takers
         self._notes_events = self._listeners.notes_events()
@@ -88,6 +101,8 @@ class Dispatch:
                 take(event, now, at)
             if answers and isinstance(event, m.Message):
                 self._waits.on_message(event, now)
+
+    def _ask_in_doubt(self) -> None:
         if self._state.active_in_doubt:
             self._requests.ask_what_is_active()
 

@@ -260,8 +260,7 @@ class Supervisor:
         kind = Reconnected if again else Connected
         event = kind(camera=self._name, at=datetime.now(UTC), url=session.address.url)
         self._listeners.publish(event)
-        for chunk in session.early:
-            self._dispatch.dispatch(chunk)
+        self._dispatch.dispatch_early(session.early)
         if self._opened is not None and not self._opened.done():
             self._opened.set_result(None)
         self._tell()

@@ -20,6 +20,7 @@ from smartcam import (
 from smartcam.emulator import EmulatedCamera
 from smartcam.protocols import messages as m
 from tests.client.camera_by_hand import (
+    BUSY,
     CONNECT,
     DISCONNECT,
     GET_CLOCK,
@@ -35,6 +36,7 @@ from tests.client.camera_by_hand import (
     SWITCH,
     THESIS,
     TRIGGER,
+    HandmadeCamera,
     words,
 )
 from tests.client.clientkit import SHORT, balance, by_hand, cancelled, emulated, until
@@ -87,6 +89,21 @@ async def test_dialect_over_udp_is_found_out() -> None:
         url = emulator.url.partition("?")[0]
         async with smartcam.connect(url, connect_timeout=0.6) as camera:
             assert camera.url == emulator.url
+
+
+async def test_load_that_ends_while_a_session_is_made_is_asked_about_in_the_session() -> None:
+    """What came before is the handshake's, the answer to its Query among it: of the old one."""
+    async with HandmadeCamera(transport="udp") as box:
+        told = iter([3])
+        box.script[QUERY] = lambda _: box.said(QUERY, next(told, box.active))
+        box.script[CONNECT] = lambda _: (
+            box.said(CONNECT, 1) + box.status_frame(BUSY) + box.status_frame(READY)
+        )
+        async with smartcam.connect(box.url) as camera:
+            assert await camera.query_application() == 7
+            assert camera.active_application == 7
+            assert (await camera.trigger()).application == 7
+            assert camera.statistics().unexpected_messages == 0
 
 
 async def test_every_frame_over_udp_is_a_datagram() -> None:
