@@ -3,7 +3,9 @@
 An agent says by its presence that it has a camera. Another one with the same camera either refuses
 to start, or stands by: without a session, until that presence ends. Two that have a camera both,
 behind a split of the network, leave it to the camera, which serves the newcomer: whoever has lost
-its session and sees another's presence asks that agent, and lets it have the camera.
+its session and sees another's presence asks that agent, and lets it have the camera. Both may let
+go of it at the same time; so who has stopped because the camera was taken, and sees that the other
+one has it no more, stands by again.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet._agent import Agent
     from smartcam.fleet._bus import Bus, Handle
+    from smartcam.fleet._host import Host
     from smartcam.fleet._keys import Keys
     from smartcam.fleet._standby_file import Standby
     from smartcam.models import CameraEvent
@@ -37,6 +40,10 @@ ASK = 0.5
 
 RETURN = 4.0
 """Seconds for others to be back on a bus that was away, before what they had is taken over."""
+
+CONTEST = 30.0
+"""Seconds behind the last word of another agent that has a camera, too, in which it may be that one
+who takes it from us."""
 
 
 class Claims:
@@ -56,6 +63,7 @@ class Claims:
         self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
         self._wanted: dict[str, CameraSettings] = {}
         self._others: dict[str, set[str]] = {}  # agents that have a camera of ours
+        self._contested: dict[str, float] = {}  # until when it may be one of them who takes it
         self._settling: set[str] = set()
         self._again: set[str] = set()
         self._back: dict[str, asyncio.Event] = {}  # another one's presence that is waited for
@@ -122,6 +130,7 @@ class Claims:
         """Want a camera no more."""
         self._wanted.pop(name, None)
         self._others.pop(name, None)
+        self._contested.pop(name, None)
         self.given_up.pop(name, None)
 
     def close(self) -> None:
@@ -172,6 +181,7 @@ class Claims:
             return ""
         others = self._others.setdefault(name, set())
         (others.add if present else others.discard)(agent)
+        self._contested[name] = asyncio.get_running_loop().time() + CONTEST
         return name
 
     def _on_presence(self, key: str, present: bool) -> None:
@@ -182,8 +192,15 @@ class Claims:
 
     def on_event(self, event: CameraEvent) -> None:
         """Something happened to a camera that this agent has."""
-        if isinstance(event, Disconnected) and self._others.get(event.camera):
-            self._consider(event.camera)
+        if isinstance(event, Disconnected):
+            name = event.camera
+            if not self._bus.reached or self._is_contested(name):
+                self._consider(name)
+
+    def _is_contested(self, name: str) -> bool:
+        """Whether another agent has a camera that is ours, or had it a moment ago."""
+        now = asyncio.get_running_loop().time()
+        return bool(self._others.get(name)) or now < self._contested.get(name, now)
 
     def _consider(self, name: str) -> None:
         """Look whose a camera is, in a task; once at a time for each."""
@@ -211,7 +228,7 @@ class Claims:
         await asyncio.sleep(HOLD_OFF * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:
-                if await self._is_back(name):
+                if await self._appears(name, RETURN):
                     return  # should it go again, that is another matter
                 away = False
             else:
@@ -224,13 +241,13 @@ class Claims:
         self.given_up.pop(name, None)
         self._agent.share(name, settings)
 
-    async def _is_back(self, name: str) -> bool:
-        """Wait until another agent that has a camera is back on the bus; bounded."""
+    async def _appears(self, name: str, timeout: float) -> bool:
+        """Wait until another agent says that it has a camera; return whether one did."""
         if self._others.get(name):
             return True
         back = self._back[name] = asyncio.Event()
         try:
-            async with asyncio.timeout(RETURN):
+            async with asyncio.timeout(timeout):
                 await back.wait()
         except TimeoutError:
             return False
@@ -240,21 +257,44 @@ class Claims:
             del self._back[name]
 
     async def _defend(self, name: str) -> None:
-        """Keep a camera that another agent says it has, too, as long as it serves this one."""
-        agent = self._agent
-        while (host := agent.hosts.get(name)) and (others := self._others.get(name)):
-            if host.connected:
-                return  # its loss is an event
-            other = min(others)
-            told = await ask_cameras(self._bus, self._keys, other, name, ASK)
-            if host.connected or agent.hosts.get(name) is not host:
+        """Settle whose a camera is that this agent has, without a session.
+
+        Another one that says it has it, too, keeps it if the camera serves that one. Where nobody
+        else has it, and the camera was taken, this one stands by.
+        """
+        agent, away = self._agent, False
+        while (host := agent.hosts.get(name)) and not host.connected:  # its loss is an event
+            if others := self._others.get(name):
+                away = False
+                other = min(others)
+                if await self._yields(host, other):
+                    await self._give_up(name, other)
+                    return
+                await asyncio.sleep(ASK)
+            elif away or not self._bus.reached:
+                away = not self._bus.reached
+                await self._appears(name, ASK if away else RETURN)
+            elif self._standby is not None and _is_taken(host):
+                logger.warning("! %s: nobody has it: %s stands by", name, agent.name)
+                await agent.unshare(name)
+                self._again.add(name)
                 return
-            # of two that have no session the first one by name goes on trying
-            yields = bool(told) and (told[0].summary.connected or other < agent.name)
-            if yields and other in self._others.get(name, ()):
-                await self._give_up(name, other)
+            elif self._is_contested(name):
+                await self._appears(name, ASK)
+            else:
                 return
-            await asyncio.sleep(ASK)
+
+    async def _yields(self, host: Host, other: str) -> bool:
+        """Whether this agent, without a session, leaves a camera to another one that has it, too.
+
+        Of two that have no session the first one by name goes on trying.
+        """
+        agent, name = self._agent, host.name
+        told = await ask_cameras(self._bus, self._keys, other, name, ASK)
+        if host.connected or agent.hosts.get(name) is not host:
+            return False
+        yields = bool(told) and (told[0].summary.connected or other < agent.name)
+        return yields and other in self._others.get(name, ())
 
     async def _give_up(self, name: str, other: str) -> None:
         stays = "stands by" if self._standby is not None else "shares it no more"
@@ -264,3 +304,8 @@ class Claims:
         )
         logger.warning("! %s", error)
         await self._agent.unshare(name)
+
+
+def _is_taken(host: Host) -> bool:
+    """Whether there will be no session any more because another client has the camera."""
+    return isinstance(host.camera.trouble, ConnectionTakenError)

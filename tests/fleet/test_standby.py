@@ -10,9 +10,11 @@ from typing import Any, Self
 
 import pytest
 
+import smartcam
 from smartcam import Backoff
 from smartcam.exceptions import (
     ConfigurationError,
+    ConnectionTakenError,
     LinkError,
     SmartCamError,
     TriggerTimeoutError,
@@ -367,6 +369,41 @@ async def test_who_is_not_back_with_the_bus_is_replaced_after_a_while() -> None:
         await asyncio.sleep(RETURN - ASK)
         assert pair.sharing() == []
         await until(lambda: pair.having() == ["south"], 2 * ASK + SOON)
+
+
+async def test_camera_whose_winner_ends_during_a_split_is_taken_again() -> None:
+    async with pair_at_work() as (pair, work):
+        pair.ends["north"].detach()
+        await until(lambda: "south" in pair.sharing(), SOON)
+        await asyncio.sleep(15.0)
+        (winner,) = pair.having()
+        await pair.agents.pop(winner).close()
+        pair.ends["north"].attach()
+        (loser,) = pair.agents
+        await until(lambda: pair.having() == [loser], RETURN + 2 * ASK + SOON)
+        await work.some()
+
+
+@pytest.mark.parametrize("contested", [True, False])
+async def test_camera_that_was_taken_is_taken_back_from_an_agent_only(contested: bool) -> None:
+    """From one that had it, and has let go of it, too: else nobody would have it."""
+    async with Pair() as pair:
+        await pair.start("north")
+        if contested:
+            end = pair.bus.end()
+            await end.open(1.0)
+            end.be_present(Keys(FLEET).camera("south", NAME)).close()
+        for _ in range(2):
+            await until(lambda: pair.having() == ["north"])
+            async with smartcam.connect(pair.box.url):
+                await until(lambda: pair.having() == [])
+        (host,) = hosts(pair)
+        if contested:
+            await until(lambda: pair.having() == ["north"], 2 * ASK + SOON)
+        else:
+            await asyncio.sleep(60.0)
+            assert isinstance(host.camera.trouble, ConnectionTakenError)
+            assert (hosts(pair), pair.having()) == ([host], [])
 
 
 def hosts(pair: Pair) -> list[Any]:
