@@ -45,6 +45,11 @@ also not the one that is to call back. The variable ZENOH_RUNTIME goes before it
 LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
 
+MOST_PATIENCE = 120.0
+"""Seconds that the engine waits for an answer, whatever who asks has said: more than anybody does.
+By itself it waits for 10, and then ends one that comes slowly, as thousands of presences on a busy
+machine, as if it was whole."""
+
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
 MOST_WAITING = 1 << 26
@@ -105,6 +110,7 @@ class BusLink:
             "transport/shared_memory/enabled": False,
             "transport/link/tx/lease": int(1e3 * LEASE),
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
+            "routing/interests/timeout": int(1e3 * MOST_PATIENCE),
             # of each later try, too: of one that began while a cable was cut the system repeats
             # the packets ever more seldom, so who stays with it for long is back that much later
             "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE))),
