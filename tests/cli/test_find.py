@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-QUICK = ("--timeout", "0.05", "--rate", "10000")
+QUICK = ("--timeout", "0.5", "--rate", "10000")
 """What is silent is silent however long it is heard."""
 
 
@@ -217,7 +217,7 @@ async def test_terminal_is_told_how_far_it_is(
 @pytest.mark.long
 def test_find_asks_where_it_may(port: int, tmp_path: Path) -> None:
     with emulators(tmp_path, ("--host", f"{NETWORK}1", "--port", str(port))):
-        args = (f"{NETWORK}1", "--port", str(port), "--ask", *QUICK)
+        args = (f"{NETWORK}1", "--port", str(port), "--ask", "--timeout", "2")
         out = search(*args).out
         assert f"a camera answers: bvs://{NETWORK}1:{port}?dialect=handbook" in out
         path = tmp_path / "found.yaml"

@@ -3,7 +3,7 @@
 import net from "node:net";
 
 const [host, port, verb, number] = process.argv.slice(2);
-const SECONDS = 1.5;
+const SECONDS = Number(process.env.CLIENT_SECONDS ?? 1.5);
 const ID = { connect: 1, disconnect: 2, status: 0x12, result: 0x20, query: 0x30, change: 0x31,
   trigger: 0x40, start: 0x41, stop: 0x42 };
 const BUSY = 0x10, RUNNING = 0x80, OVERTRIGGERED = 0x100, WAITING = 0x200;

@@ -87,7 +87,10 @@ async def test_checks_of_a_plain_client_find_nothing() -> None:
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
 @at_any_pace
-async def test_checks_of_a_client_in_another_language_find_nothing() -> None:
+async def test_checks_of_a_client_in_another_language_find_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("CLIENT_SECONDS", str(slowed(1.5)))
     client = CommandClient(f"node {HERE / 'client.mjs'} {{host}} {{port}} {{task}}")
     assert await findings(client, room=asyncio.Semaphore(AT_ONCE)) == []
 
