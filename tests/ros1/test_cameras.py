@@ -110,7 +110,9 @@ def test_no_fleet() -> None:
 
 @pytest.mark.long
 def test_a_bridge_that_is_not_there_is_tried_on(tmp_path: Path) -> None:
-    (tmp_path / "fleet.yaml").write_text("cameras:\n  cam3: {emulated: {}}\n")
+    (tmp_path / "fleet.yaml").write_text(
+        "listen: tcp/127.0.0.1:0\ncameras:\n  cam3: {emulated: {}}\n"
+    )
     with (
         closed_port() as gone,
         Process(
