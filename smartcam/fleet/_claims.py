@@ -45,6 +45,10 @@ CONTEST = 30.0
 """Seconds behind the last word of another agent that has a camera, too, in which it may be that one
 who takes it from us."""
 
+CALM = 600.0
+"""Seconds in which a camera that was taken is not taken again a second time: it may be no agent who
+takes it, and that one would again, too."""
+
 
 class Claims:
     """The cameras that an agent has, or stands by for.
@@ -64,6 +68,7 @@ class Claims:
         self._wanted: dict[str, CameraSettings] = {}
         self._others: dict[str, set[str]] = {}  # agents that have a camera of ours
         self._contested: dict[str, float] = {}  # until when it may be one of them who takes it
+        self._calm: dict[str, float] = {}  # until when that is not so, whoever comes and goes
         self._settling: set[str] = set()
         self._again: set[str] = set()
         self._back: dict[str, asyncio.Event] = {}  # another one's presence that is waited for
@@ -131,6 +136,7 @@ class Claims:
         self._wanted.pop(name, None)
         self._others.pop(name, None)
         self._contested.pop(name, None)
+        self._calm.pop(name, None)
         self.given_up.pop(name, None)
 
     def close(self) -> None:
@@ -181,7 +187,9 @@ class Claims:
             return ""
         others = self._others.setdefault(name, set())
         (others.add if present else others.discard)(agent)
-        self._contested[name] = asyncio.get_running_loop().time() + CONTEST
+        now = asyncio.get_running_loop().time()
+        if now >= self._calm.get(name, now):
+            self._contested[name] = now + CONTEST
         return name
 
     def _on_presence(self, key: str, present: bool) -> None:
@@ -275,7 +283,9 @@ class Claims:
                 away = not self._bus.reached
                 await self._appears(name, ASK if away else RETURN)
             elif self._standby is not None and _is_taken(host):
-                logger.warning("! %s: nobody has it: %s stands by", name, agent.name)
+                logger.warning("! %s: no agent has it: %s stands by", name, agent.name)
+                self._contested.pop(name, None)
+                self._calm[name] = asyncio.get_running_loop().time() + CALM
                 await agent.unshare(name)
                 self._again.add(name)
                 return
