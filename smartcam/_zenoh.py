@@ -46,9 +46,8 @@ LEASE = 5.0
 """Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
 
 MOST_PATIENCE = 120.0
-"""Seconds that the engine waits for an answer, whatever who asks has said: more than anybody does.
-By itself it waits for 10, and then ends one that comes slowly, as thousands of presences on a busy
-machine, as if it was whole."""
+"""Seconds after which the engine ends the answer to who is there as if it was whole, however long
+who asks would wait. By itself it takes 10; thousands of presences on a busy machine take longer."""
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 

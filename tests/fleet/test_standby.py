@@ -283,12 +283,18 @@ async def test_of_two_at_the_same_time_one_keeps_it() -> None:
 # ---------------------------------------------------------------------- splits
 
 
+async def split(pair: Pair) -> str:
+    """Cut north off, which has the camera; return who has it once they have settled that."""
+    pair.ends["north"].detach()
+    await until(lambda: "south" in pair.sharing(), SOON)
+    await asyncio.sleep(15.0)
+    (winner,) = pair.having()
+    return winner
+
+
 async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
     async with pair_at_work() as (pair, _):
-        pair.ends["north"].detach()
-        await until(lambda: "south" in pair.sharing(), SOON)
-        await asyncio.sleep(15.0)
-        (winner,) = pair.having()
+        winner = await split(pair)
         sessions = [one.camera.statistics().sessions for one in hosts(pair)]
         await asyncio.sleep(30.0)
         assert pair.having() == [winner]
@@ -302,9 +308,7 @@ async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
 
 async def test_program_follows_to_who_won_a_split() -> None:
     async with pair_at_work() as (pair, work):
-        pair.ends["north"].detach()
-        await until(lambda: "south" in pair.sharing(), SOON)
-        await asyncio.sleep(15.0)
+        await split(pair)
         pair.ends["north"].attach()
         await until(lambda: len(pair.sharing()) == 1, PATIENCE)
         await work.some()
@@ -373,10 +377,7 @@ async def test_who_is_not_back_with_the_bus_is_replaced_after_a_while() -> None:
 
 async def test_camera_whose_winner_ends_during_a_split_is_taken_again() -> None:
     async with pair_at_work() as (pair, work):
-        pair.ends["north"].detach()
-        await until(lambda: "south" in pair.sharing(), SOON)
-        await asyncio.sleep(15.0)
-        (winner,) = pair.having()
+        winner = await split(pair)
         await pair.agents.pop(winner).close()
         pair.ends["north"].attach()
         (loser,) = pair.agents
@@ -392,10 +393,10 @@ async def test_camera_that_was_taken_is_taken_back_from_an_agent_only(contested:
         other = pair.bus.end()
         await other.open(1.0)
         for _ in range(1 + contested):
+            await until(lambda: pair.having() == ["north"])
             if contested:
                 other.be_present(Keys(FLEET).camera("south", NAME)).close()
             await taken_twice(pair)
-            await asyncio.sleep(2 * ASK + SOON)
         (host,) = hosts(pair)
         await asyncio.sleep(60.0)
         assert isinstance(host.camera.trouble, ConnectionTakenError)
