@@ -328,13 +328,18 @@ SPOKEN = [
 
 
 @contextlib.asynccontextmanager
-async def dumping(path: Path, ports: list[int]) -> AsyncIterator[None]:
-    """Capture what is said on some ports of loopback; at the end all of it is in the file."""
+async def dumping(path: Path, cameras: list[EmulatedCamera]) -> AsyncIterator[None]:
+    """Capture what cameras hear and say; at the end all of it is in the file.
+
+    Other tests run beside this one: their clients may have the port of a camera with the other
+    transport.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as marker:
         marker.bind(("127.0.0.1", 0))
-        wanted = " or ".join(f"port {port}" for port in (*ports, marker.getsockname()[1]))
+        places = [("udp", marker.getsockname()[1]), *((one.transport, one.port) for one in cameras)]
+        wanted = " or ".join(f"{transport} port {port}" for transport, port in places)
         process = await asyncio.create_subprocess_exec(
-            *("dumpcap", "-q", "-i", "lo", "-w", str(path), "-f", wanted),
+            *("dumpcap", "-q", "-i", "lo", "-w", str(path), "-f", f"ip and ({wanted})"),
             stderr=asyncio.subprocess.PIPE,
         )
         try:
@@ -394,14 +399,15 @@ async def test_captured_sessions_are_shown_as_the_camera_saw_them(
             )
             for dialect, transport, quirks in SPOKEN
         ]
-        async with dumping(path, [one.port for one in cameras]):
+        async with dumping(path, cameras):
             await asyncio.gather(*map(use, cameras))
     told = [("-d", f"{one.transport}.port=={one.port},bvs") for one in cameras]
     shown = await asyncio.to_thread(show, lua, path, "-2", *itertools.chain(*told))
     for camera in cameras:
         for sender, direction in ((CLIENT, "in"), (CAMERA, "out")):
             said = [one.message for one in camera.log if one.direction == direction]
-            seen = [one for one in shown if one.ports[sender is CLIENT] == camera.port]
+            place = (camera.transport, camera.port)
+            seen = [one for one in shown if (one.transport, one.ports[sender is CLIENT]) == place]
             assert [one.message(camera.spoken) for one in seen] == said, camera.url
             assert {one.fields["sender"] for one in seen} == {sender.value}
             assert {one.fields["dialect"] for one in seen} == {camera.spoken.label}

@@ -80,6 +80,7 @@ class Shown(NamedTuple):
     """One message, or bytes that make none, as Wireshark shows it."""
 
     packet: int  # its packet's number
+    transport: str  # of the packet: tcp or udp
     ports: tuple[int, int]  # of the packet: source and target
     # value of each field by its name, without ``bvs.``; hex where it is bytes
     fields: dict[str, str]
@@ -154,7 +155,7 @@ def show(lua: Path, capture: Path, *options: str) -> list[Shown]:
 
 def _shown(packet: ET.Element, proto: ET.Element) -> Shown:
     values = {one.get("name", ""): one.get("show", "") for one in packet.iter("field")}
-    kind = "tcp" if "tcp.srcport" in values else "udp"
+    transport = "tcp" if "tcp.srcport" in values else "udp"
     fields: dict[str, str] = {}
     findings: list[str] = []
     for one in proto.iter("field"):
@@ -165,5 +166,5 @@ def _shown(packet: ET.Element, proto: ET.Element) -> Shown:
         elif name.startswith("bvs."):
             fields[kept] = shown.replace(":", "") if kept in BYTES else shown
     number = int(packet.find("proto/field[@name='num']").get("show", ""))  # type: ignore[union-attr]
-    ports = (int(values[f"{kind}.srcport"]), int(values[f"{kind}.dstport"]))
-    return Shown(number, ports, fields, findings)
+    ports = (int(values[f"{transport}.srcport"]), int(values[f"{transport}.dstport"]))
+    return Shown(number, transport, ports, fields, findings)

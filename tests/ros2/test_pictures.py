@@ -37,7 +37,7 @@ from smartcam.ros2._camera_pictures import CameraPictures
 from smartcam.ros2._image_messages import frame_from, header_fields
 from smartcam.ros2._lens_messages import lens_fields
 from smartcam.ros2._picture_requests import MOST_NAMESPACES
-from smartcam.ros2._qos import LATCHED
+from smartcam.ros2._qos import DRIVER, LATCHED
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.ros2.roskit import free_place, soon, two_nodes, until
 
@@ -75,14 +75,27 @@ async def given(driver: ScriptedDriver, *frames: Any) -> None:
     driver.give(*frames)
 
 
+async def heard(node: Node, topic: str, kind: str) -> None:
+    """Wait until a node knows that somebody hears a topic of its own."""
+    with contextlib.closing(node.publisher(topic, kind, qos=DRIVER)) as other:
+        await until(lambda: other.heard)
+
+
+def readers(driver: ScriptedDriver) -> int:
+    """Return how many read what it streams."""
+    return driver.sink.statistics().readers if isinstance(driver.sink, FrameSource) else 0
+
+
 # ---------------------------------------------------------------------- streams
 
 
 async def test_the_device_streams_while_somebody_hears() -> None:
-    async with pictures(camera_info=LENS) as (driver, shown, _, there):
+    async with pictures(camera_info=LENS) as (driver, shown, here, there):
         assert driver.calls == ["open"]
         images = there.subscribe(f"{CAM}/image_raw", IMAGE)
         infos = there.subscribe(f"{CAM}/camera_info", INFO)
+        await heard(here, f"{CAM}/image_raw", IMAGE)
+        await heard(here, f"{CAM}/camera_info", INFO)
         for number in (1, 2):
             sent = frame(number, utc=100.5 + number)
             await given(driver, sent)
@@ -151,6 +164,7 @@ async def test_compressed_pictures_have_a_lens_of_their_stamp() -> None:
     async with pictures(camera_info=LENS) as (driver, _, _, there):
         small = there.subscribe(f"{CAM}/image_raw/compressed", COMPRESSED)
         infos = there.subscribe(f"{CAM}/camera_info", INFO)
+        await until(lambda: readers(driver) == 2)  # each of the two streams has one
         await given(driver, frame(200))
         message, info = await soon(anext(small)), await soon(anext(infos))
         assert message.format == "mono8; jpeg compressed mono8"
