@@ -9,11 +9,13 @@ import asyncio
 import collections
 import contextlib
 import ctypes
+import errno
 import functools
 import io
 import json
 import logging
 import os
+import random
 import re
 import socket
 import struct
@@ -48,6 +50,10 @@ LEASE = 5.0
 MOST_PATIENCE = 120.0
 """Seconds after which the engine ends the answer to who is there as if it was whole, however long
 who asks would wait. By itself it takes 10; thousands of presences on a busy machine take longer."""
+
+PORTS = range(20_000, 32_000)
+"""Those for port 0, below what systems give to who asks for any: between the look at one and the
+engine's listening no connection of another program takes it."""
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
@@ -139,11 +145,18 @@ def with_ports(endpoints: Iterable[str]) -> tuple[str, ...]:
 
 
 def _free_port(endpoint: str) -> int:
+    """Return a port that nobody has; where the host is none of this machine, the engine says so."""
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family) as found:
-        found.bind((host, 0))
-        return int(found.getsockname()[1])
+    for port in random.SystemRandom().sample(PORTS, 100):
+        try:
+            with socket.socket(family) as found:
+                found.bind((host, port))
+        except OSError as exc:
+            if exc.errno in {errno.EADDRINUSE, errno.EACCES}:
+                continue
+        break
+    return port
 
 
 def _end_lingering(ports: frozenset[int]) -> None:
