@@ -14,6 +14,7 @@ import gc
 import importlib
 import json
 import os
+import secrets
 import selectors
 import shutil
 import signal
@@ -55,6 +56,18 @@ def wait_until(true: Callable[[], object]) -> None:
     while not true():
         assert time.monotonic() < end, "what was waited for has not come"
         time.sleep(0.02)
+
+
+def free_port() -> int:
+    """Return a port where nothing listens, for what another process is to listen on.
+
+    It is below those that a system gives to who asks for any: other tests do not get it.
+    """
+    while True:
+        port = 20_000 + secrets.randbelow(12_000)
+        with socket.socket() as found, contextlib.suppress(OSError):
+            found.bind(("127.0.0.1", port))
+            return port
 
 
 def printed_by(python: str) -> str:

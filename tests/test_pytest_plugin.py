@@ -31,8 +31,8 @@ SYNCHRONOUS = """
             answer = client.recv(16, socket.MSG_WAITALL)
             assert answer == bytes.fromhex("50535642 04000000 01000000 01000000")
             client.sendall(bytes.fromhex("50535642 00000000 02000000"))
-        emulated_camera.log.expect("Connect", "ConnectAnswer", "Disconnect")
-        emulated_camera.log.expect_disconnect_before_close()
+        emulated_camera.log.expect("Connect", "ConnectAnswer", "Disconnect", timeout=60)
+        emulated_camera.log.expect_disconnect_before_close(timeout=60)
 """
 
 ASYNCHRONOUS = """
@@ -156,7 +156,7 @@ def test_client_is_closed_after_a_failure(pytester: pytest.Pytester) -> None:
             assert False
 
         def test_after():
-            emulator.log.expect("Connect", "Disconnect")
+            emulator.log.expect("Connect", "Disconnect", timeout=60)
     """
     run(pytester, source, passed=1, failed=1)
 

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, assert_type
@@ -184,10 +185,12 @@ def test_events_and_statuses_are_seen(emulator: ThreadedCamera) -> None:
 
 
 def test_next_result_is_somebody_elses(emulator: ThreadedCamera, camera: SyncCamera[Any]) -> None:
-    timer = threading.Timer(0.05, lambda: emulator.run(lambda one: one.device.trigger()))
-    timer.start()
-    assert camera.next_result(timeout=PATIENCE).triggered_at is None
-    timer.join()
+    with ThreadPoolExecutor(1) as pool:
+        waiting = pool.submit(camera.next_result, timeout=PATIENCE)
+        while not waiting.done():  # nobody tells when it has begun to wait
+            emulator.run(lambda one: one.device.trigger())
+            time.sleep(0.05)
+        assert waiting.result().triggered_at is None
 
 
 def test_subscription_that_nobody_holds_is_gone(camera: SyncCamera[Any]) -> None:

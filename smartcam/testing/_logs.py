@@ -102,7 +102,7 @@ class CameraLog(Sequence["LogEntry"]):
 
     # ------------------------------------------------------------------ expectations
 
-    def expect(self, *expected: Expected, only: bool = False, timeout: float = 1.0) -> None:
+    def expect(self, *expected: Expected, only: bool = False, timeout: float = 5.0) -> None:
         """See that these messages went over the wire, in this order.
 
         Args:
@@ -139,7 +139,7 @@ class CameraLog(Sequence["LogEntry"]):
         allowed = (*ALLOWED_WHILE_BUSY, *also)
         self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
-    def expect_disconnect_before_close(self, *, timeout: float = 1.0) -> None:
+    def expect_disconnect_before_close(self, *, timeout: float = 5.0) -> None:
         """See that every client that had a session ended it by Disconnect, and then its connection.
 
         Over UDP there is no connection: Disconnect has to be the last message of each.

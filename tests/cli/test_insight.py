@@ -215,7 +215,7 @@ def test_watch_says_that_nothing_comes_by_itself(online: str) -> None:
 
 
 def test_probe_shows_the_conversation(url: str) -> None:
-    out = run("probe", url).done().out
+    out = run("probe", url, "--timeout", "60").done().out
     assert sum(line.startswith("  ") for line in out.splitlines()) == 11
     for line in (
         "tcp native: a camera answers\n",

@@ -75,7 +75,7 @@ def lines_of(outcome: str, head: str) -> list[str]:
 
 def test_probe_shows_each_frame_decoded_and_as_hex() -> None:
     with Peer(SESSION) as peer:
-        outcome = run("probe", peer.url).done()
+        outcome = run("probe", peer.url, "--timeout", "60").done()
     assert lines_of(outcome.out, ANSWERED) == [
         "> Disconnect()  505356420000000002000000",
         "> Connect()  505356420000000001000000",
@@ -130,8 +130,8 @@ def test_probe_long_frame_is_cut_for_people_and_whole_in_json() -> None:
     long = bytes.fromhex("50535642") + size.to_bytes(4, "little") + HELLO_WORLD[8:16]
     long += bytes(size - 4)
     with Peer({**SESSION, CONNECT: CONNECTED + long + WAITING}) as peer:
-        text = run("probe", peer.url).done().out
-        first = run("probe", peer.url, "--json").done().lines[0]
+        text = run("probe", peer.url, "--timeout", "60").done().out
+        first = run("probe", peer.url, "--timeout", "60", "--json").done().lines[0]
     (line,) = [each for each in lines_of(text, ANSWERED) if "ResultContainer" in each]
     assert line.endswith(long.hex()[:128] + "...")
     assert long.hex() in [frame["hex"] for frame in first["frames"]]
@@ -140,7 +140,7 @@ def test_probe_long_frame_is_cut_for_people_and_whole_in_json() -> None:
 def test_probe_flood_is_counted_and_not_shown() -> None:
     flood = HELLO_WORLD * 200
     with Peer({**SESSION, CONNECT: CONNECTED + flood + WAITING}) as peer:
-        outcome = run("probe", peer.url).done()
+        outcome = run("probe", peer.url, "--timeout", "60").done()
     shown = outcome.out.splitlines()
     assert len(shown) < 70
     assert any(line.startswith("  ... and ") and line.endswith(" more") for line in shown)
@@ -169,7 +169,7 @@ def test_probe_silence_says_what_was_sent() -> None:
 def test_probe_trace_has_the_end_of_the_session_too(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
     with Peer(SESSION) as peer:
-        run("probe", peer.url, "--trace", str(path)).done()
+        run("probe", peer.url, "--timeout", "60", "--trace", str(path)).done()
     messages = [json.loads(line)["message"] for line in path.read_text().splitlines()]
     assert messages == [
         "Disconnect", "Connect", "ConnectAnswer", "StatusReport", "Query", "QueryAnswer",

@@ -324,7 +324,7 @@ def test_probe_host_and_port_finds_transport_and_dialect(urls: dict[tuple[str, s
 def test_probe_url_begins_with_what_it_says(urls: dict[tuple[str, str], str]) -> None:
     for way, url in urls.items():
         with each(way):
-            outcome = run("probe", url).done()
+            outcome = run("probe", url, "--timeout", "60").done()
             assert probed(outcome.out) == [way]
             assert outcome.out.splitlines()[0].endswith(": a camera answers")
 
@@ -373,13 +373,14 @@ def test_probe_changes_nothing(urls: dict[tuple[str, str], str]) -> None:
         with each(url):
             run("trigger", url, "--application", "21").done()
             before = state(url)
-            assert "status: RUNNING + WAITING_FOR_TRIGGER" in run("probe", url).done().out
+            out = run("probe", url, "--timeout", "60").done().out
+            assert "status: RUNNING + WAITING_FOR_TRIGGER" in out
             assert state(url) == before
 
 
 def test_probe_ends_with_disconnect() -> None:
     with Peer(SESSION) as peer:
-        run("probe", peer.url).done()
+        run("probe", peer.url, "--timeout", "60").done()
         peer.wait_last(DISCONNECT)
 
 

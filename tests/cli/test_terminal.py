@@ -82,9 +82,10 @@ def test_watch_counts_while_it_waits_and_leaves_result_lines_whole() -> None:
 @pytest.mark.long
 def test_watch_says_for_how_long_nothing_came() -> None:
     with ThreadedCamera(active=21, running=True) as emulator:
-        text = shown("watch", emulator.url, "--seconds", "2.5")
-    assert "0 results, nothing for 1 s\r" in text
-    assert "0 results, nothing for 2 s\r" in text
+        text = shown("watch", emulator.url, "--seconds", "4.5")
+    told = re.findall(r"0 results, nothing for (\d) s\r", text)
+    assert len(told) >= 2  # a slow machine leaves some out
+    assert told == sorted(set(told))
 
 
 @pytest.mark.long

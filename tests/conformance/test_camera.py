@@ -35,6 +35,7 @@ from tests.conformance.camera_world import (
     short_options,
 )
 from tests.conformance.pace import at_any_pace, slowed
+from tests.handmade import refusing
 
 FAST = {"reboot_time": 0.2}
 
@@ -348,9 +349,8 @@ def test_judge_nothing_allowed_only_asks(thread: LoopThread, dialect: str) -> No
 
 @at_any_pace
 def test_judge_nothing_there_fails_one_check_and_ends_soon() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-    report = judge(short_options(f"bvs://127.0.0.1:{port}"))
+    with refusing(socket.SOCK_STREAM) as port:
+        report = judge(short_options(f"bvs://127.0.0.1:{port}"))
     assert [one.item.name for one in report.differing] == ["connect-is-answered"]
     assert report.differing[0].expected == "an answer to Connect in one of the dialects"
     assert "Connection refused" in report.differing[0].came

@@ -11,6 +11,7 @@ import pytest
 from smartcam.conformance.client import CommandClient, FunctionClient, Outcome, Task
 from smartcam.conformance.client._tasks import read_results
 from smartcam.exceptions import ConfigurationError
+from tests.conformance.pace import at_any_pace, slowed
 
 pytestmark = pytest.mark.real_time
 
@@ -171,6 +172,7 @@ async def test_function_that_does_not_end_is_left_behind() -> None:
     assert without_time(outcome) == Outcome(ended=False)
 
 
+@at_any_pace  # it is to begin before
 async def test_asynchronous_function_that_does_not_end_is_cancelled() -> None:
     ended: list[str] = []
 
@@ -181,6 +183,6 @@ async def test_asynchronous_function_that_does_not_end_is_cancelled() -> None:
             ended.append("cancelled")
         return []
 
-    outcome = await FunctionClient(perform).perform(TASK, SHORT)
+    outcome = await FunctionClient(perform).perform(TASK, slowed(SHORT))
     assert without_time(outcome) == Outcome(ended=False)
     assert ended == ["cancelled"]

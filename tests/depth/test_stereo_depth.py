@@ -85,6 +85,15 @@ async def streaming(cameras: StereoDepth, *found: ScriptedDriver) -> asyncio.Tas
     return waiting
 
 
+def give(
+    pictures: tuple[NDArray[np.uint8], NDArray[np.uint8]], number: int, *found: ScriptedDriver
+) -> None:
+    """Have the left and the right one give pictures of the same moment."""
+    now = time.monotonic()
+    for one, picture in zip(found, pictures, strict=True):
+        one.give(shown(picture, number, captured=now))
+
+
 @functools.cache
 def drawn(right_size: tuple[int, int] = SIZE) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     left, right = CHAIN.cameras
@@ -158,8 +167,7 @@ async def test_cancelling_while_it_matches_leaves_it_working() -> None:
     pictures = drawn()
     async with cameras:
         waiting = await streaming(cameras, left, right)
-        left.give(shown(pictures[0], 1))
-        right.give(shown(pictures[1], 1))
+        give(pictures, 1, left, right)
         await until(lambda: cameras.statistics().group.delivered == 1)
         worker = cameras._opened()[0]
         assert worker._running is not None
@@ -169,8 +177,7 @@ async def test_cancelling_while_it_matches_leaves_it_working() -> None:
             await waiting
         again = asyncio.ensure_future(anext(cameras))
         for number in (2, 3):
-            left.give(shown(pictures[0], number))
-            right.give(shown(pictures[1], number))
+            give(pictures, number, left, right)
         assert (await again).sequences in ((2, 2), (3, 3))
 
 
@@ -180,12 +187,10 @@ async def test_a_cut_picture_is_refused_and_the_next_pair_is_matched() -> None:
     pictures = drawn()
     async with cameras:
         waiting = await streaming(cameras, left, right)
-        left.give(shown(pictures[0][:120], 1))
-        right.give(shown(pictures[1], 1))
+        give((pictures[0][:120], pictures[1]), 1, left, right)
         with pytest.raises(FrameFormatError, match=r"calibrated with, 240x160 .* got 240x120"):
             await waiting
-        left.give(shown(pictures[0], 2))
-        right.give(shown(pictures[1], 2))
+        give(pictures, 2, left, right)
         assert (await anext(cameras)).left.shape == (160, 240)
 
 
@@ -247,8 +252,7 @@ async def test_readers_of_frames_are_paired_as_sources_are() -> None:
     await opening
     waiting = asyncio.ensure_future(anext(cameras))
     for number in (2, 3):
-        for one, picture in zip(found, pictures, strict=True):
-            one.give(shown(picture, number))
+        give(pictures, number, *found)
         await asyncio.sleep(0.01)
     depth = (await waiting).depth
     assert np.median(depth[depth > 0]) == pytest.approx(1.5, abs=0.2)

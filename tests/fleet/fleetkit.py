@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable, Mapping
 from typing import Any, Self
 
 from smartcam import Backoff
-from smartcam._zenoh import BusLink, with_ports
+from smartcam._zenoh import BusLink
 from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import Bus, MemoryBus, MemoryEnd
@@ -19,6 +19,7 @@ from smartcam.fleet._program import Program
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
+from tests.processes import free_port
 
 FLEET = "plant"
 NAME = "line1/cam1"
@@ -74,6 +75,11 @@ class NumberedCamera(EmulatedCamera):
         return {"run": number, "token": token or 0}
 
 
+def free_place() -> str:
+    """Return an endpoint of Zenoh's that nobody listens on."""
+    return f"tcp/127.0.0.1:{free_port()}"
+
+
 class Plant:
     """A bus with an agent that shares one camera; a context manager.
 
@@ -100,7 +106,7 @@ class Plant:
     ) -> None:
         self.box = NumberedCamera() if box is None else box
         self.bus = MemoryBus() if bus is None else bus
-        self.places = with_ports(["tcp/127.0.0.1:0"]) if zenoh else ()
+        self.places = (free_place(),) if zenoh else ()
         self._engine = engine
         self._frames = frames
         self.session = {"reconnect": FAST, "name": NAME, **session}

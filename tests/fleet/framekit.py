@@ -28,7 +28,8 @@ class FramePlant(Plant):
 
     def __init__(self, source: dict[str, Any] | None = None, **options: Any) -> None:
         self.driver = ScriptedDriver()
-        self._source = source or {}
+        # the device gives nothing while a test waits for something else
+        self._source = {"stall": None, **(source or {})}
         options.setdefault("zenoh", not isinstance(asyncio.get_running_loop(), TimedLoop))
         super().__init__(frames=self._make, **options)
 

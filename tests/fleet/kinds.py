@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from smartcam import Camera, SmartCamera
-from smartcam._zenoh import BusLink, with_ports
+from smartcam._zenoh import BusLink
 from smartcam.fleet._agent import Agent
 from smartcam.fleet._bus import Bus, MemoryBus
 from smartcam.fleet._camera import FleetCamera
@@ -15,6 +15,7 @@ from smartcam.fleet._program import Program
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
+from tests.fleet.fleetkit import free_place
 
 FLEET = "plant"
 
@@ -76,6 +77,6 @@ def connect(
     if kind == "in_process":
         bus = MemoryBus()
         return OwnAgentCamera(url, (bus.end(), bus.end()), options, observers)
-    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    place = free_place()
     ends = ZenohEnd(BusLink(listen=(place,))), ZenohEnd(BusLink(connect=(place,)))
     return OwnAgentCamera(url, ends, options, observers)

@@ -14,12 +14,13 @@ from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetFile, FleetServer
 from smartcam.fleet._bus import MemoryBus
 from smartcam.protocols import messages as m
+from tests.fleet.fleetkit import free_place, until
 from tests.timed_loop import TimedLoop
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from smartcam.fleet._bus import Bus
+    from smartcam.fleet._bus import Bus, Publisher
 
 PREFIX = "smartcam/plant"
 NAME = "line1/cam3"
@@ -117,11 +118,26 @@ class InProcess(Client):
 
 
 class OverZenoh(Client):
-    """With plain Zenoh."""
+    """With plain Zenoh, at a server in this process."""
 
-    def __init__(self, session: Any) -> None:
+    def __init__(self, session: Any, server: FleetServer) -> None:
         self._session = session
+        self._server = server
         self._loop = asyncio.get_running_loop()
+
+    async def topic(self, pattern: str) -> Heard:
+        heard = await super().topic(pattern)
+        # of a subscription the engine tells in another thread than of what is asked
+        await until(lambda: all(one.heard for one in self._publishers(pattern)))
+        return heard
+
+    def _publishers(self, pattern: str) -> list[Publisher]:
+        """Return what the server says things with that a pattern means."""
+        own = self._server.hosts[NAME].topics
+        if pattern.startswith("topic/"):
+            return [one for kind, one in own._topics._any.items() if kind == pattern.split("/")[1]]
+        results = None if own.results_out is None else own.results_out.publisher
+        return [one for one in (own.status_out, results) if one is not None]
 
     async def ask_raw(self, key: str, payload: bytes) -> list[tuple[str, bytes]]:
         return await asyncio.to_thread(self._get, key, payload)
@@ -177,7 +193,7 @@ def fleet_file(url: str, **more: Any) -> FleetFile:
         "interpret_as": {COUNTER: LAYOUT, TEXTS: "strings50"},
         "reconnect": {"initial": 0.05, "maximum": 0.05},
     }
-    fields = {"agent": "one", "listen": "tcp/127.0.0.1:0", "cameras": {NAME: {**entry, **more}}}
+    fields = {"agent": "one", "listen": free_place(), "cameras": {NAME: {**entry, **more}}}
     return FleetFile.model_validate(fields)
 
 
@@ -214,7 +230,7 @@ async def plant(**more: Any) -> AsyncIterator[Plant]:
         else:
             session = await asyncio.to_thread(zenoh_session, server.address.port)
             stack.push_async_callback(asyncio.to_thread, session.close)
-            client = OverZenoh(session)
+            client = OverZenoh(session, server)
         yield Plant(client, camera, server, memory)
 
 

@@ -9,12 +9,13 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from smartcam._zenoh import BusLink, with_ports
+from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetFile
 from smartcam.fleet._access import access_control
 from smartcam.fleet._authority import make_certificates
 from smartcam.fleet._zenoh import ZenohEnd
 from tests.fleet.fleetkit import PATIENCE
+from tests.processes import free_port
 
 NAMES = {
     "agent": ("line1", "line2"),
@@ -42,7 +43,7 @@ async def short_lived(folder: Path, role: str, name: str, seconds: float) -> Non
 @contextlib.asynccontextmanager
 async def guarded(plant: Path, domain: int | None = None) -> AsyncIterator[tuple[ZenohEnd, str]]:
     """Give an end that listens and guards by roles, and where."""
-    (place,) = with_ports(["tls/127.0.0.1:0"])
+    place = f"tls/127.0.0.1:{free_port()}"
     link = BusLink((place,), (), str(plant / WHO["agent"]))
     end = ZenohEnd(link, {"access_control": access_control(domain)})
     await end.open(PATIENCE)
@@ -68,7 +69,7 @@ def plant_file(folder: Path, name: str = "line1", **more: Any) -> FleetFile:
     return FleetFile.model_validate(
         {
             "agent": name,
-            "listen": "tls/127.0.0.1:0",
+            "listen": f"tls/127.0.0.1:{free_port()}",
             "certificates": str(folder / name),
             "cameras": {CAMERA: {"emulated": {}, "application": 7, "interpret_as": "raw"}},
             **more,

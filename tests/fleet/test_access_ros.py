@@ -56,7 +56,7 @@ async def test_roles_and_renewal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             await certified(folder, {"agent": ["line1"]})
             digest = read_identity(folder / "line1").digest
             await until(lambda: not topics(contexts["robot"]))
-            await until(lambda: topics(contexts["robot"]) == before)
+            await until(lambda: topics(contexts["robot"]) >= before)
             assert server._bus.identity is not None
             assert server._bus.identity.digest == digest
             assert server.ros_nodes == ["/line1/cam3"]

@@ -15,7 +15,7 @@ from smartcam.fleet._caller import DRIFT, Caller
 from smartcam.frames import FrameSource
 from smartcam.frames import open as open_frames
 from smartcam.frames._synthetic import read_stamp
-from tests.fleet.fleetkit import PATIENCE
+from tests.fleet.fleetkit import PATIENCE, free_place
 
 WAYS = st.floats(0.0, 0.2)
 
@@ -80,7 +80,7 @@ async def test_exact_where_all_is_in_one_process() -> None:
 @pytest.mark.real_time
 async def test_frames_over_the_network_have_the_time_at_which_they_were_drawn() -> None:
     camera = {"emulated": {}, "frames": "synthetic://?size=300x200&fps=200"}
-    file = {"listen": "tcp/127.0.0.1:0", "cameras": {"a": camera}}
+    file = {"listen": free_place(), "cameras": {"a": camera}}
     async with FleetServer(FleetFile.model_validate(file)) as server:
         source = open_frames(server.urls["a"], timeout=PATIENCE)
         assert isinstance(source, FrameSource)

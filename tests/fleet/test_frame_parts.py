@@ -291,11 +291,16 @@ async def test_program_that_ends_without_a_word_stops_its_stream_and_no_other(nu
     ):
         await until(lambda: len(plant.shared._viewers) == 1)
         async with camera.frames(timeout=PATIENCE) as frames:
+            await anext(frames)
+            await until(lambda: len(plant.shared._viewers) == 2)
             viewer.signal(number)
+            triggered = 0
             while len(plant.shared._viewers) > 1:
                 await anext(frames)  # as before
-                assert (await camera.trigger(timeout=2.0)).value.run
+                assert (await camera.trigger(timeout=PATIENCE)).value.run
+                triggered += 1
                 theirs = plant.agent._sender._windows.values()
                 assert all(one.under_way <= WINDOW for one in theirs)
+            assert triggered > 1 or number != signal.SIGSTOP  # none had to wait for its end
         await plant.driver.rests()
         viewer.signal(signal.SIGCONT)

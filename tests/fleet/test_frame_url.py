@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 from collections.abc import AsyncIterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,14 +19,14 @@ from smartcam import (
     FrameSourceError,
     UnsupportedError,
 )
-from smartcam._zenoh import with_ports
 from smartcam.camera import FrameEncoding
 from smartcam.fleet import FleetFile, FleetFrame, FleetServer
 from smartcam.frames._synthetic import read_stamp
 from tests.client.clientkit import gone
-from tests.fleet.fleetkit import PATIENCE
+from tests.fleet.fleetkit import PATIENCE, free_place
 from tests.fleet.framekit import looking
 from tests.frames.drivers import frame
+from tests.handmade import refusing
 
 NAME = "line1/cam3"
 
@@ -33,7 +35,7 @@ NAME = "line1/cam3"
 async def served(frames: str | None = "synthetic://?size=300x200&fps=200") -> AsyncIterator[str]:
     """Give the fleet URL of a camera with frames."""
     camera = {"emulated": {}} if frames is None else {"emulated": {}, "frames": frames}
-    file = {"listen": "tcp/127.0.0.1:0", "cameras": {NAME: camera}}
+    file = {"listen": free_place(), "cameras": {NAME: camera}}
     async with FleetServer(FleetFile.model_validate(file)) as server:
         yield server.urls[NAME]
 
@@ -75,9 +77,9 @@ def test_wrong_parameter_is_told(query: str, says: str) -> None:
 
 @pytest.mark.real_time
 async def test_nobody_there_is_told_as_of_any_source() -> None:
-    (place,) = with_ports(["tcp/127.0.0.1:0"])
-    source = smartcam.frames.open(f"fleet://127.0.0.1:{place.rpartition(':')[2]}/{NAME}")
-    error = await gone(source.__aenter__())
+    with refusing(socket.SOCK_STREAM) as port:
+        source = smartcam.frames.open(f"fleet://127.0.0.1:{port}/{NAME}")
+        error = await gone(source.__aenter__())
     assert isinstance(error, FrameSourceError)
     assert "127.0.0.1" in str(error)
 
@@ -96,12 +98,13 @@ async def test_camera_without_frames_is_told() -> None:
 async def test_frame_comes_encoded_once_for_all_and_is_decoded_where_it_is_wanted() -> None:
     picture = np.tile(np.arange(0, 240, 5, dtype=np.uint8), (32, 1))
     given = frame(5, data=picture.tobytes(), width=48, height=32, stride=48, lost=2)
+    old: Any = {"max_age": 3600.0, "timeout": PATIENCE}
     async with looking(source={"linger": 60.0}) as (plant, camera):
         async with camera.frames():
             await plant.driver.streams()
             plant.driver.give(given)
         jpegs = await asyncio.gather(
-            *(camera.newest_frame(max_age=3600.0, encoding="jpeg", quality=95) for _ in range(3))
+            *(camera.newest_frame(**old, encoding="jpeg", quality=95) for _ in range(3))
         )
         assert len({bytes(one.data) for one in jpegs}) == 1
         one = jpegs[0]
@@ -110,7 +113,7 @@ async def test_frame_comes_encoded_once_for_all_and_is_decoded_where_it_is_wante
         assert np.abs(one.grey().astype(int) - picture).max() < 10
         lossless: dict[FrameEncoding, str] = {"png": "PNG", "jpegxl": "JPEGXL"}
         for encoding, pixels in lossless.items():
-            got = await camera.newest_frame(max_age=3600.0, encoding=encoding)
+            got = await camera.newest_frame(**old, encoding=encoding)
             assert got.format.name == pixels
             async with smartcam.frames.Codecs() as codecs:
                 assert ((await codecs.decode(got)).array() == picture).all()
@@ -133,7 +136,7 @@ async def test_jpegs_of_the_camera_are_left_as_they_are() -> None:
     jpeg = smartcam.frames.find_format("MJPEG")
     given = frame(1, format=jpeg, data=b"\xff\xd8 as it came", stride=0)
     async with looking(source={"linger": 60.0}) as (plant, camera):
-        asking = asyncio.create_task(camera.newest_frame(encoding="jpeg"))
+        asking = asyncio.create_task(camera.newest_frame(max_age=3600.0, encoding="jpeg"))
         await plant.driver.streams()
         plant.driver.give(given)
         got = await asking

@@ -45,7 +45,7 @@ def in_process() -> bool:
 @pytest.mark.both_buses
 async def test_frame_comes_with_all_that_is_known_of_it() -> None:
     async with looking(source={"camera_info": LENS, "linger": 60.0}) as (plant, camera):
-        asking = asyncio.create_task(camera.newest_frame(timeout=PATIENCE))
+        asking = asyncio.create_task(camera.newest_frame(max_age=math.inf, timeout=PATIENCE))
         await plant.driver.streams()
         given = frame(
             7, moment=Moment.FRAME_END, duration=0.25, lost=3, utc=1.5e9, data=b"\x01\x02" * 4
@@ -67,7 +67,7 @@ async def test_frame_comes_with_all_that_is_known_of_it() -> None:
 
 async def test_frame_in_one_process_is_not_copied() -> None:
     async with looking(source={"linger": 60.0}) as (plant, camera):
-        asking = asyncio.create_task(camera.newest_frame())
+        asking = asyncio.create_task(camera.newest_frame(max_age=math.inf))
         await plant.driver.streams()
         given = frame(1, data=bytes(2_000_000), width=2000, height=1000, stride=2000)
         plant.driver.give(given)
@@ -85,7 +85,9 @@ async def test_newest_frame_is_not_older_than_wanted() -> None:
         plant.driver.give(frame(1, captured=time.monotonic() - 10.0))
         await asyncio.sleep(0.05)
         assert not asking.done()
-        plant.driver.give(frame(2))
+        while not asking.done():  # one that is new yet when it is looked at
+            plant.driver.give(frame(2))
+            await asyncio.sleep(0.05)
         assert (await asking).sequence == 2
         assert (await camera.newest_frame(max_age=60.0)).sequence == 2
         plant.driver.give(frame(3, captured=time.monotonic() - 10.0))
@@ -106,7 +108,9 @@ async def test_frame_after_was_exposed_after_the_call_or_the_moment() -> None:
             plant.driver.give(frame(3, captured=time.monotonic() - 1000.0))
             await asyncio.sleep(0.05)
             assert not asking.done()
-            plant.driver.give(frame(4))
+            while not asking.done():  # the agent's clock is known as well as a call was quick
+                plant.driver.give(frame(4))
+                await asyncio.sleep(0.05)
             assert (await asking).sequence == 4
 
 
@@ -133,7 +137,7 @@ async def test_device_that_cannot_be_opened_is_told_with_what_it_has() -> None:
             assert (str(error), error.available) == ("no such pixels", ("Mono8 4x2",))
         del plant.driver.fails["open"]
         async with plant.streaming():
-            assert (await camera.newest_frame()).sequence == 1
+            assert (await camera.newest_frame()).sequence >= 1
 
 
 # ---------------------------------------------------------------------- streams

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from smartcam import Result
-from smartcam._zenoh import BusLink, with_ports
+from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, RemoteProtocolError
 from smartcam.fleet import _fleet
 from smartcam.fleet._bundle import AgentBundle, decode_bundle
@@ -19,7 +19,7 @@ from smartcam.fleet._exchange import Exchange
 from smartcam.fleet._fleet import Fleet
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._server import FleetServer
-from tests.fleet.fleetkit import PATIENCE, until
+from tests.fleet.fleetkit import PATIENCE, free_place, until
 from tests.fleet.test_fleet import HELLO, file
 
 CAMERAS = ("a", "b", "c", "d", "e")
@@ -197,7 +197,7 @@ async def test_thousands_of_presences_come_through_a_router() -> None:
     pytest.importorskip("zenoh")
     from smartcam.fleet._zenoh import ZenohEnd
 
-    places = with_ports(["tcp/127.0.0.1:0"])
+    places = (free_place(),)
     keys, count = Keys("plant"), 6000
     router, agent = ZenohEnd(BusLink(listen=places)), ZenohEnd(BusLink(connect=places))
     program = ZenohEnd(BusLink(connect=places))

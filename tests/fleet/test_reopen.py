@@ -10,8 +10,8 @@ import pytest
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectFailedError
 from smartcam.fleet._zenoh import ZenohEnd
-from tests.fleet.fleetkit import PATIENCE, until
-from tests.fleet.test_zenoh import free_place, two_ends
+from tests.fleet.fleetkit import PATIENCE, free_place, until
+from tests.fleet.test_zenoh import two_ends
 
 pytestmark = pytest.mark.real_time
 

@@ -61,7 +61,8 @@ async def test_a_plant_is_seen_and_used_from_ros() -> None:
         poses = viewer.subscribe("/line_1/cam2/localizations", POSES, qos=QoS(depth=5))
         others = viewer.subscribe("/line_1/cam1/localizations", POSES, qos=QoS(depth=5))
         publishers = {one.node.full_name: one for one in server._ros.nodes.values()}  # type: ignore[union-attr]
-        await until(lambda: publishers["/line_1/cam2"].results._publishers["localizations"].heard)
+        heard = [one.results._publishers["localizations"] for one in publishers.values()]
+        await until(lambda: all(one.heard for one in heard))
         direct: Any = smartcam.connect(server.urls["line-1/cam2"])
         async with direct as camera:
             result = await camera.trigger()
@@ -91,7 +92,7 @@ async def test_a_node_goes_with_its_agent_and_comes_with_it() -> None:
                 await until(lambda: "/cam/trigger" in viewer.graph.services())
                 assert viewer.graph.services()["/cam/trigger"] == [TRIGGER]
             await until(lambda: viewer.graph.nodes() == ["/viewer"])
-            assert "/cam/trigger" not in viewer.graph.services()
+            await until(lambda: "/cam/trigger" not in viewer.graph.services())
 
 
 async def test_a_fleet_that_is_served_already_is_seen_by_its_url() -> None:

@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("zenoh")
 
-from smartcam._zenoh import BusLink, with_ports
+from smartcam._zenoh import BusLink
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet import Fleet
 from smartcam.fleet._address import FleetAddress
@@ -22,6 +22,7 @@ from smartcam.fleet._zenoh import ZenohEnd
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
 from tests.fleet.partner import Partner, partner
 from tests.fleet.test_standby import QUICK, Work
+from tests.processes import free_port
 
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 
@@ -37,7 +38,7 @@ class Hosts:
 
     def __init__(self, box: NumberedCamera, address: str) -> None:
         self.box = box
-        (self.place,) = with_ports([f"tcp/{address}:0"])
+        self.place = f"tcp/{address}:{free_port()}"
         self.router = ZenohEnd(BusLink(listen=(self.place,)))
         self.agents: dict[str, Partner] = {}
 
@@ -50,7 +51,7 @@ class Hosts:
     async def sharing(self) -> list[str]:
         """Return the agents that say that they have the camera."""
         keys = Keys(FLEET)
-        found = await self.router.present(keys.camera("*", NAME), 1.0)
+        found = await self.router.present(keys.camera("*", NAME), PATIENCE)
         return sorted(keys.tail(key, "presence/camera")[0] for key in found)
 
     async def settled(self, *agents: str) -> None:

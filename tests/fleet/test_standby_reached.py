@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("zenoh")
 
-from smartcam._zenoh import BusLink, with_ports
+from smartcam._zenoh import BusLink
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._zenoh import ZenohEnd
-from tests.fleet.fleetkit import FLEET, PATIENCE, until
+from tests.fleet.fleetkit import FLEET, PATIENCE, free_place, until
 
 pytestmark = pytest.mark.real_time
 
@@ -21,7 +21,7 @@ MANY = 300
 
 async def test_router_that_is_gone_is_known_before_its_agents_are() -> None:
     keys = Keys(FLEET)
-    places = with_ports(["tcp/127.0.0.1:0"])
+    places = (free_place(),)
     router, end = ZenohEnd(BusLink(listen=places)), ZenohEnd(BusLink(connect=places))
     await router.open(PATIENCE)
     try:

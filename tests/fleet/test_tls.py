@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -23,11 +22,11 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     TriggerTimeoutError,
 )
-from smartcam.fleet import FleetCamera, FleetFile, FleetServer, _renewal
+from smartcam.fleet import FleetCamera, FleetFile, FleetServer, _renewal, _zenoh
 from smartcam.fleet._certificates import read_identity
 from smartcam.fleet._wire import encode
 from smartcam.models import Disconnected, Reconnected
-from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, until
+from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, free_place, until
 from tests.fleet.plantkit import CAMERA, certified, plant_file, short_lived, url_of
 
 pytestmark = pytest.mark.real_time
@@ -160,11 +159,13 @@ async def test_cancelling_under_the_name_of_another() -> None:
 # ---------------------------------------------------------------------- who does not come in
 
 
-async def refused(url: str, timeout: float = 5.0) -> str:
+async def refused(url: str, timeout: float = PATIENCE) -> str:
     """Return why nobody comes in."""
-    with pytest.raises(ConnectFailedError) as caught:
-        async with smartcam.connect(url, connect_timeout=timeout):
-            pass
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_zenoh, "LOOK", PATIENCE)
+        with pytest.raises(ConnectFailedError) as caught:
+            async with smartcam.connect(url, connect_timeout=timeout):
+                pass
     return str(caught.value)
 
 
@@ -176,7 +177,7 @@ async def test_plain_tcp(server: FleetServer) -> None:
 
 
 async def test_tls_where_there_is_none(folder: Path) -> None:
-    file = {"listen": "tcp/127.0.0.1:0", "cameras": {CAMERA: {"emulated": {}}}}
+    file = {"listen": free_place(), "cameras": {CAMERA: {"emulated": {}}}}
     async with smartcam.fleet.serve(FleetFile.model_validate(file)) as server:
         said = await refused(url(server, folder / "robot"), 1.0)
     assert said.endswith("is it fleet://, without +tls?")
@@ -211,11 +212,10 @@ async def test_certificate_of_a_program_for_an_agent(folder: Path) -> None:
 async def test_expired(server: FleetServer, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "authority").symlink_to(folder / "authority")
     await short_lived(tmp_path, "operator", "robot", 0.0)
-    begun = time.monotonic()
-    said = await refused(url(server, tmp_path / "robot"), 30.0)
+    async with asyncio.timeout(PATIENCE):  # it does not wait for its own
+        said = await refused(url(server, tmp_path / "robot"), 3600.0)
     assert f"operator robot ({tmp_path / 'robot' / 'cert.pem'}) has expired on 20" in said
     assert "smartcam fleet certificates DIR" in said
-    assert time.monotonic() - begun < 20  # it did not wait for its timeout
 
 
 @pytest.mark.long
@@ -291,6 +291,24 @@ async def _trigger_of_another(server: FleetServer, folder: Path) -> smartcam.Res
         return await other.trigger(timeout=PATIENCE)
 
 
+@contextlib.asynccontextmanager
+async def soon_expired(
+    server: FleetServer, folder: Path, role: str, name: str
+) -> AsyncIterator[FleetCamera[Any]]:
+    """Give a program that came in with a certificate that ends soon after."""
+    await short_lived(folder, role, name, 3.0)
+    camera = program(url(server, folder / name))
+    try:
+        await camera.open()
+    except ConnectFailedError:  # on a slow machine it has ended before
+        await short_lived(folder, role, name, 40.0)
+        camera = await program(url(server, folder / name)).open()
+    try:
+        yield camera
+    finally:
+        await camera.close()
+
+
 async def test_certificates_that_end_while_all_runs(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -298,11 +316,10 @@ async def test_certificates_that_end_while_all_runs(
     folder = await certified(tmp_path)
     async with smartcam.fleet.serve(plant_file(folder)) as server:
         await server.wait_tried()
-        await short_lived(folder, "operator", "robot", 3.0)
         with caplog.at_level(logging.WARNING, "smartcam.fleet"):
-            async with program(url(server, folder / "robot")) as robot:
+            async with soon_expired(server, folder, "operator", "robot") as robot:
                 assert "the certificate of operator robot" in caplog.text
-                assert ", in 0.000" in caplog.text
+                assert ", in 0.0" in caplog.text
                 await until(lambda: "has expired" in caplog.text)
                 assert read_identity(folder / "robot").expired
                 assert (await robot.trigger()).number == 1
@@ -315,11 +332,11 @@ async def test_certificates_that_end_while_all_runs(
 @pytest.mark.long
 async def test_lost_with_a_certificate_that_has_expired(tmp_path: Path) -> None:
     folder = await certified(tmp_path)
-    await short_lived(folder, "viewer", "dashboard", 2.0)
-    ends = read_identity(folder / "dashboard").ends
-    async with contextlib.AsyncExitStack() as stack:
-        server = await stack.enter_async_context(smartcam.fleet.serve(plant_file(folder)))
-        dashboard = await stack.enter_async_context(program(url(server, folder / "dashboard")))
+    async with (
+        smartcam.fleet.serve(plant_file(folder)) as server,
+        soon_expired(server, folder, "viewer", "dashboard") as dashboard,
+    ):
+        ends = read_identity(folder / "dashboard").ends
         await asyncio.sleep(max(0.0, (ends - datetime.now(UTC)).total_seconds()) + 0.01)
         await server.stop()
         await until(lambda: not dashboard.connected)

@@ -115,16 +115,16 @@ async def test_newest_is_the_one_that_is_there_unless_it_is_too_old() -> None:
     driver, source = scripted()
     async with source, source.reader() as reader:
         await driver.streams()
-        driver.give(frame(1, captured=time.monotonic() - 2))
-        waiting = asyncio.create_task(reader.newest())
+        driver.give(frame(1, captured=time.monotonic() - 60))
+        waiting = asyncio.create_task(reader.newest(max_age=30))
         await asyncio.sleep(0.01)
         assert not waiting.done()
         driver.give(frame(2))
         assert (await waiting).sequence == 2
-        assert (await reader.newest()).sequence == 2  # still the newest
+        assert (await reader.newest(max_age=30)).sequence == 2  # still the newest
         assert reader.statistics().delivered == 2
-        assert (await reader.newest(max_age=3)).sequence == 2
-        assert (await source.newest()).sequence == 2
+        assert (await reader.newest(max_age=90)).sequence == 2
+        assert (await source.newest(max_age=30)).sequence == 2
 
 
 async def test_frame_after_a_moment_is_never_one_that_may_have_begun_before() -> None:

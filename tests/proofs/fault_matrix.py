@@ -346,6 +346,11 @@ async def run_cell(cell: Cell, probe: LagProbe, process: ProcessCamera | None = 
     return verdict
 
 
+def was_late(verdict: Verdict) -> bool:
+    """Return whether short timeouts may have run out; of another process nobody knows it."""
+    return verdict.lag > LAG or is_apart(verdict.cell)
+
+
 class Runner:
     """Runs many cells in one loop."""
 
@@ -355,7 +360,7 @@ class Runner:
         self.worst_lag = 0.0  # seconds
 
     async def run(self, chosen: Sequence[Cell], jobs: int = JOBS) -> list[Verdict]:
-        """Run cells; those that failed while the loop was late, again."""
+        """Run cells; those that failed while the loop, or their camera, was late, again."""
         probe = LagProbe()
         hook, sys.unraisablehook = sys.unraisablehook, self._on_unraisable
         try:
@@ -363,7 +368,7 @@ class Runner:
                 warnings.simplefilter("error", ResourceWarning)
                 done = await self._run_all(chosen, probe, jobs)
                 for _ in range(RERUNS):
-                    again = [n for n, one in enumerate(done) if one.wrong and one.lag > LAG]
+                    again = [n for n, one in enumerate(done) if one.wrong and was_late(one)]
                     verdicts = await self._run_all([chosen[n] for n in again], probe, FEW_JOBS)
                     for number, verdict in zip(again, verdicts, strict=True):
                         verdict.before = [*done[number].before, *done[number].wrong]

@@ -14,6 +14,7 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from smartcam._server import Server
+from tests.processes import free_port
 
 
 class Gone(Exception):  # noqa: N818
@@ -58,7 +59,7 @@ class Bridge(Server):
         self.changed = asyncio.Condition()
         self.reading = asyncio.Event()
         self.reading.set()
-        self._port = 0
+        self._port = free_port()
         self._runner: web.AppRunner | None = None
 
     @property

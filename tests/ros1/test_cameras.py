@@ -47,7 +47,8 @@ async def test_a_fleet_is_seen_and_used_from_ros1() -> None:
             found = values["localizations"]
             assert found[0]["pose"]["header"]["frame_id"] == "line_1_cam3"
 
-            await bridge.until(lambda: said_on(bridge, f"{camera}/localizations"))
+            topics = [f"{camera}/localizations", f"{camera}/results"]
+            await bridge.until(lambda: all(said_on(bridge, topic) for topic in topics))
             poses = said_on(bridge, f"{camera}/localizations")[0]["poses"]
             assert poses == [one["pose"]["pose"] for one in found]
             stamp = found[0]["pose"]["header"]["stamp"]

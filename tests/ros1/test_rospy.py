@@ -80,7 +80,10 @@ def test_nobody_gets_the_answer_to_another_where_the_way_to_the_bridge_breaks(
     seen: dict[str, Any],
 ) -> None:
     cut = seen["cut"]
-    assert cut["old"] == cut["late"] == f"ServiceException: service [/probe/slow] {ABORTED}"
+    aborted = f"ServiceException: service [/probe/slow] {ABORTED}"
+    assert cut["old"] == aborted
+    # it may come when the way is there again, and has the answer to itself then
+    assert cut["late"] in (aborted, {"success": True, "message": "call 2"})
     assert cut["new"] == {"success": True, "message": f"call {cut['calls']}"}
     assert cut["text"] == {"data": "grün"}
 

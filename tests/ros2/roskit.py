@@ -7,8 +7,8 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
-from smartcam._zenoh import with_ports
 from smartcam.ros2 import Node, RosContext
+from tests.processes import free_port
 
 PATIENCE = 60.0
 """Seconds that only a failure takes."""
@@ -20,8 +20,7 @@ SET_BOOL = "std_srvs/srv/SetBool"
 
 def free_place() -> str:
     """Return an endpoint that nobody listens on."""
-    (place,) = with_ports(["tcp/127.0.0.1:0"])
-    return place
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @contextlib.asynccontextmanager

@@ -72,13 +72,13 @@ class Partner:
         """List topics with their types."""
         from zenoh_ros2_sdk.discovery import get_topic_names_and_types
 
-        return get_topic_names_and_types(timeout=2.0, **self.port)
+        return get_topic_names_and_types(timeout=60.0, **self.port)
 
     def services(self) -> Any:
         """List services with their types."""
         from zenoh_ros2_sdk.discovery import get_service_names_and_types
 
-        return get_service_names_and_types(timeout=2.0, **self.port)
+        return get_service_names_and_types(timeout=60.0, **self.port)
 
     def subscribe(self, topic: str, type: str) -> None:
         """Hear a topic."""

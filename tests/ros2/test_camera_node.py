@@ -198,7 +198,7 @@ async def test_nodes_come_and_go_while_others_call_and_listen() -> None:
             task.cancel()
         await asyncio.wait(asking)
         assert answers > 60
-        assert viewer.graph.nodes() == ["/anchor", "/viewer"]
+        await until(lambda: viewer.graph.nodes() == ["/anchor", "/viewer"])
 
 
 # ---------------------------------------------------------------------- parameters

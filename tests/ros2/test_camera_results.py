@@ -13,7 +13,6 @@ import pytest
 import smartcam
 from smartcam import Camera
 from smartcam._client.supervisor import TAKEN_WITHIN
-from smartcam._zenoh import with_ports
 from smartcam.exceptions import ConfigurationError, RosError
 from smartcam.ros2 import Node, QoS
 from smartcam.ros2._camera_results import CameraResults
@@ -33,6 +32,7 @@ from tests.ros2.camerakit import (
     PaperNode,
     PartsCamera,
 )
+from tests.ros2.roskit import free_place
 
 TOPICS = ("results", "localizations", "detections")
 
@@ -370,7 +370,7 @@ async def test_results_of_other_programs_are_published_once() -> None:
 @pytest.mark.real_time
 @pytest.mark.parametrize("count", [20, pytest.param(1000, marks=pytest.mark.long)])
 async def test_another_node_hears_each_result_once_over_tcp(count: int) -> None:
-    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    place = free_place()
     async with (
         asyncio.timeout(60),
         Node("cam3", namespace="/line1", listen=place) as node,
@@ -397,7 +397,7 @@ async def test_another_node_hears_each_result_once_over_tcp(count: int) -> None:
 @pytest.mark.long
 async def test_results_at_once_reach_another_node() -> None:
     """The engine drops what it gets faster than the link takes it, so there is a pause."""
-    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    place = free_place()
     async with (
         asyncio.timeout(60),
         Node("cam3", namespace="/line1", listen=place) as node,

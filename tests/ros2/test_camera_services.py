@@ -13,7 +13,6 @@ import pytest
 
 import smartcam
 from smartcam import Camera, Status
-from smartcam._zenoh import with_ports
 from smartcam.exceptions import RosError
 from smartcam.ros2 import Node
 from smartcam.ros2._camera_results import CameraResults
@@ -34,6 +33,7 @@ from tests.ros2.camerakit import (
     PaperNode,
     PartsCamera,
 )
+from tests.ros2.roskit import free_place
 
 
 @contextlib.asynccontextmanager
@@ -444,7 +444,7 @@ async def test_camera_of_a_fleet_is_served_as_any() -> None:
 
 @pytest.mark.real_time
 async def test_another_node_calls_over_tcp_and_dies_in_the_middle() -> None:
-    (place,) = with_ports(["tcp/127.0.0.1:0"])
+    place = free_place()
     box = PartsCamera(time=0.05)
     async with (
         asyncio.timeout(60),

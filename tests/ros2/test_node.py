@@ -225,11 +225,12 @@ async def test_calls_beyond_the_bound_are_refused() -> None:
         return {"success": True}
 
     async with two_nodes() as (here, there):
-        here.serve("~/waits", TRIGGER, waits)
+        served = here.serve("~/waits", TRIGGER, waits)
         calls = there.client("/line1/cam3/waits", TRIGGER)
         tasks = [asyncio.create_task(calls.call(timeout=PATIENCE)) for _ in range(MOST_CALLS + 5)]
         done, _ = await asyncio.wait(tasks, return_when="FIRST_COMPLETED", timeout=PATIENCE)
         assert "under way" in str(done.pop().exception())
+        await until(lambda: served.calls == len(tasks))
         release.set()
         replies = await soon(asyncio.gather(*tasks, return_exceptions=True))
         refused = [one for one in replies if isinstance(one, ServiceCallError)]
@@ -328,7 +329,7 @@ async def test_nodes_of_one_session_do_not_collide() -> None:
         one.publisher("chatter", STRING)
         other.publisher("chatter", STRING)
         await until(lambda: len(viewer.graph.ends("/chatter", "MP")) == 2)
-        assert viewer.graph.nodes() == ["/twin", "/twin", "/viewer"]
+        await until(lambda: viewer.graph.nodes() == ["/twin", "/twin", "/viewer"])
         await other.stop()
         await until(lambda: viewer.graph.nodes() == ["/twin", "/viewer"])
         assert len(viewer.graph.ends("/chatter", "MP")) == 1

@@ -136,7 +136,7 @@ async def test_services_both_ways() -> None:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=PATIENCE,
             )
-            await until(lambda: querier.matching_status)
+            await until(lambda: querier.matching_status.matching)
             asked = Attachment(5, 1, theirs.gid)
             replies = querier.get(payload=type.request.encode({}), attachment=asked.encode())
             (reply,) = await asyncio.to_thread(list, replies)

@@ -13,19 +13,21 @@ import smartcam
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
 from smartcam.testing._threads import ThreadedCamera
+from tests.processes import PATIENCE, wait_until
 
 pytestmark = pytest.mark.real_time
 
 CONNECT = bytes.fromhex("50535642 00000000 01000000")
 DISCONNECT = bytes.fromhex("50535642 00000000 02000000")
 QUERY = bytes.fromhex("50535642 00000000 30000000")
-SWITCH_3 = bytes.fromhex("50535642 04000000 31000000 03000000")
+SWITCH_5 = bytes.fromhex("50535642 04000000 31000000 05000000")
 START = bytes.fromhex("50535642 00000000 41000000")
 
 
 @pytest.fixture
 def emulator() -> Iterator[ThreadedCamera]:
-    with ThreadedCamera(active=21, running=True) as threaded:
+    slow = {"id": 5, "load_time": PATIENCE}
+    with ThreadedCamera(applications=[slow], active=21, running=True) as threaded:
         yield threaded
 
 
@@ -57,9 +59,9 @@ async def test_good_client_meets_every_expectation(emulator: ThreadedCamera) -> 
         await camera.trigger()
     log = emulator.log
     log.expect(m.Connect, m.ConnectAnswer, m.Query, m.Stop, m.SwitchApplication, m.Trigger)
-    log.expect("Trigger", 0x20, m.Disconnect(), only=False)
+    log.expect("Trigger", 0x20, m.Disconnect(), only=False, timeout=PATIENCE)
     log.expect_nothing_while_busy()
-    log.expect_disconnect_before_close()
+    log.expect_disconnect_before_close(timeout=PATIENCE)
     log.expect_no_errors()
     assert m.Trigger() in log.received
     assert any(isinstance(message, m.ResultContainer) for message in log.said)
@@ -77,7 +79,7 @@ def test_message_that_did_not_come_is_named_with_the_log(emulator: ThreadedCamer
 def test_log_that_was_full_is_told_and_is_no_proof(emulator: ThreadedCamera) -> None:
     log = emulator.log
     with talk(emulator, CONNECT, QUERY):
-        log.expect(m.Query, "QueryAnswer")
+        log.expect(m.Query, "QueryAnswer", timeout=PATIENCE)
         assert log.pushed_out == 0
         emulator.run(lambda camera: setattr(camera.log, "maxlen", 3))
     with talk(emulator, CONNECT) as client:
@@ -98,7 +100,7 @@ def test_log_that_was_full_is_told_and_is_no_proof(emulator: ThreadedCamera) -> 
 
 def test_order_counts(emulator: ThreadedCamera) -> None:
     with talk(emulator, CONNECT, QUERY):
-        emulator.log.expect(m.Connect, m.Query)
+        emulator.log.expect(m.Connect, m.Query, timeout=PATIENCE)
         assert "expected Connect, after Query" in failure(
             emulator.log.expect, m.Query, m.Connect, timeout=0
         )
@@ -106,7 +108,7 @@ def test_order_counts(emulator: ThreadedCamera) -> None:
 
 def test_only_finds_what_else_was_sent(emulator: ThreadedCamera) -> None:
     with talk(emulator, CONNECT, QUERY) as client:
-        emulator.log.expect(m.QueryAnswer)
+        emulator.log.expect(m.QueryAnswer, timeout=PATIENCE)
         client.sendall(QUERY)
         emulator.wait_received(m.Query, count=2)
         emulator.log.expect(m.Connect, m.Query, m.QueryAnswer, m.Query, only=True)
@@ -117,7 +119,7 @@ def test_only_finds_what_else_was_sent(emulator: ThreadedCamera) -> None:
 def test_expectation_waits_for_what_is_on_its_way(emulator: ThreadedCamera) -> None:
     emulator.inject({"kind": "delay", "on": "Query", "seconds": 0.05})
     with talk(emulator, CONNECT, QUERY):
-        emulator.log.expect(m.Query, m.QueryAnswer)
+        emulator.log.expect(m.Query, m.QueryAnswer, timeout=PATIENCE)
 
 
 def test_unknown_name_is_refused(emulator: ThreadedCamera) -> None:
@@ -127,13 +129,13 @@ def test_unknown_name_is_refused(emulator: ThreadedCamera) -> None:
 
 def test_what_is_sent_while_busy_is_found(emulator: ThreadedCamera) -> None:
     emulator.device.stop()
-    with talk(emulator, CONNECT, SWITCH_3):
-        emulator.log.expect("SwitchApplication", "StatusReport")
+    with talk(emulator, CONNECT, SWITCH_5):
+        emulator.log.expect("SwitchApplication", "StatusReport", timeout=PATIENCE)
         with talk(emulator, QUERY):  # has no session, so nobody told it of BUSY
             emulator.wait_received(m.Query)
         emulator.log.expect_nothing_while_busy()
     with talk(emulator, CONNECT) as client:
-        emulator.log.expect(m.Connect, m.Connect, m.StatusReport)
+        emulator.log.expect(m.Connect, m.Connect, m.StatusReport, timeout=PATIENCE)
         client.sendall(START)  # the camera is BUSY still
         emulator.wait_received(m.Start)
         text = failure(emulator.log.expect_nothing_while_busy)
@@ -147,6 +149,7 @@ def test_close_without_disconnect_is_found(emulator: ThreadedCamera) -> None:
         emulator.wait_received(m.Connect)
         text = failure(emulator.log.expect_disconnect_before_close, timeout=0)
         assert "was Connect(), not Disconnect\n" in text
+    wait_until(lambda: emulator.visits)  # it has noticed
     text = failure(emulator.log.expect_disconnect_before_close, timeout=0.1)
     assert re.search(r"not Disconnect, and the client (reset|closed) the connection\n", text)
 
@@ -155,7 +158,7 @@ def test_client_that_stays_connected_is_found(emulator: ThreadedCamera) -> None:
     with talk(emulator, CONNECT, DISCONNECT):
         emulator.wait_received(m.Disconnect)
         assert failure(emulator.log.expect_disconnect_before_close, timeout=0).startswith("still")
-    emulator.log.expect_disconnect_before_close()
+    emulator.log.expect_disconnect_before_close(timeout=PATIENCE)
 
 
 def test_over_udp_disconnect_is_the_last_message() -> None:
@@ -163,7 +166,7 @@ def test_over_udp_disconnect_is_the_last_message() -> None:
         emulator.wait_received(m.Connect)
         assert "not Disconnect" in failure(emulator.log.expect_disconnect_before_close, timeout=0)
         client.sendall(DISCONNECT)
-        emulator.log.expect_disconnect_before_close()
+        emulator.log.expect_disconnect_before_close(timeout=PATIENCE)
 
 
 def test_what_the_camera_refuses_is_found(emulator: ThreadedCamera) -> None:

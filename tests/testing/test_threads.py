@@ -15,7 +15,7 @@ import smartcam
 from smartcam._loop_thread import LoopThread
 from smartcam.emulator import EmulatedCamera, Scenario, faults
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
-from smartcam.protocols.messages import Connect, Query
+from smartcam.protocols.messages import Connect, Query, Trigger
 from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
 
 pytestmark = pytest.mark.real_time
@@ -57,6 +57,7 @@ async def test_asyncio_client_is_served_while_the_test_uses_the_emulator(
         emulator.inject(faults.NoResult(on="Trigger"))
         with pytest.raises(smartcam.TriggerTimeoutError):
             await camera.trigger(timeout=0.05)
+        await emulator.received(Trigger, timeout=60)
         assert [fired.fault.kind for fired in emulator.fired] == ["no_result"]
         await emulator.received(Query, timeout=60)
         with pytest.raises(ResponseTimeoutError):

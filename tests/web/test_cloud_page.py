@@ -13,6 +13,7 @@ import pytest_asyncio
 from smartcam.depth import Cloud
 from smartcam.web import CloudSite
 from smartcam.web import _clouds as clouds_module
+from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
 from tests.web.sitekit import TOKEN, until
 
@@ -174,7 +175,7 @@ async def test_two_fingers_zoom_and_one_turns(page: Page) -> None:
 async def test_colour_by_height_point_size_and_axes(page: Page) -> None:
     async with opened(page, Cloud(SCENE.points), up="-z") as site:
         assert await page.input_value("#colour") == "height"  # it has no picture
-        assert await page.locator("#legend").is_visible()
+        await page.locator("#legend").wait_for()
         low, high = await page.inner_text("#low"), await page.inner_text("#high")
         assert (low, high) == ("-1 m", "-0.98 m")
         pixels = await picture(page)
@@ -190,6 +191,7 @@ async def test_colour_by_height_point_size_and_axes(page: Page) -> None:
         await page.locator("#number").filter(has_text="3").wait_for()
         await page.click("#reset")
         await page.select_option("#up", "z")
+        await page.evaluate(DRAWN)
         names = page.locator(".axis:not([hidden])")
         assert await names.all_inner_texts() == ["x", "y", "z"]
         await page.uncheck("#axes")
@@ -230,7 +232,7 @@ async def test_newer_cloud_takes_the_place(page: Page, monkeypatch: pytest.Monke
 
 async def test_server_that_goes_is_said_and_comes_back(page: Page) -> None:
     with nothing_wrong(page):
-        async with CloudSite(SCENE, token=TOKEN) as site:
+        async with CloudSite(SCENE, token=TOKEN, port=free_port()) as site:
             await page.goto(site.api)
             await page.fill("#token", TOKEN)
             await page.click("#gate button")
@@ -247,10 +249,12 @@ async def test_lost_context_comes_back(page: Page) -> None:
     async with opened(page, SCENE):
         before = await picture(page)
         await page.evaluate(
-            "() => { const lose = document.querySelector('canvas').getContext('webgl2')"
-            ".getExtension('WEBGL_lose_context'); lose.loseContext();"
-            " return new Promise((done) => setTimeout(() => { lose.restoreContext();"
-            " setTimeout(done, 50); }, 50)); }"
+            "() => { const canvas = document.querySelector('canvas');"
+            " const lose = canvas.getContext('webgl2').getExtension('WEBGL_lose_context');"
+            " const is = (what) => new Promise((done) => canvas.addEventListener("
+            "`webglcontext${what}`, () => setTimeout(done), { once: true }));"
+            " const [lost, restored] = [is('lost'), is('restored')]; lose.loseContext();"
+            " return lost.then(() => lose.restoreContext()).then(() => restored); }"
         )
         assert np.array_equal(before, await picture(page))
 

@@ -13,6 +13,7 @@ from smartcam.exceptions import InterpretationError
 from smartcam.fleet import FleetFile
 from smartcam.models import Status
 from smartcam.web import FleetSite
+from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
 from tests.web.madeup import MadeUpFleet, names
 from tests.web.sitekit import TOKEN
@@ -233,6 +234,7 @@ async def test_one_camera_is_triggered_on_its_page(page: Page) -> None:
 
 async def test_key_opens_a_camera_and_back_finds_the_table_as_it_was(page: Page) -> None:
     async with smartcam.fleet.open(CELL) as fleet, opened(page, fleet):
+        await see(page, "[data-total=connected]", "2")
         await page.click("[data-filter=connected]")
         await page.focus("#grid")
         await page.keyboard.press("ArrowDown")
@@ -258,7 +260,7 @@ async def test_without_control_there_is_no_trigger_and_an_unknown_camera_is_told
 
 async def test_server_that_ends_and_comes_back_is_told(page: Page) -> None:
     fleet = MadeUpFleet(names(20))
-    async with opened(page, fleet.as_fleet) as site:
+    async with opened(page, fleet.as_fleet, port=free_port()) as site:
         await site.stop()
         await see(page, "#live[data-state=lost]")
         await see(page, "#alarm", "does not answer")

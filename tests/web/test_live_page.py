@@ -15,6 +15,7 @@ import smartcam.fleet
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
 from smartcam.fleet import FleetFile
 from smartcam.web import LiveSite
+from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
 from tests.web.sitekit import TOKEN, until
 
@@ -52,12 +53,18 @@ async def see(page: Page, selector: str, text: str = "") -> None:
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page, url: str, *, control: bool = True, token: str | None = None, **options: Any
+    page: Page,
+    url: str,
+    *,
+    control: bool = True,
+    token: str | None = None,
+    port: int = 0,
+    **options: Any,
 ) -> AsyncIterator[LiveSite]:
     """Show a camera; what the browser finds wrong with the page fails the test."""
     camera = smartcam.connect(url, **{"reconnect": FAST, "name": "cell", **options})
     with nothing_wrong(page):
-        async with LiveSite(camera, control=control, token=token) as site, camera:
+        async with LiveSite(camera, control=control, token=token, port=port) as site, camera:
             await page.goto(site.url)
             await see(page, LIVE)
             yield site
@@ -134,8 +141,8 @@ async def test_pass_and_fail_are_told_in_words(page: Page) -> None:
 
 async def test_lost_camera_and_lost_server_are_said(page: Page) -> None:
     async with (
-        EmulatedCamera(active=21, running=True) as emulator,
-        opened(page, emulator.url) as site,
+        EmulatedCamera(active=21, running=True, port=free_port()) as emulator,
+        opened(page, emulator.url, port=free_port()) as site,
     ):
         await page.click("#trigger")
         await see(page, "#last code")

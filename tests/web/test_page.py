@@ -17,6 +17,7 @@ from smartcam.emulator.faults import FAULTS
 from smartcam.exceptions import ConnectionLostError
 from smartcam.models import Status
 from smartcam.web import EmulatorSite
+from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
 from tests.web.sitekit import TOKEN, until
 
@@ -70,7 +71,11 @@ async def page() -> AsyncIterator[Page]:
 
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page, *cameras: WireCamera, token: str | None = None, at: str | None = None
+    page: Page,
+    *cameras: WireCamera,
+    token: str | None = None,
+    at: str | None = None,
+    port: int = 0,
 ) -> AsyncIterator[View]:
     """Show cameras; what the browser finds wrong with the page fails the test."""
     async with contextlib.AsyncExitStack() as stack:
@@ -78,7 +83,7 @@ async def opened(
         for camera in cameras:
             await stack.enter_async_context(camera)
         named = {camera.name: camera for camera in cameras}
-        site = await stack.enter_async_context(EmulatorSite(named, token=token))
+        site = await stack.enter_async_context(EmulatorSite(named, token=token, port=port))
         await page.goto(site.url if at is None else site.api + at)
         view = View(page, named, site)
         if at is None:
@@ -112,8 +117,8 @@ async def test_trigger_button_brings_the_client_a_result(page: Page) -> None:
         async with smartcam.connect(view.emulator.url, interpret_as=HELLO) as camera:
             waiting = asyncio.create_task(camera.next_result(timeout=PATIENCE))
             await page.click("#trigger")
+            await view.see("#told", "an inspection began")  # which does not stand there for long
             assert (await waiting).value.text == "Hello World"
-            await view.see("#told", "an inspection began")
             await view.see("#log tr.out", 'application 21: text "Hello World"')
         await page.click("#stop")
         await view.see("#mode", "stopped")
@@ -143,6 +148,7 @@ async def test_page_of_another_make_shows_what_that_camera_has(page: Page) -> No
             await view.see("#log tr.out", "code 1")
             await view.see("#latency-last", "in 1")
             await page.click("text=Lost link")
+            await view.see("#told", "With its next message")
             with pytest.raises(ConnectionLostError):
                 await camera.trigger()
         await view.see("#fired", "reset")
@@ -177,8 +183,11 @@ async def test_buttons_change_what_the_client_sees(page: Page) -> None:
         await view.see(f"{hot}[aria-pressed=false]")
         await page.select_option("#application", "3")
         await page.check("#switch-running")
+        busy = asyncio.create_task(
+            camera.wait_status(lambda status: Status.BUSY in status, timeout=PATIENCE)
+        )
         await page.click("#switch button")
-        await camera.wait_status(lambda status: Status.BUSY in status, timeout=PATIENCE)
+        await busy
         await view.see("#mode", "running")
         await view.see("#facts", "3 part check, triggered")
         assert await camera.query_application() == 3
@@ -347,8 +356,8 @@ async def test_part_obeys_the_keyboard(page: Page) -> None:
         wanted = (x + 0.002, y + 0.010, theta + math.radians(1))
         await until(lambda: pieces["square"] == pytest.approx(wanted))
         await page.keyboard.press("Delete")
-        await until(lambda: "square" not in pieces)
         await view.see("#told", "square is off the table")
+        assert "square" not in pieces
 
 
 async def test_part_form_puts_takes_off_and_puts_back(page: Page) -> None:
@@ -472,7 +481,7 @@ async def test_page_without_the_token_asks_for_it(page: Page) -> None:
 
 
 async def test_page_comes_back_with_its_site(page: Page) -> None:
-    async with opened(page, greeting()) as view:
+    async with opened(page, greeting(), port=free_port()) as view:
         await view.site.stop()
         await view.see("#live[data-state=lost]", "not connected, trying again")
         again = EmulatorSite(view.cameras, port=view.site.port)

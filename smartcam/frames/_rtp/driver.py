@@ -206,10 +206,10 @@ class _RtpStream:
     async def begin(self) -> None:
         """Decode what comes."""
         await self._codecs.__aenter__()
-        self._tasks = [
-            asyncio.create_task(self._decode(), name=f"frames of {self._name}"),
-            asyncio.create_task(self._watch(), name=f"silence of {self._name}"),
-        ]
+        self._tasks = [asyncio.create_task(self._decode(), name=f"frames of {self._name}")]
+        if self._expected is not None:  # who opens it has a timeout of its own, and says more
+            watching = asyncio.create_task(self._watch(), name=f"silence of {self._name}")
+            self._tasks.append(watching)
 
     async def end(self) -> None:
         """End all; the sink hears no more."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import secrets
 import socket
 from typing import TYPE_CHECKING, Any
 
@@ -16,17 +17,20 @@ HOST = "127.0.0.1"
 
 
 def two_ports() -> int:
-    """Return a port that is free, and the next one, too."""
+    """Return a port that is free, and the next one, too.
+
+    They are below those that a system gives to who asks for any: other tests get none of them.
+    """
     while True:
+        port = 10_000 + 2 * secrets.randbelow(10_000)
         with (
             socket.socket(type=socket.SOCK_DGRAM) as one,
             socket.socket(type=socket.SOCK_DGRAM) as two,
+            contextlib.suppress(OSError),
         ):
-            one.bind((HOST, 0))
-            port = int(one.getsockname()[1])
-            with contextlib.suppress(OSError, OverflowError):
-                two.bind((HOST, port + 1))
-                return port
+            one.bind((HOST, port))
+            two.bind((HOST, port + 1))
+            return port
 
 
 class Way:
