@@ -148,15 +148,16 @@ def _free_port(endpoint: str) -> int:
     """Return a port that nobody has; where the host is none of this machine, the engine says so."""
     host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for port in random.SystemRandom().sample(PORTS, 100):
+    ports = random.SystemRandom().sample(PORTS, 100)
+    for port in ports:
         try:
             with socket.socket(family) as found:
                 found.bind((host, port))
         except OSError as exc:
             if exc.errno in {errno.EADDRINUSE, errno.EACCES}:
                 continue
-        break
-    return port
+        return port
+    return ports[0]
 
 
 def _end_lingering(ports: frozenset[int]) -> None:
