@@ -163,7 +163,7 @@ class Bridge(Server):
         self.topics[said["topic"]] = said
 
     async def _unadvertise(self, _link: web.WebSocketResponse, said: dict[str, Any]) -> None:
-        del self.topics[said["topic"]]
+        self.topics.pop(said["topic"], None)  # another link may have had it, too
 
     async def _advertise_service(self, link: web.WebSocketResponse, said: dict[str, Any]) -> None:
         self.services[said["service"]] = Served(link, said["type"])
