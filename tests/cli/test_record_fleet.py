@@ -110,7 +110,8 @@ def test_damage_is_told_and_skipped_and_the_rest_is_played(folder: Path) -> None
     no_mcap = f"recording {paths[2]}: this is no MCAP file"
     assert any(line.startswith(no_mcap) for line in remarks), remarks
     kept = runs(load_recording(paths[1]))
-    assert 0 < len(kept) < len(whole[1])
+    assert len(kept) < len(whole[1])
+    assert kept or len(whole[1]) < 10  # of a few, none may stand before the damage
     assert runs(found) == [
         *whole[0],
         *kept,
