@@ -195,7 +195,8 @@ def test_find_after_ctrl_c_shows_what_it_has(port: int) -> None:
     assert outcome.code == 130
     assert [line["protocols"] for line in outcome.lines] == [["insight"]]
     assert outcome.lines[0]["greeting"] == "Welcome to In-Sight(tm)"
-    assert "3 of 6 ports tried: 1 open, 2 refused" in outcome.err
+    # on a slow machine some of the other host's are refused before the signal comes
+    assert re.search("[345] of 6 ports tried: 1 open, [234] refused", outcome.err)
 
 
 async def test_terminal_is_told_how_far_it_is(
