@@ -175,6 +175,7 @@ class Feed(Generic[NumberedT]):
         self._returns = returns
         self._announced = 0  # the highest number of this epoch that the agent said comes next
         self._places: dict[int, int] = {}  # of epochs before: the number to come next
+        self._said: dict[int, int] = {}  # of other epochs: the number that was said to come next
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
         """Take what has ``expected`` or a later number, of this epoch of the agent.
@@ -188,6 +189,7 @@ class Feed(Generic[NumberedT]):
                 expected = self._places.get(epoch, expected)
             self.epoch, self.expected = epoch, expected
             self._announced = 0
+            following = max(following, self._said.pop(epoch, 0))
         if epoch != self._held_epoch:
             self._drop_held()
         self._go_on(following)
@@ -219,9 +221,14 @@ class Feed(Generic[NumberedT]):
                 elif thing.next > self.expected:
                     self._have(thing)
             self._go_on(following)
-        elif epoch >= self.epoch:
-            if epoch == self.epoch and self.expected:
-                self._announced = max(self._announced, following)
+            return
+        if epoch == self.epoch and self.expected:
+            self._announced = max(self._announced, following)
+        else:  # of what is not held then, begin() is to know
+            self._said[epoch] = max(following, self._said.get(epoch, 0))
+            if len(self._said) > MOST_PLACES:
+                del self._said[next(iter(self._said))]
+        if epoch >= self.epoch:
             for thing in things:
                 self._hold(epoch, thing)
 
@@ -249,6 +256,7 @@ class Feed(Generic[NumberedT]):
         """Nobody wants any more."""
         self.expected = self._announced = 0
         self._places.clear()
+        self._said.clear()
         self.lacking = False
         self._drop_held()
 

@@ -263,6 +263,16 @@ def test_what_an_agent_had_said_is_missed_when_another_goes_on() -> None:
     assert not ear.feed.lacking
 
 
+def test_what_is_said_before_an_agent_s_turn_is_asked_for() -> None:
+    ear = alternating()
+    ear.feed.begin(2, 1, 1)
+    ear.feed.receive(1, 7, said(5, 6))  # by one that was started before
+    ear.feed.begin(1, 5, 5)  # as it had answered before that
+    assert ear.feed.lacking
+    ear.feed.fill(1, 5, 7, said(5, 6))
+    assert (ear.taken, ear.missed) == ([(1, 5), (1, 6)], 0)
+
+
 class Hearing(RuleBasedStateMachine):
     """An agent that speaks, forgets and is restarted; a bus that loses, doubles and mixes up.
 

@@ -12,6 +12,7 @@ import pytest
 
 import smartcam
 from smartcam import Backoff
+from smartcam.emulator import faults
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectionTakenError,
@@ -314,6 +315,28 @@ async def test_program_follows_to_who_won_a_split() -> None:
         await work.some()
         assert work.camera.connected
         assert not work.camera.ended
+
+
+async def test_session_that_begins_while_another_agent_is_asked_is_seen() -> None:
+    async with Pair() as pair:
+        await pair.start("north")
+        await pair.start("south")
+        await pair.agents["north"].unshare(NAME)
+        await until(lambda: pair.having() == ["south"])
+        async with pair.program() as camera:
+            pair.box.inject(faults.Delay(on="ConnectAnswer", seconds=1.0))
+            say_hello = camera._caller._say_hello
+
+            async def slowly(agent: str) -> Any:
+                heard = await say_hello(agent)
+                await asyncio.sleep(2.0)  # another one is asked, and says nothing
+                return heard
+
+            camera._caller._say_hello = slowly  # type: ignore[method-assign]
+            await pair.agents["south"].drop(NAME)
+            await until(lambda: pair.having() == ["north"])
+            await camera.wait_connected(timeout=PATIENCE)
+            assert (await camera.trigger(2)).value.run == 1
 
 
 async def test_without_standby_the_one_that_lost_it_shares_it_no_more() -> None:
