@@ -43,6 +43,10 @@ LOOK_ELSEWHERE = 0.25
 """Seconds between two looks whether another agent has a session, where the one that was met has
 none."""
 
+ASK_ANEW = 5.0
+"""Seconds until the one that was met is asked whether it has one by now: that it said so may be
+lost, and a camera that nobody triggers says nothing more."""
+
 MOST_EPOCHS = 16
 """Agents of a camera that are remembered."""
 
@@ -195,15 +199,25 @@ class Caller:
 
     async def _attend(self) -> None:
         """Meet the agent whenever there is one; of several, the one that has a session."""
+        loop, asked = asyncio.get_running_loop(), 0.0
         while True:
-            elsewhere = self.met is not None and not self.linked and len(self._agents) > 1
+            look = None
+            if self.met is not None and not self.linked:
+                look = LOOK_ELSEWHERE if len(self._agents) > 1 else ASK_ANEW
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LOOK_ELSEWHERE if elsewhere else None):
+                async with asyncio.timeout(look):
                     await self._stirred.wait()
+                    asked = loop.time()
             self._stirred.clear()
             met = self.met
+            if met is not None and self.linked:
+                continue
+            if met is not None and loop.time() - asked >= ASK_ANEW:
+                asked = loop.time()
+                await self._ask_anew(met)
+                continue
             others = sorted(self._agents.keys() - ({met.agent} if met is not None else set()))
-            if not others or (met is not None and self.linked):
+            if not others:
                 continue
             try:
                 await self._choose(others, met)
@@ -240,6 +254,13 @@ class Caller:
             self.lose(f"the agent {met.agent} has no session with the camera, {best.agent} has one")
         self._meet(best)
 
+    async def _ask_anew(self, met: Met) -> None:
+        """Meet the agent again if it has a session by now."""
+        with contextlib.suppress(SmartCamError):
+            heard = await self._say_hello(met.agent)
+            if self.met is met and not self.linked and heard.hello.get("connected"):
+                self._meet(heard)
+
     async def _say_hello(self, agent: str) -> _HelloHeard:
         loop = asyncio.get_running_loop()
         begun = loop.time()
@@ -272,10 +293,9 @@ class Caller:
         return all(one != epoch for agent, one in self._epochs.items() if agent != met.agent)
 
     def unlink(self) -> None:
-        """The agent has no session with the camera: another one may have."""
+        """The agent has no session with the camera: another one may have, or it will again."""
         self.linked = False
-        if len(self._agents) > 1:
-            self._stirred.set()
+        self._stirred.set()
 
     # ------------------------------------------------------------------ the clock
 

@@ -17,7 +17,7 @@ from smartcam.fleet._fleet import Fleet
 from smartcam.fleet._host import GATHER
 from smartcam.models import Result, SubscriberStatistics
 from smartcam.streams import Subscription
-from tests.fleet.fleetkit import NAME, NumberedCamera, Plant, end_of, until
+from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, end_of, until
 from tests.fleet.lossy_bus import LossyBus, as_said, chance_of
 
 RATE = 1000.0
@@ -259,6 +259,20 @@ async def test_results_of_many_come_to_a_fleet_in_the_same_way() -> None:
             assert account.offered == account.queued == sender.sent
             numbers = [(await anext(results)).number for _ in range(account.queued)]
             assert numbers == [*range(1, sender.sent + 1)]
+
+
+async def test_session_is_seen_though_the_word_of_it_is_lost() -> None:
+    bus = LossyBus()
+    async with sending(bus) as sender, sender.plant.cameras(1) as (camera,):
+        plant = sender.plant
+        await plant.box.stop()
+        await until(lambda: not camera.connected)
+        bus.fate = lambda key, _: () if "/states/" in key else (0.0,)
+        await plant.box.start()
+        await until(lambda: plant.agent.hosts[NAME].connected)
+        await asyncio.sleep(0.1)
+        bus.fate = as_said
+        await camera.wait_connected(timeout=PATIENCE)
 
 
 def free_memory(camera: FleetCamera[Any]) -> int:
