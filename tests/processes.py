@@ -14,7 +14,6 @@ import gc
 import importlib
 import json
 import os
-import secrets
 import selectors
 import shutil
 import signal
@@ -25,6 +24,8 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
+
+from smartcam._zenoh import with_ports
 
 PATIENCE = 60.0
 """Seconds; only what has gone wrong takes as long."""
@@ -58,16 +59,15 @@ def wait_until(true: Callable[[], object]) -> None:
         time.sleep(0.02)
 
 
-def free_port() -> int:
-    """Return a port where nothing listens, for what another process is to listen on.
+def free_place(host: str = "127.0.0.1") -> str:
+    """Return an endpoint of Zenoh's that nobody listens on, as an agent finds one itself."""
+    (place,) = with_ports([f"tcp/{host}:0"])
+    return place
 
-    It is below those that a system gives to who asks for any: other tests do not get it.
-    """
-    while True:
-        port = 20_000 + secrets.randbelow(12_000)
-        with socket.socket() as found, contextlib.suppress(OSError):
-            found.bind(("127.0.0.1", port))
-            return port
+
+def free_port() -> int:
+    """Return a port where nothing listens, and which no other test gets meanwhile."""
+    return int(free_place().rpartition(":")[2])
 
 
 def printed_by(python: str) -> str:

@@ -199,7 +199,7 @@ class Caller:
 
     async def _attend(self) -> None:
         """Meet the agent whenever there is one; of several, the one that has a session."""
-        loop, asked = asyncio.get_running_loop(), 0.0
+        loop, quiet_since = asyncio.get_running_loop(), 0.0
         while True:
             look = None
             if self.met is not None and not self.linked:
@@ -207,13 +207,13 @@ class Caller:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(look):
                     await self._stirred.wait()
-                    asked = loop.time()
+                    quiet_since = loop.time()
             self._stirred.clear()
             met = self.met
             if met is not None and self.linked:
                 continue
-            if met is not None and loop.time() - asked >= ASK_ANEW:
-                asked = loop.time()
+            if met is not None and loop.time() - quiet_since >= ASK_ANEW:
+                quiet_since = loop.time()
                 await self._ask_anew(met)
                 continue
             others = sorted(self._agents.keys() - ({met.agent} if met is not None else set()))

@@ -10,7 +10,7 @@ import pytest
 
 from tests.cli.commandline import closed_port
 from tests.cli.test_live import ask, page_of
-from tests.processes import Process, free_port
+from tests.processes import Process, free_place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,7 +41,7 @@ def test_page_of_a_file_looks_only_and_ends_with_ctrl_c(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_fleet_that_is_not_there_yet_is_awaited(tmp_path: Path) -> None:
     pytest.importorskip("zenoh", reason="needs the extra fleet")
-    place = f"tcp/127.0.0.1:{free_port()}"
+    place = free_place()
     path = tmp_path / "plant.yaml"
     path.write_text(FILE.format(place=place), encoding="utf-8")
     url = f"fleet://{place.removeprefix('tcp/')}"

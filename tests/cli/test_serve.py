@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.processes import PATIENCE, Process, free_port
+from tests.processes import PATIENCE, Process, free_place, free_port
 
 pytestmark = pytest.mark.real_time
 
@@ -73,7 +73,7 @@ def test_a_process_is_told_ready_reloaded_and_stopped_and_says_how_it_is(
     tmp_path: Path, unit: Unit
 ) -> None:
     path, port = tmp_path / "fleet.yaml", free_port()
-    place = f"tcp/127.0.0.1:{free_port()}"
+    place = free_place()
     put(path, 2, place, port=port)
     env = {"NOTIFY_SOCKET": unit.place, "WATCHDOG_USEC": "20000000"}
     with Process("smartcam", "serve", str(path), "--log", "json", env=env) as process:
@@ -111,7 +111,7 @@ def test_a_process_is_told_ready_reloaded_and_stopped_and_says_how_it_is(
 
 def test_a_fleet_is_reloaded_by_a_command(tmp_path: Path, unit: Unit) -> None:
     path = tmp_path / "fleet.yaml"
-    place = f"tcp/127.0.0.1:{free_port()}"
+    place = free_place()
     put(path, 2, place, port=0)
     url = f"fleet://{place.removeprefix('tcp/')}"
     env = {"NOTIFY_SOCKET": unit.place}

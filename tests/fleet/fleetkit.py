@@ -19,7 +19,7 @@ from smartcam.fleet._program import Program
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
-from tests.processes import free_port
+from tests.processes import free_place
 
 FLEET = "plant"
 NAME = "line1/cam1"
@@ -73,11 +73,6 @@ class NumberedCamera(EmulatedCamera):
         number = len(self.inputs) + 1
         self.inputs[number] = token
         return {"run": number, "token": token or 0}
-
-
-def free_place() -> str:
-    """Return an endpoint of Zenoh's that nobody listens on."""
-    return f"tcp/127.0.0.1:{free_port()}"
 
 
 class Plant:

@@ -15,7 +15,7 @@ from smartcam.fleet._program import Program
 from smartcam.fleet._zenoh import ZenohEnd
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
-from tests.fleet.fleetkit import free_place
+from tests.processes import free_place
 
 FLEET = "plant"
 

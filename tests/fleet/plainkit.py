@@ -14,7 +14,8 @@ from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetFile, FleetServer
 from smartcam.fleet._bus import MemoryBus
 from smartcam.protocols import messages as m
-from tests.fleet.fleetkit import free_place, until
+from tests.fleet.fleetkit import until
+from tests.processes import free_place
 from tests.timed_loop import TimedLoop
 
 if TYPE_CHECKING:

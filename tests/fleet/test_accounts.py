@@ -270,7 +270,8 @@ async def test_session_is_seen_though_the_word_of_it_is_lost() -> None:
         bus.fate = lambda key, _: () if "/states/" in key else (0.0,)
         await plant.box.start()
         await until(lambda: plant.agent.hosts[NAME].connected)
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)  # of the loop's time: every word of the session is lost
+        assert bus.lost
         bus.fate = as_said
         await camera.wait_connected(timeout=PATIENCE)
 

@@ -15,7 +15,8 @@ from smartcam.fleet._caller import DRIFT, Caller
 from smartcam.frames import FrameSource
 from smartcam.frames import open as open_frames
 from smartcam.frames._synthetic import read_stamp
-from tests.fleet.fleetkit import PATIENCE, free_place
+from tests.fleet.fleetkit import PATIENCE
+from tests.processes import free_place
 
 WAYS = st.floats(0.0, 0.2)
 

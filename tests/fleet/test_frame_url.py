@@ -23,10 +23,11 @@ from smartcam.camera import FrameEncoding
 from smartcam.fleet import FleetFile, FleetFrame, FleetServer
 from smartcam.frames._synthetic import read_stamp
 from tests.client.clientkit import gone
-from tests.fleet.fleetkit import PATIENCE, free_place
+from tests.fleet.fleetkit import PATIENCE
 from tests.fleet.framekit import looking
 from tests.frames.drivers import frame
 from tests.handmade import refusing
+from tests.processes import free_place
 
 NAME = "line1/cam3"
 

@@ -19,8 +19,9 @@ from smartcam.fleet._exchange import Exchange
 from smartcam.fleet._fleet import Fleet
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._server import FleetServer
-from tests.fleet.fleetkit import PATIENCE, free_place, until
+from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.test_fleet import HELLO, file
+from tests.processes import free_place
 
 CAMERAS = ("a", "b", "c", "d", "e")
 

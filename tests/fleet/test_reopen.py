@@ -10,8 +10,9 @@ import pytest
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectFailedError
 from smartcam.fleet._zenoh import ZenohEnd
-from tests.fleet.fleetkit import PATIENCE, free_place, until
+from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.test_zenoh import two_ends
+from tests.processes import free_place
 
 pytestmark = pytest.mark.real_time
 

@@ -18,7 +18,8 @@ from smartcam.fleet._ros import ros_of
 from smartcam.fleet._ros_file import RosSection
 from smartcam.ros2 import Node, QoS
 from smartcam.ros2._qos import LATCHED
-from tests.ros2.roskit import PATIENCE, TRIGGER, free_place, soon, until
+from tests.processes import free_place
+from tests.ros2.roskit import PATIENCE, TRIGGER, soon, until
 
 pytestmark = pytest.mark.real_time
 

@@ -317,7 +317,9 @@ async def test_program_follows_to_who_won_a_split() -> None:
         assert not work.camera.ended
 
 
-async def test_session_that_begins_while_another_agent_is_asked_is_seen() -> None:
+async def test_session_that_begins_while_another_agent_is_asked_is_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     async with Pair() as pair:
         await pair.start("north")
         await pair.start("south")
@@ -332,7 +334,7 @@ async def test_session_that_begins_while_another_agent_is_asked_is_seen() -> Non
                 await asyncio.sleep(2.0)  # another one is asked, and says nothing
                 return heard
 
-            camera._caller._say_hello = slowly  # type: ignore[method-assign]
+            monkeypatch.setattr(camera._caller, "_say_hello", slowly)
             await pair.agents["south"].drop(NAME)
             await until(lambda: pair.having() == ["north"])
             await camera.wait_connected(timeout=PATIENCE)

@@ -22,7 +22,7 @@ from smartcam.fleet._zenoh import ZenohEnd
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
 from tests.fleet.partner import Partner, partner
 from tests.fleet.test_standby import QUICK, Work
-from tests.processes import free_port
+from tests.processes import free_place
 
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 
@@ -38,7 +38,7 @@ class Hosts:
 
     def __init__(self, box: NumberedCamera, address: str) -> None:
         self.box = box
-        self.place = f"tcp/{address}:{free_port()}"
+        self.place = free_place(address)
         self.router = ZenohEnd(BusLink(listen=(self.place,)))
         self.agents: dict[str, Partner] = {}
 

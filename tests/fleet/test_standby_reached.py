@@ -11,7 +11,8 @@ pytest.importorskip("zenoh")
 from smartcam._zenoh import BusLink
 from smartcam.fleet._keys import Keys
 from smartcam.fleet._zenoh import ZenohEnd
-from tests.fleet.fleetkit import FLEET, PATIENCE, free_place, until
+from tests.fleet.fleetkit import FLEET, PATIENCE, until
+from tests.processes import free_place
 
 pytestmark = pytest.mark.real_time
 

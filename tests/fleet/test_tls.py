@@ -26,8 +26,9 @@ from smartcam.fleet import FleetCamera, FleetFile, FleetServer, _renewal, _zenoh
 from smartcam.fleet._certificates import read_identity
 from smartcam.fleet._wire import encode
 from smartcam.models import Disconnected, Reconnected
-from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, free_place, until
+from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, until
 from tests.fleet.plantkit import CAMERA, certified, plant_file, short_lived, url_of
+from tests.processes import free_place
 
 pytestmark = pytest.mark.real_time
 

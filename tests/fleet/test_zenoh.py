@@ -26,10 +26,10 @@ from smartcam.fleet import FleetCamera
 from smartcam.fleet._zenoh import LONG, ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
-from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant, free_place
+from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant, until
 from tests.fleet.partner import partner
 from tests.handmade import refusing
-from tests.processes import printed_by
+from tests.processes import free_place, printed_by
 
 pytestmark = pytest.mark.real_time
 
@@ -422,8 +422,7 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
             while heard.payloads[-1] != b"last":  # as soon as it reads again, all is well
                 says.put("test/last", b"last")
                 await asyncio.sleep(0.05)
-            while hears._bytes:  # noqa: ASYNC110 - of another last one
-                await asyncio.sleep(0.005)
+        await until(lambda: not hears._bytes)  # of another last one
         assert heard.payloads.count(bytes(size)) < count
 
 

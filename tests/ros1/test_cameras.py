@@ -17,9 +17,9 @@ from smartcam.fleet._ros_file import RosSection
 from smartcam.ros1 import RosbridgeNode
 from smartcam.ros1._fleet import bridged
 from tests.cli.commandline import closed_port, run
-from tests.processes import Process
+from tests.processes import Process, free_place
 from tests.ros1.bridge import Bridge
-from tests.ros2.roskit import PATIENCE, free_place
+from tests.ros2.roskit import PATIENCE
 
 EMULATED = {"emulated": {}, "application": 7, "interpret_as": "localizations"}
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 from smartcam.ros2 import Node, RosContext
-from tests.processes import free_port
+from tests.processes import free_place
 
 PATIENCE = 60.0
 """Seconds that only a failure takes."""
@@ -16,11 +16,6 @@ PATIENCE = 60.0
 STRING = "std_msgs/msg/String"
 TRIGGER = "std_srvs/srv/Trigger"
 SET_BOOL = "std_srvs/srv/SetBool"
-
-
-def free_place() -> str:
-    """Return an endpoint that nobody listens on."""
-    return f"tcp/127.0.0.1:{free_port()}"
 
 
 @contextlib.asynccontextmanager

@@ -18,8 +18,9 @@ from smartcam.ros2._parameters import RosParameters
 from smartcam.ros2._qos import LATCHED
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import Plant
+from tests.processes import free_place
 from tests.ros2.nodekit import COUNTER, FAST, NAME, OTHER, NotedNode, away, box, seen, until
-from tests.ros2.roskit import free_place, soon
+from tests.ros2.roskit import soon
 
 FULL = f"/{NAME}"
 LIFE = "lifecycle_msgs/srv/"

@@ -21,6 +21,7 @@ from smartcam.ros2._qos import DRIVER
 from tests.client.clientkit import FAST
 from tests.fleet.fleetkit import Plant, until
 from tests.insides import inside
+from tests.processes import free_place
 from tests.ros2.camerakit import (
     BOTH,
     BROKEN,
@@ -32,7 +33,6 @@ from tests.ros2.camerakit import (
     PaperNode,
     PartsCamera,
 )
-from tests.ros2.roskit import free_place
 
 TOPICS = ("results", "localizations", "detections")
 

@@ -21,6 +21,7 @@ from smartcam.ros2._messages import RESULT
 from smartcam.ros2._qos import LATCHED
 from smartcam.settings import parse_address
 from tests.fleet.fleetkit import Plant, until
+from tests.processes import free_place
 from tests.ros2.camerakit import (
     BOTH,
     BROKEN,
@@ -33,7 +34,6 @@ from tests.ros2.camerakit import (
     PaperNode,
     PartsCamera,
 )
-from tests.ros2.roskit import free_place
 
 
 @contextlib.asynccontextmanager

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.ros2.roskit import PATIENCE, free_place
+from tests.processes import free_place
+from tests.ros2.roskit import PATIENCE
 
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 

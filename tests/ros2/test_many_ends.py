@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from smartcam.ros2 import Node
-from tests.ros2.roskit import STRING, free_place, until
+from tests.processes import free_place
+from tests.ros2.roskit import STRING, until
 
 pytestmark = pytest.mark.real_time
 

@@ -26,12 +26,12 @@ from smartcam.ros2 import Node, QoS, RosContext
 from smartcam.ros2._attachment import Attachment
 from smartcam.ros2._qos import LATCHED
 from smartcam.ros2._services import MOST_CALLS
+from tests.processes import free_place
 from tests.ros2.roskit import (
     PATIENCE,
     SET_BOOL,
     STRING,
     TRIGGER,
-    free_place,
     soon,
     two_nodes,
     until,

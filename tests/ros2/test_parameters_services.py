@@ -19,7 +19,8 @@ from smartcam.exceptions import (
 )
 from smartcam.ros2 import Node, RosContext
 from smartcam.ros2._qos import PARAMETERS
-from tests.ros2.roskit import STRING, free_place, soon, two_nodes, until
+from tests.processes import free_place
+from tests.ros2.roskit import STRING, soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time
 

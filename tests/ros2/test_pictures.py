@@ -39,7 +39,8 @@ from smartcam.ros2._lens_messages import lens_fields
 from smartcam.ros2._picture_requests import MOST_NAMESPACES
 from smartcam.ros2._qos import DRIVER, LATCHED
 from tests.frames.drivers import ScriptedDriver, frame
-from tests.ros2.roskit import free_place, soon, two_nodes, until
+from tests.processes import free_place
+from tests.ros2.roskit import soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time
 

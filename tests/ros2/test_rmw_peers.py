@@ -22,7 +22,8 @@ from smartcam.ros2 import Node
 from smartcam.ros2._attachment import Attachment
 from smartcam.ros2._qos import LATCHED
 from smartcam.ros2._tokens import Entity
-from tests.ros2.roskit import PATIENCE, STRING, TRIGGER, free_place, soon, until
+from tests.processes import free_place
+from tests.ros2.roskit import PATIENCE, STRING, TRIGGER, soon, until
 
 pytestmark = pytest.mark.real_time
 

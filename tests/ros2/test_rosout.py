@@ -14,7 +14,8 @@ from smartcam.exceptions import RosError
 from smartcam.ros2 import Node
 from smartcam.ros2._rosout import MOST_TEXT, MOST_WAITING, ROSOUT, RosOut
 from smartcam.ros2._topics import RosPublisher
-from tests.ros2.roskit import free_place, soon, two_nodes, until
+from tests.processes import free_place
+from tests.ros2.roskit import soon, two_nodes, until
 
 pytestmark = pytest.mark.real_time
 

@@ -15,7 +15,8 @@ import pytest
 from smartcam.exceptions import ServiceCallError
 from smartcam.ros2 import Node, QoS
 from smartcam.ros2._qos import LATCHED
-from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, free_place, soon, until
+from tests.processes import free_place
+from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, soon, until
 
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 
