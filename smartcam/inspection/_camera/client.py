@@ -1,0 +1,141 @@
+"""A software camera in this process: a client, and the device that it has a session with."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+from smartcam._finishing import finish
+from smartcam.client import SmartCamera
+from smartcam.exceptions import ConfigurationError, ResponseTimeoutError, UnsupportedError
+from smartcam.inspection._camera.device import SoftwareDevice
+from smartcam.inspection._camera.pictures import png_of
+from smartcam.inspection._cell import load_cell
+from smartcam.models import Capabilities, ValueT
+from smartcam.settings import SOFTWARE_SCHEME, Address, CameraSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from typing import Self
+
+    from smartcam.inspection._camera.eyes import Judged
+    from smartcam.inspection._cell import CellCamera
+    from smartcam.observers import Observer
+
+
+class SoftwareCamera(SmartCamera[ValueT]):
+    """A camera whose pictures are inspected in this process: ``software:cell.yaml#line1/cam1``.
+
+    It is a client of a device that it starts and stops itself, so triggers, statuses, errors and
+    streams are those of a camera on the wire. Results are read by the programs' layouts unless
+    ``interpret_as`` says otherwise; an application may be named by number or by name.
+
+    Args:
+        url: address of the camera, ``software:FILE#CAMERA``.
+        options: options of a client.
+        observers: observers of the session.
+
+    Raises:
+        ConfigurationError: the file or an option cannot work.
+        MissingExtraError: what it needs is not installed.
+    """
+
+    def __init__(
+        self, url: str, options: dict[str, Any], observers: Iterable[Observer] = ()
+    ) -> None:
+        camera = find_camera(url)
+        self._device = SoftwareDevice(camera)
+        usual = {"name": camera.name, "interpret_as": self._device.interpret_as}
+        given = {
+            **usual,
+            **{name: one for name, one in options.items() if one or name not in usual},
+        }
+        emulator = self._device.emulator
+        address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
+        super().__init__(CameraSettings.of(address, given), observers=observers)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return dataclasses.replace(super().capabilities, read_image=True)
+
+    @property
+    def judged(self) -> Judged | None:
+        """The last picture that was judged, with what was said about it; None before the first."""
+        return self._device.eyes.judged
+
+    @property
+    def trouble_seeing(self) -> str:
+        """The reason for which no frames come; "" where they come."""
+        return self._device.eyes.trouble
+
+    async def open(self) -> Self:
+        try:
+            await self._device.start()
+            self._go_to(self.settings.address._replace(port=self._device.emulator.port))
+        except BaseException:
+            await finish(self._device.stop)
+            raise
+        return await super().open()
+
+    async def close(self) -> None:
+        try:
+            await super().close()
+        finally:
+            await finish(self._device.stop)
+
+    async def _switch_application(self, application: int | str, timeout: float) -> None:
+        if isinstance(application, str):
+            application = self._device.camera.program(application).application
+        await super()._switch_application(application, timeout)
+
+    async def _read_image(self, timeout: float) -> bytes:
+        return await self._picture(timeout, drawn=False)
+
+    async def read_drawn_image(self, *, timeout: float | None = None) -> bytes:
+        """Return the last picture that was judged with the marks of its tools, a PNG's bytes.
+
+        Raises:
+            UnsupportedError: no picture was judged yet.
+            ResponseTimeoutError: it was not drawn in time.
+
+        Cancellation: safe.
+        """
+        limit = self._limit(timeout, self.settings.request_timeout)
+        return await self._picture(limit, drawn=True)
+
+    async def _picture(self, timeout: float, *, drawn: bool) -> bytes:
+        self._require_session()
+        judged = self.judged
+        if judged is None:
+            raise UnsupportedError(f"{self.name}: no picture was judged yet: trigger first")
+        try:
+            async with asyncio.timeout(timeout):
+                return await asyncio.to_thread(png_of, judged, drawn=drawn)
+        except TimeoutError:
+            raise ResponseTimeoutError(
+                f"{self.name}: the picture was not made within {timeout:g} s", waited=timeout
+            ) from None
+
+
+def find_camera(url: str) -> CellCamera:
+    """Return the camera of an address, ``software:FILE`` or ``software:FILE#CAMERA``.
+
+    Raises:
+        ConfigurationError: the file is wrong, or has no such camera, or several and none is named.
+    """
+    path, mark, name = url.strip()[len(SOFTWARE_SCHEME) :].partition("#")
+    if not path:
+        raise ConfigurationError(
+            f"camera address {url!r}: expected software:FILE#CAMERA, such as "
+            "software:cell.yaml#line1/cam1"
+        )
+    cameras = load_cell(path)
+    if mark and name in cameras:
+        return cameras[name]
+    if not mark and len(cameras) == 1:
+        return next(iter(cameras.values()))
+    there = ", ".join(cameras)
+    if mark:
+        raise ConfigurationError(f"{path} has no software camera {name!r:.80}; it has {there}")
+    raise ConfigurationError(f"{path} has several software cameras: name one of {there} behind #")

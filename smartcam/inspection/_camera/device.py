@@ -1,0 +1,297 @@
+"""A software camera as a device on a port: an emulated camera that has eyes."""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from smartcam import frames
+from smartcam._server import Server
+from smartcam.emulator import EmulatedCamera, EmulatedInSight
+from smartcam.emulator._inside import InspectedApplication, InspectedJob, Inspector
+from smartcam.exceptions import ConfigurationError
+from smartcam.inspection._camera.eyes import Eyes
+from smartcam.inspection._camera.keeper import PictureKeeper
+from smartcam.layout import Layout
+from smartcam.models import Status
+from smartcam.settings import validated
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.emulator import WireCamera
+    from smartcam.emulator._inside import InspectionOrder, Values
+    from smartcam.frames import FrameSource
+    from smartcam.inspection._cell import CellCamera
+    from smartcam.inspection._program import Program
+
+_log: Final = logging.getLogger("smartcam.inspection")
+
+MAX_RECORDS: Final = 32
+"""Records of a list that an In-Sight camera has cells for."""
+
+NO_VALUE: Final = "#ERR"
+"""Text of a cell without a value."""
+
+_RECORDED: Final = re.compile(r"^(?:[A-Za-z]:[\\/]|(?![A-Za-z][A-Za-z0-9+.-]*:)|file:)")
+_PACE: Final = re.compile(r"#(.*&)?pace=")
+
+
+class SoftwareDevice(Server):
+    """A camera that inspects the frames of a source, and speaks as a smart camera does.
+
+    It is in run mode from the beginning. A source that is lost is a System Error until it is back;
+    an inspection under way is BUSY, and a trigger meanwhile Overtriggered.
+
+    Args:
+        camera: programs of the camera, and the address of the frames.
+        protocol: ``"bvs"`` or ``"insight"``.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        transport: ``"tcp"`` or ``"udp"``, of ``bvs``; default ``"tcp"``.
+        dialect: name of the dialect of ``bvs``; default ``handbook``.
+        quirks: options of the emulated camera for what is not known of real ones.
+        seed: of the emulated camera's chance.
+
+    Raises:
+        ConfigurationError: something of it cannot work.
+
+    Attributes:
+        camera: programs of the camera, and the address of the frames.
+        eyes: inspector of the frames.
+        emulator: the device and its port.
+    """
+
+    def __init__(
+        self,
+        camera: CellCamera,
+        *,
+        protocol: str = "bvs",
+        host: str = "127.0.0.1",
+        port: int = 0,
+        transport: Literal["tcp", "udp"] | None = None,
+        dialect: str | None = None,
+        quirks: dict[str, Any] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        self.camera = camera
+        recorded = _RECORDED.match(camera.frames) is not None
+        make = partial(source_of, camera.frames, recorded=recorded)
+        make()  # what cannot work is told now
+        self.eyes: Eyes = Eyes(
+            camera.name,
+            make,
+            camera.programs,
+            recorded=recorded,
+            grey=protocol == "insight",
+            on_sight=self._note_sight,
+        )
+        self._keeper: PictureKeeper | None = None
+        if camera.keep is not None:
+            self._keeper = PictureKeeper(
+                camera.name, camera.folder / camera.keep.folder, camera.keep
+            )
+            self.eyes.viewers.add(self._keeper.take)
+        self.emulator: WireCamera
+        if protocol == "insight":
+            for name, value in (("transport", transport), ("dialect", dialect)):
+                if value not in {None, "tcp", "native"}:
+                    raise ConfigurationError(f"{camera.name}: In-Sight has no {name} {value!r}")
+            self.emulator = EmulatedInSight(
+                jobs=[self._job(program) for program in camera.programs.values()],
+                online=True,
+                host=host,
+                port=port,
+                name=camera.name,
+                quirks=quirks,
+                seed=seed or 0,
+            )
+            self.emulator.device.sight = self._sight
+        elif protocol == "bvs":
+            self.emulator = EmulatedCamera(
+                [self._application(program) for program in camera.programs.values()],
+                builtins=False,
+                running=True,
+                host=host,
+                port=port,
+                transport=transport,
+                dialect=dialect,
+                name=camera.name,
+                quirks={"busy_while_processing": True, **(quirks or {})},
+                seed=seed,
+            )
+        else:
+            raise ConfigurationError(
+                f"{camera.name}: a software camera speaks bvs or insight, not {protocol!r:.60}"
+            )
+
+    def _application(self, program: Program) -> InspectedApplication:
+        return validated(
+            InspectedApplication,
+            {
+                "id": program.application,
+                "name": program.name,
+                "layout": program.layout.text,
+                "rate": self.camera.rates.get(program.application),
+                "processing_time": 0.0,
+                "inspector": self.eyes,
+            },
+            f"{self.camera.name}: application {program.application}",
+        )
+
+    def _job(self, program: Program) -> InspectedJob:
+        name = re.sub(r"[^A-Za-z0-9_-]", "_", program.name)
+        number = str(program.application)
+        return validated(
+            InspectedJob,
+            {
+                "file": f"{number}{'' if name == number else name}.job",
+                "cells": dict.fromkeys(cell_names(program), NO_VALUE),
+                "rate": self.camera.rates.get(program.application),
+                "load_time": 0.01,
+                "inspector": _CellInspector(self.eyes, program),
+                "application": program.application,
+            },
+            f"{self.camera.name}: application {program.application}",
+        )
+
+    @property
+    def url(self) -> str:
+        """Its address on the wire."""
+        return self.emulator.url
+
+    @property
+    def interpret_as(self) -> dict[int, str]:
+        """The layout of the results of each application."""
+        return {number: one.interpret_as for number, one in self.camera.programs.items()}
+
+    async def start(self) -> None:
+        """Open the source of the frames, then the port.
+
+        A source that is not there is a System Error.
+
+        Raises:
+            ConfigurationError: it cannot listen there.
+
+        Cancellation: leaves it stopped.
+        """
+        await self.eyes.start()
+        if self._keeper is not None:
+            self._keeper.start()
+        try:
+            await self.emulator.start()
+        except BaseException:
+            await self._rest()
+            raise
+
+    async def stop(self) -> None:
+        """Close the port and the source. Harmless when done twice.
+
+        Cancellation: everything is closed nevertheless.
+        """
+        try:
+            await self.emulator.stop()
+        finally:
+            await self._rest()
+
+    async def _rest(self) -> None:
+        """Stop what looks, and what keeps pictures."""
+        try:
+            await self.eyes.stop()
+        finally:
+            if self._keeper is not None:
+                await self._keeper.stop()
+
+    def _note_sight(self, trouble: str) -> None:
+        device = self.emulator.device
+        if isinstance(self.emulator, EmulatedInSight):
+            device.set_blind(bool(trouble))
+        else:
+            device.set_condition(Status.SYSTEM_ERROR, bool(trouble))
+
+    def _sight(self) -> Any:
+        """Return the last judged picture's grey levels; before the first a black pixel."""
+        import numpy as np
+
+        judged = self.eyes.judged
+        if judged is None or judged.inspection is None:
+            return np.zeros((1, 1), np.uint8)
+        return judged.inspection.picture.grey
+
+
+class _CellInspector(Inspector):
+    """Has the values of a program in the units of its layout, as the cells show them.
+
+    Args:
+        eyes: inspector of the frames.
+        program: program whose values they are.
+    """
+
+    def __init__(self, eyes: Eyes, program: Program) -> None:
+        self._eyes, self._layout = eyes, program.layout
+        plain = [str(replace(field, unit=None)) for field in program.layout.fields]
+        if program.layout.repeat is None:
+            text = ", ".join(plain)
+        else:
+            name = next(step.name for step in program.steps if step.records)
+            head = [str(replace(field, unit=None)) for field in program.layout.head]
+            text = ", ".join([*head, f"{name}: ({', '.join(plain)})*"])
+        self._plain = Layout(text)
+
+    def begin(
+        self,
+        order: InspectionOrder,
+        seen: Callable[[], None],
+        done: Callable[[Values | None], None],
+    ) -> None:
+        """Begin an inspection, as the eyes do."""
+        number = None if self._layout.sequence_field is None else order.number & 0x7FFFFFFF
+
+        def converted(found: Values | None) -> None:
+            values: Values | None = None
+            try:
+                if found is not None:
+                    data = self._layout.build(found, sequence=number)
+                    values = _as_mapping(self._plain.parse(data))
+            except Exception:  # noqa: BLE001 - the run has to end
+                _log.exception("%s ! a result does not fit its cells", self._eyes.name)
+            done(values)
+
+        self._eyes.begin(order, seen, converted)
+
+    def cancel(self) -> None:
+        """Give up the inspection under way."""
+        self._eyes.cancel()
+
+
+def _as_mapping(record: Any) -> dict[str, Any]:
+    """Return a record, and the records in it, as mappings."""
+    return {
+        name: [_as_mapping(one) for one in value] if isinstance(value, list) else value
+        for name, value in record._asdict().items()
+    }
+
+
+def source_of(address: str, *, recorded: bool) -> FrameSource:
+    """Return the source of an address; a recording waits until a run takes its next picture.
+
+    Raises:
+        ConfigurationError: the address cannot work.
+    """
+    if recorded and _PACE.search(address) is None:
+        address += "&pace=none" if re.search(r"#\w+=[^#/]*$", address) else "#pace=none"
+    return frames.open(address)
+
+
+def cell_names(program: Program) -> list[str]:
+    """Return the names of the cells that a program's values are in on an In-Sight camera."""
+    layout = program.layout
+    if layout.repeat is None:
+        return [field.name for field in layout.fields]
+    names = [field.name for field in layout.head]
+    for number in range(1, MAX_RECORDS + 1):
+        names += [f"{field.name}_{number}" for field in layout.fields]
+    return names

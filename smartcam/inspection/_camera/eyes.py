@@ -1,0 +1,368 @@
+"""The eyes of a software camera: a source of frames, and the programs that inspect them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam.backoff import Backoff
+from smartcam.emulator._inside import Inspector
+from smartcam.exceptions import FrameSourceError, SmartCamError
+from smartcam.inspection._camera.tool_thread import ToolThread
+from smartcam.inspection._program import MAX_REASON_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from concurrent.futures import Future
+
+    from smartcam.emulator._inside import InspectionOrder, Values
+    from smartcam.frames import Frame, FrameSource, StreamFormat
+    from smartcam.inspection._finding import Inspection
+    from smartcam.inspection._program import Program
+
+_log: Final = logging.getLogger("smartcam.inspection")
+
+FIRST_FRAME_TIMEOUT: Final = 5.0
+"""Seconds that the first frame is waited for before the camera is there without one."""
+
+FRAME_WAIT: Final = 10.0
+"""Seconds that a trigger waits for a frame that was exposed after it."""
+
+TOOLS_TIMEOUT: Final = 60.0
+"""Seconds that the tools of a program may take; then the result is not ok, and says so."""
+
+MAX_HUNG_THREADS: Final = 4
+"""Threads with tools that do not end; the last one is waited for."""
+
+THREAD_GRACE: Final = 1.0
+"""Seconds that a tool gets to come to its end when the camera is closed."""
+
+RETRY: Final = Backoff(initial=0.1, maximum=5.0)
+"""Delays before a lost source of frames is tried again."""
+
+
+class Judged(NamedTuple):
+    """A picture that was judged, and what was said about it.
+
+    Attributes:
+        number: sequence number of the run.
+        frame: the frame that was judged.
+        inspection: what the program says about it; None where it failed.
+        application: id of the program.
+    """
+
+    number: int
+    frame: Frame
+    inspection: Inspection | None
+    application: int
+
+
+@dataclass(eq=False, slots=True)
+class _OrderedRun:
+    """A run that waits for its frame, or for its tools."""
+
+    order: InspectionOrder
+    seen: Callable[[], None]
+    done: Callable[[Values | None], None]
+    moment: float  # of time.monotonic(); its frame is exposed after it
+    deadline: asyncio.TimerHandle
+    frame: Frame | None = None
+    work: Future[Inspection] | None = None
+
+
+class Eyes(Inspector):
+    """Inspects the first frame that is exposed after a run has begun.
+
+    One thread of its own runs the tools, one picture at a time; what a tool does for a run that was
+    given up goes on in another.
+
+    Args:
+        name: name of the camera, for logs.
+        make: returns the source of its frames, unopened.
+        programs: the programs, by their ids.
+        recorded: the source is a recording: each run takes its next picture, and the first one
+            again after the last.
+        grey: have the grey levels of each picture made in the thread, for whoever asks for them.
+        on_sight: is called when frames are lost, with the reason, and with "" when they come again.
+
+    Attributes:
+        name: name of the camera.
+        judged: the last picture that was judged; None before the first.
+        viewers: are shown each picture that was judged.
+        format: format of the source's frames; None before it was opened.
+        trouble: why there are no frames; "" where there are.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        make: Callable[[], FrameSource],
+        programs: Mapping[int, Program],
+        *,
+        recorded: bool = False,
+        grey: bool = False,
+        on_sight: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.judged: Judged | None = None
+        self.trouble: str = "it was not opened yet"
+        self.on_sight = on_sight
+        self.format: StreamFormat | None = None
+        self.viewers: set[Callable[[Judged], None]] = set()
+        self.name = name
+        self._make, self._programs = make, programs
+        self._recorded, self._grey = recorded, grey
+        self._order: _OrderedRun | None = None
+        self._wanted = asyncio.Event()  # a run waits for a frame
+        self._sighted = asyncio.Event()  # the first frame came, or cannot come
+        self._task: asyncio.Task[None] | None = None
+        self._thread: ToolThread | None = None
+        self._hung: list[ToolThread] = []  # those that were given up, and are still at work
+
+    def _new_thread(self) -> ToolThread:
+        return ToolThread(f"smartcam.inspection {self.name}")
+
+    # ------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open the source, and wait a moment for its first frame; without one it is told, too.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._task is not None:
+            return
+        self._sighted.clear()
+        self._thread = self._new_thread()
+        self._task = asyncio.create_task(self._watch(), name=f"eyes of {self.name}")
+        try:
+            async with asyncio.timeout(FIRST_FRAME_TIMEOUT):
+                await self._sighted.wait()
+        except TimeoutError:
+            self._lose(f"no frame came within {FIRST_FRAME_TIMEOUT:g} s")
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def stop(self) -> None:
+        """Give the source back. A tool that does not end is left to its thread. Idempotent.
+
+        Cancellation: takes effect when the source is given back.
+        """
+        self.cancel()
+        task, self._task = self._task, None
+        thread, self._thread = self._thread, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait({task})
+        if thread is not None:
+            last = asyncio.wrap_future(thread.submit(lambda: None))
+            thread.close()
+            await asyncio.wait({last}, timeout=THREAD_GRACE)
+            last.cancel()
+
+    # ------------------------------------------------------------------ for the device
+
+    def begin(
+        self,
+        order: InspectionOrder,
+        seen: Callable[[], None],
+        done: Callable[[Values | None], None],
+    ) -> None:
+        """Begin an inspection of the first frame that is exposed from now on."""
+        self.cancel()
+        loop = asyncio.get_running_loop()
+        deadline = loop.call_later(FRAME_WAIT, self._give_up)
+        self._order = _OrderedRun(order, seen, done, time.monotonic(), deadline)
+        self._wanted.set()
+        if self.trouble:  # a restart has made the device forget it
+            loop.call_soon(self._tell, self.trouble)
+
+    def cancel(self) -> None:
+        """Give up the inspection under way; what its thread has begun keeps no later one."""
+        order, self._order = self._order, None
+        self._wanted.clear()
+        if order is not None:
+            order.deadline.cancel()
+            if order.work is not None:
+                order.work.cancel()
+
+    # ------------------------------------------------------------------ frames
+
+    async def _watch(self) -> None:
+        """Read the source, and open it again whenever it is lost."""
+        delays = RETRY.delays()
+        while True:
+            try:
+                async with self._make() as source:
+                    self.format = source.format
+                    if self._recorded:
+                        self._regain()
+                    while True:
+                        if await self._follow(source):
+                            delays = RETRY.delays()
+                        if not self._recorded:
+                            raise FrameSourceError(f"{source.name}: it ended", source=source.name)
+            except (SmartCamError, OSError) as exc:
+                self._lose(str(exc))
+            except Exception as exc:  # noqa: BLE001 - a driver may be anybody's
+                _log.exception("%s ! the source of its frames failed", self.name)
+                self._lose(repr(exc))
+            await asyncio.sleep(next(delays))
+
+    async def _follow(self, source: FrameSource) -> bool:
+        """Give frames to the runs that wait for them; return whether any came before the end."""
+        came = False
+        held: Frame | None = None  # of a recording, whose run was given up
+        async with source.reader(timeout=None) as reader:
+            while True:
+                if self._recorded:
+                    await self._wanted.wait()
+                try:
+                    frame: Frame = await anext(reader) if held is None else held
+                except StopAsyncIteration:
+                    return came
+                came, held = True, None
+                self._regain()
+                order = self._order
+                if order is None or order.frame is not None:
+                    held = frame if self._recorded else None
+                elif self._recorded or frame.began >= order.moment:
+                    self._inspect(order, frame)
+
+    def _regain(self) -> None:
+        """Note that frames come."""
+        if self.trouble:
+            _log.info("%s = sees again", self.name)
+            self._tell("")
+        self._sighted.set()
+
+    def _lose(self, why: str) -> None:
+        """Note that no frames come; the run under way is void."""
+        if why != self.trouble:
+            _log.warning("%s ! sees nothing: %s", self.name, why)
+        self._tell(why)
+        self._sighted.set()
+
+    def _tell(self, trouble: str) -> None:
+        self.trouble = trouble
+        self.on_sight(trouble)
+
+    def _give_up(self) -> None:
+        """End a run that got no frame in time."""
+        order, self._order = self._order, None
+        self._wanted.clear()
+        if order is not None:
+            _log.warning(
+                "%s ! no frame was exposed within %g s after the trigger: no result",
+                self.name,
+                FRAME_WAIT,
+            )
+            order.done(None)
+
+    # ------------------------------------------------------------------ tools
+
+    def _inspect(self, order: _OrderedRun, frame: Frame) -> None:
+        """Have the tools look at a frame, in the thread."""
+        thread = self._free_thread()
+        if thread is None:
+            return
+        loop = asyncio.get_running_loop()
+        order.deadline.cancel()
+        order.deadline = loop.call_later(TOOLS_TIMEOUT, self._give_up_tools, order, frame)
+        order.frame = frame
+        self._wanted.clear()
+        program = self._programs[order.order.application]
+        work = thread.submit(partial(_inspected, program, frame, order.order.input, self._grey))
+        order.work = work
+
+        def ended(_: Future[Inspection]) -> None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(self._finish, order, frame, work)
+
+        work.add_done_callback(ended)
+        order.seen()
+
+    def _free_thread(self) -> ToolThread | None:
+        """Return a thread for tools: a new one where a run that was given up is at work in it."""
+        thread = self._thread
+        if thread is not None and thread.at_work:
+            self._hung = [one for one in self._hung if one.at_work]
+            if len(self._hung) < MAX_HUNG_THREADS:
+                self._hung.append(thread)
+                thread.close()
+                thread = self._thread = self._new_thread()
+        return thread
+
+    def _give_up_tools(self, order: _OrderedRun, frame: Frame) -> None:
+        """End a run whose tools do not; another thread has the next one."""
+        if order is not self._order:
+            return
+        if order.work is not None:
+            order.work.cancel()
+        text = f"the tools did not end within {TOOLS_TIMEOUT:g} s"
+        self._end(order, frame, None, TimeoutError(text))
+
+    def _finish(self, order: _OrderedRun, frame: Frame, work: Future[Inspection]) -> None:
+        """Take what the tools said of a run's frame, unless the run is void."""
+        if order is not self._order:
+            return
+        error = work.exception()
+        self._end(order, frame, work.result() if error is None else None, error)
+
+    def _end(
+        self,
+        order: _OrderedRun,
+        frame: Frame,
+        inspection: Inspection | None,
+        error: BaseException | None,
+    ) -> None:
+        self._order = None
+        order.deadline.cancel()
+        number, application = order.order.number, order.order.application
+        values: Values | None = None
+        try:
+            if inspection is not None:
+                values = inspection.values
+            else:
+                _log.error("%s ! application %d failed", self.name, application, exc_info=error)
+                values = failed_values(self._programs[application], str(error))
+        except Exception:  # noqa: BLE001 - the run has to end
+            _log.exception("%s ! application %d has no result", self.name, application)
+        self.judged = Judged(number, frame, inspection, application)
+        order.done(values)
+        for show in self.viewers:
+            show(self.judged)
+
+
+def _inspected(program: Program, frame: Frame, data: bytes, grey: bool) -> Inspection:
+    """Return the inspection of a frame; values that do not fit the layout are an error."""
+    inspection = program.inspect(frame, input=data)
+    inspection.payload()
+    if grey:
+        _ = inspection.picture.grey  # which takes longer than the loop has time
+    return inspection
+
+
+def failed_values(program: Program, reason: str) -> dict[str, Any]:
+    """Return the values of a program that failed: not ok, with the reason, all else empty."""
+    layout = program.layout
+    fields = layout.fields if layout.repeat is None else layout.head
+    values = {
+        field.name: _EMPTY.get(field.type, math.nan if "real" in field.type else 0)
+        for field in fields
+    }
+    values |= {step.name: [] for step in program.steps if step.records}
+    data = reason.replace("\0", "?").encode(errors="replace")
+    return {
+        **values,
+        "ok": False,
+        "reason": data[:MAX_REASON_BYTES].decode(errors="ignore"),
+    }
+
+
+_EMPTY: Final[dict[str, Any]] = {"bool": False, "string": ""}

@@ -1,0 +1,121 @@
+"""Keeping judged pictures in a folder, with what was said about them."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import json
+import logging
+import re
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.exceptions import SmartCamError
+from smartcam.inspection._camera.pictures import png_of
+from smartcam.models import jsonable
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam.inspection._camera.eyes import Judged
+    from smartcam.inspection._cell import Keep
+
+_log: Final = logging.getLogger("smartcam.inspection")
+
+MAX_WAITING: Final = 16
+"""Pictures that wait to be written; more are not kept, and counted."""
+
+_UNFIT: Final = re.compile(r'[\x00-\x1f/\\:*?"<>|]')  # for the name of a file
+
+
+class PictureKeeper:
+    """Writes judged pictures as PNG files into a folder, each with a JSON file beside it.
+
+    The camera's oldest ones in the folder make room; other files there are left alone. A folder
+    that cannot be written costs the pictures, and nothing else.
+
+    Args:
+        name: name of the camera, for logs.
+        folder: folder for the pictures; it is made if need be.
+        keep: settings of keeping.
+
+    Attributes:
+        missed: pictures that were not kept, since others were still being written.
+    """
+
+    def __init__(self, name: str, folder: Path, keep: Keep) -> None:
+        self._name, self._folder, self._keep = name, folder, keep
+        self._called = _UNFIT.sub("-", name)  # in the names of its files
+        self._own = re.compile(
+            rf"\d{{8}}-\d{{6}}-\d{{6}}-{re.escape(self._called)}-\d+-(ok|bad)\.png"
+        )
+        self.missed: int = 0
+        self._waiting: collections.deque[Judged] = collections.deque()
+        self._wake = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self._failed = False
+
+    def start(self) -> None:
+        """Begin to write what comes."""
+        if self._task is None:
+            self._task = asyncio.create_task(self._write_all(), name=f"pictures of {self._name}")
+
+    async def stop(self) -> None:
+        """Write what waits, which is bounded, and end. Idempotent."""
+        task, self._task = self._task, None
+        if task is None:
+            return
+        task.cancel()
+        await asyncio.wait({task})
+        while self._waiting:
+            await asyncio.to_thread(self._write, self._waiting.popleft())
+
+    def take(self, judged: Judged) -> None:
+        """Keep a picture, unless only those that are not ok are kept and it is."""
+        ok = judged.inspection is not None and judged.inspection.ok
+        if ok and self._keep.which == "bad":
+            return
+        if len(self._waiting) >= MAX_WAITING:
+            self.missed += 1
+            return
+        self._waiting.append(judged)
+        self._wake.set()
+
+    async def _write_all(self) -> None:
+        while True:
+            self._wake.clear()
+            while self._waiting:
+                await asyncio.to_thread(self._write, self._waiting[0])
+                self._waiting.popleft()
+            await self._wake.wait()
+
+    def _write(self, judged: Judged) -> None:
+        """Write a picture, and delete those that are too many."""
+        inspection = judged.inspection
+        ok = inspection is not None and inspection.ok
+        at = datetime.fromtimestamp(judged.frame.utc, UTC)
+        verdict = "ok" if ok else "bad"
+        stem = f"{at:%Y%m%d-%H%M%S-%f}-{self._called}-{judged.application}-{verdict}"
+        said: dict[str, Any] = {
+            "camera": self._name,
+            "application": judged.application,
+            "number": judged.number,
+            "captured": at.isoformat(),
+            "ok": ok,
+            "value": None if inspection is None else jsonable(inspection.value),
+        }
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            (self._folder / f"{stem}.png").write_bytes(png_of(judged, drawn=False))
+            text = json.dumps(said, indent=1)
+            (self._folder / f"{stem}.json").write_text(text + "\n", encoding="utf-8")
+            kept = sorted(one for one in self._folder.iterdir() if self._own.fullmatch(one.name))
+            for old in kept[: max(0, len(kept) - self._keep.most)]:
+                old.unlink(missing_ok=True)
+                old.with_suffix(".json").unlink(missing_ok=True)
+        except (OSError, ValueError, SmartCamError) as exc:
+            if not self._failed:  # once is enough
+                _log.error("%s ! pictures are not kept: %s", self._name, exc)
+            self._failed = True
+        else:
+            self._failed = False

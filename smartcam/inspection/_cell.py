@@ -1,0 +1,322 @@
+"""Cell files: software cameras and their programs; read from YAML, alone or in a fleet file."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from smartcam._arguments import check_application_or_name, check_path, check_text
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.inspection._program import (
+    MAX_TOOLS,
+    FollowedApplication,
+    Program,
+    ProgramError,
+    ProgramStep,
+    make_step,
+)
+from smartcam.inspection._tool import ToolSetup
+from smartcam.layout._inside import read_model
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from smartcam.calibration._inside import AnyCalibration
+
+MAX_APPLICATIONS: Final = 1000
+"""Applications of one camera."""
+
+_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
+
+
+class ApplicationEntry(BaseModel):
+    """An application of a software camera; every other key is a tool, in the order they run."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="allow", frozen=True, hide_input_in_errors=True
+    )
+
+    name: str = Field(
+        "", max_length=60, description="name of the application; others may follow it"
+    )
+    sequence: bool = Field(False, description="put the sequence number in front of the result")
+    rate: float | None = Field(
+        None,
+        ge=0.0001,
+        le=1000,
+        allow_inf_nan=False,
+        description="runs per second of a free-running application; default: it waits for triggers",
+    )
+
+    @property
+    def tools(self) -> dict[str, Any]:
+        """Settings of its tools by their keys, as YAML gives them."""
+        return dict(self.model_extra or {})
+
+
+def _folder(given: str) -> str:
+    if "\0" in given:
+        raise ValueError("expected the path of a folder, which has no zero in it")
+    return given
+
+
+class Keep(BaseModel):
+    """Settings of keeping judged pictures in a folder."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    folder: Annotated[str, AfterValidator(_folder)] = Field(
+        min_length=1, description="folder beside this file; made if need be"
+    )
+    which: Literal["bad", "all"] = Field("bad", description="those that are not ok, or all")
+    most: int = Field(
+        1000,
+        ge=1,
+        le=1_000_000,
+        description="pictures of the camera in the folder; the oldest ones make room",
+    )
+
+
+class Software(BaseModel):
+    """The camera that programs make of a source of pictures: ``software:`` in a file."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    frames: str = Field(
+        min_length=1,
+        description="where its pictures come from: gige://HOST, v4l2:///dev/video0, "
+        "rtsp://HOST/..., or a file or folder beside this file",
+    )
+    calibration: str | None = Field(
+        None,
+        description="file with a calibration, beside this one: results are in the robot's metres",
+    )
+    applications: dict[int, ApplicationEntry] = Field(
+        min_length=1,
+        max_length=MAX_APPLICATIONS,
+        description="by number: a name, and the tools in the order they run",
+    )
+    keep: Keep | None = Field(
+        None, description="keep judged pictures in a folder, with what was said about them"
+    )
+    drawn: bool = Field(
+        True,
+        description="draw what the tools saw into the pictures that a fleet shows; false: as they "
+        "came",
+    )
+
+    def frames_address(self, folder: Path) -> str:
+        """Return the address for :func:`smartcam.frames.open`.
+
+        Args:
+            folder: folder that the file is in.
+        """
+        return self.frames if _URL.match(self.frames) else str(folder / self.frames)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CellCamera:
+    """A software camera, as its file says: loaded, but with nothing open.
+
+    Attributes:
+        name: name of the camera.
+        frames: address for :func:`smartcam.frames.open`.
+        calibration: calibration of the camera; None: it has none.
+        programs: programs by the numbers of their applications.
+        rates: runs per second of the applications that run freely, by their numbers.
+        keep: settings of keeping judged pictures; None: none is kept.
+        folder: folder that the file is in.
+    """
+
+    name: str
+    frames: str
+    calibration: AnyCalibration | None
+    programs: Mapping[int, Program]
+    rates: Mapping[int, float] = field(default_factory=dict[int, float])
+    keep: Keep | None = None
+    folder: Path = Path()
+
+    def program(self, application: int | str) -> Program:
+        """Return the program of an application's number or name.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        application = check_application_or_name(application, who="program")
+        for number, program in self.programs.items():
+            if application in (number, str(number), program.name):
+                return program
+        known = [f"{number} ({one.name})" for number, one in self.programs.items()]
+        raise ConfigurationError(
+            f"{self.name}: no application {application!r:.60}; there are {', '.join(known)}"
+        )
+
+
+class _CellEntry(BaseModel):
+    """A camera in a file; what else a fleet file says of it is the fleet's to read."""
+
+    software: Software | None = None
+
+
+class _CellFile(BaseModel):
+    cameras: dict[str, _CellEntry] = Field(min_length=1)
+
+
+def load_cell(path: str | Path) -> dict[str, CellCamera]:
+    """Return the software cameras of a file, by name: a cell file, or a fleet file with some.
+
+    Nothing is opened, but what the tools need is loaded: models, taught pictures, calibrations.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or a part of it cannot work; the text names
+            file, line and field.
+        MissingExtraError: what it needs is not installed.
+    """
+    path = check_path(path, "path", "load_cell")
+    found: dict[str, CellCamera] = {}
+
+    def mistake(file: _CellFile) -> tuple[tuple[int | str, ...], str] | None:
+        for name, entry in file.cameras.items():
+            if entry.software is None:
+                continue
+            try:
+                found[name] = make_camera(name, entry.software, path.parent)
+            except ProgramError as exc:
+                return ("cameras", name, "software", *exc.place), str(exc)
+        return None if found else (("cameras",), "expected a camera with software:, got none")
+
+    read_model(path, "cell", _CellFile, "cameras", mistake)
+    return found
+
+
+def software_mistakes(
+    name: str, software: Software, folder: Path
+) -> Iterator[tuple[tuple[int | str, ...], str]]:
+    """Yield the place and text of what cannot work in ``software:`` of a fleet file."""
+    try:
+        make_camera(name, software, folder)
+    except ProgramError as exc:
+        yield exc.place, str(exc)
+
+
+def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
+    """Return the camera that ``software:`` says.
+
+    Args:
+        name: name of the camera.
+        software: what the file says of it.
+        folder: folder that the file is in.
+
+    Raises:
+        ConfigurationError: something cannot work. Where it is a place in the file, the error has
+            ``place``: the keys that lead there.
+        MissingExtraError: what it needs is not installed.
+    """
+    setup = ToolSetup(folder=folder, calibration=_calibration(software, folder))
+    names = _names(software)
+    made: dict[int, list[ProgramStep]] = {}
+    programs: dict[int, Program] = {}
+    for number, entry in software.applications.items():
+        steps = _steps(number, software, names, setup, made, ())
+        try:
+            programs[number] = Program(
+                number, entry.name or str(number), steps, sequence=entry.sequence
+            )
+        except ConfigurationError as exc:
+            raise ProgramError(str(exc), ("applications", number)) from exc
+    return CellCamera(
+        name=check_text(name, "name", "make_camera"),
+        frames=software.frames_address(folder),
+        calibration=setup.calibration,
+        programs=programs,
+        rates={
+            number: entry.rate
+            for number, entry in software.applications.items()
+            if entry.rate is not None
+        },
+        keep=software.keep,
+        folder=folder,
+    )
+
+
+def _calibration(software: Software, folder: Path) -> AnyCalibration | None:
+    if software.calibration is None:
+        return None
+    from smartcam.calibration import load_calibration
+
+    try:
+        return load_calibration(folder / software.calibration)
+    except (SmartCamError, OSError) as exc:
+        raise ProgramError(str(exc), ("calibration",)) from exc
+
+
+def _names(software: Software) -> dict[str, int]:
+    """Return the numbers of the applications that have a name."""
+    names: dict[str, int] = {}
+    for number, entry in software.applications.items():
+        if not 0 <= number <= 0xFFFFFFFF:
+            raise ProgramError("expected a number from 0 to 4294967295", ("applications", number))
+        if entry.name and names.setdefault(entry.name, number) != number:
+            raise ProgramError(
+                f"the application {names[entry.name]} is called {entry.name!r}, too",
+                ("applications", number, "name"),
+            )
+    return names
+
+
+def _steps(
+    number: int,
+    software: Software,
+    names: Mapping[str, int],
+    setup: ToolSetup,
+    made: dict[int, list[ProgramStep]],
+    waiting: tuple[int, ...],
+) -> list[ProgramStep]:
+    """Return the steps of an application: before its own, those of applications that it follows."""
+    if number in made:
+        return made[number]
+    place = ("applications", number)
+    entry = software.applications[number]
+    if not 1 <= len(entry.tools) <= MAX_TOOLS:
+        raise ProgramError(
+            f"expected 1 to {MAX_TOOLS} tools, such as 'read:', got {len(entry.tools)}", place
+        )
+    steps: dict[str, ProgramStep] = {}
+    for key, given in entry.tools.items():
+        try:
+            step = make_step(key, given, setup, ApplicationEntry.model_fields)
+        except ProgramError as exc:
+            raise ProgramError(str(exc), (*place, *exc.place)) from exc
+        follow = step.tool.settings.follow
+        if follow is not None and follow not in steps:
+            where = (*place, key, "follow")
+            other = names.get(follow)
+            if other is None:
+                known = [*steps, *names]
+                raise ProgramError(
+                    f"no tool before this one and no application is called {follow!r:.60}"
+                    f"{did_you_mean(follow, known)}",
+                    where,
+                )
+            if other == number or other in waiting:
+                raise ProgramError("the applications follow each other in a circle", where)
+            followed = _steps(other, software, names, setup, made, (*waiting, number))
+            steps[follow] = ProgramStep(follow, FollowedApplication(followed, setup), own=False)
+        if step.name in steps:
+            raise ProgramError(
+                f"there is a tool {step.name!r} already: expected a name behind the tool's, such "
+                f"as '{key.split()[0]} left:'",
+                (*place, key),
+            )
+        steps[step.name] = step
+    made[number] = [*steps.values()]
+    return made[number]

@@ -1,0 +1,295 @@
+"""The tool `compare`: where a region differs from a taught picture."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from pydantic import Field
+
+from smartcam._extras import load
+from smartcam.exceptions import ConfigurationError
+from smartcam.inspection._finding import Drawing, Finding
+from smartcam.inspection._picture import Picture
+from smartcam.inspection._tool import Tool, ToolSettings
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.inspection._tool import ToolSetup, View
+
+MAX_AREA_PX: Final = 1_000_000_000
+"""Largest area that can be asked for, in pixels."""
+
+MAX_SHIFT_PX: Final = 50
+"""Largest distance of a part from its place, in pixels; the search takes the square of it."""
+
+MAX_DRAWN: Final = 100
+"""Differences that are drawn."""
+
+MAX_GAIN: Final = 2.0
+"""Largest factor by which the contrast may have risen or fallen."""
+
+MAX_TURN: Final = math.radians(3.0)
+"""Largest turn of the part in its place, in radians."""
+
+EDGE_TOLERANCE_PX: Final = 0.75
+"""Distance that an edge may be beside its taught place, in pixels."""
+
+MAX_ITERATIONS: Final = 30
+"""Steps of the alignment."""
+
+MIN_CORRELATION: Final = 0.5
+"""Correlation of taught and seen levels from which on they are the same thing in another light."""
+
+FIT_ROUNDS: Final = 4
+"""Fits of the light, each without the pixels that the last one did not explain."""
+
+LIGHT_PIXELS: Final = 50_000
+"""Pixels that the light is fitted to; of a larger region every nth."""
+
+SURROUNDINGS_PX: Final = 31
+"""Side of the square around a pixel that it has to differ from, in pixels."""
+
+OUTLIER_SIGMAS: Final = 2.5
+"""Deviation, in standard deviations, from which on a pixel is not explained by the light."""
+
+
+class CompareSettings(ToolSettings):
+    """The taught picture, and how much may differ from it."""
+
+    taught: str = Field(
+        min_length=1,
+        description="file with the taught picture, beside this one: a whole picture, or the region "
+        "alone",
+    )
+    level: int = Field(40, ge=1, le=255, description="grey levels from which on a pixel differs")
+    area: int = Field(
+        20,
+        ge=1,
+        le=MAX_AREA_PX,
+        description="pixels of a difference at least; smaller do not count",
+    )
+    allowed: int = Field(
+        0, ge=0, le=MAX_AREA_PX, description="pixels that may differ, all differences together"
+    )
+    shift: int = Field(
+        3, ge=0, le=MAX_SHIFT_PX, description="pixels that the part may lie beside its place"
+    )
+    light: bool = Field(True, description="allow for a change of the light: brightness, contrast")
+
+
+class Compare(Tool[CompareSettings]):
+    """The difference to a taught picture in a region."""
+
+    settings_model = CompareSettings
+
+    def __init__(self, settings: CompareSettings, setup: ToolSetup) -> None:
+        super().__init__(settings, setup)
+        region = settings.region
+        self._corner, self._size = (0.0, 0.0), (0, 0)
+        self._taught = Picture.read(setup.folder / settings.taught).grey
+        height, width = self._taught.shape
+        if region is not None:
+            (x1, y1), (x2, y2) = np.min(region, axis=0), np.max(region, axis=0)
+            if len(region) != 4 or {*region} != {(x1, y1), (x2, y1), (x2, y2), (x1, y2)}:
+                raise ConfigurationError("expected a region [x, y, width, height] to compare")
+            self._corner = float(x1), float(y1)
+            size = round(x2 - x1), round(y2 - y1)
+            if (width, height) != size:
+                left, top = round(x1), round(y1)
+                fits = left >= 0 and top >= 0 and left + size[0] <= width
+                if settings.follow is not None or not fits or top + size[1] > height:
+                    raise ConfigurationError(
+                        f"{settings.taught}: expected a picture of {size[0]} x {size[1]} pixels, "
+                        f"as the region is, got {width} x {height}"
+                    )
+                self._taught = self._taught[top : top + size[1], left : left + size[0]]
+        self._size = self._taught.shape[1], self._taught.shape[0]
+        if min(self._size) < 2 * settings.shift + 8:
+            raise ConfigurationError(
+                f"expected a region of {2 * settings.shift + 8} pixels or more along each side, "
+                f"for a shift of {settings.shift}; got {self._size[0]} x {self._size[1]}"
+            )
+
+    @property
+    def fields(self) -> str:
+        """Return the layout of how much differs, and by how much the part lies beside its place."""
+        return "differing: uint32, count: uint16, shift_x: real32 px, shift_y: real32 px"
+
+    def inspect(self, view: View) -> Finding:
+        """Return the number of pixels that differ, and their places."""
+        cv2 = load("cv2", "inspection needs")
+        if self.settings.region is None and view.picture.size != self._size:
+            return Finding(
+                ok=False,
+                reason=f"the picture has {view.picture.size[0]} x {view.picture.size[1]} pixels, "
+                f"the taught one {self._size[0]} x {self._size[1]}",
+            )
+        patch = self._patch(view)
+        motion = self._motion(patch)
+        size = self._size
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        seen = cv2.warpAffine(patch, motion, size, flags=how, borderMode=cv2.BORDER_REPLICATE)
+        there = cv2.warpAffine(np.full_like(patch, 255), motion, size, flags=how) == 255
+        taught, level = self._taught, float(self.settings.level)
+        hidden = np.zeros(there.shape, bool)
+        too_light = True
+        if self.settings.light:
+            gain, offset = _light(taught[there], seen[there])
+            lit = (gain * taught + offset).astype(np.float32)
+            taught = np.clip(np.rint(lit), 0, 255).astype(np.uint8)
+            level *= min(gain, 1.0)
+            hidden = _hidden(lit, level) & there
+            too_light = lit[hidden].mean() > 127 if hidden.any() else True
+        # what remains of a shift is no difference: at an edge it is as large as the edge is steep
+        steep = cv2.morphologyEx(taught, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
+        over = cv2.absdiff(taught, seen) - EDGE_TOLERANCE_PX * steep
+        differs = (over >= level) & there
+        kept, allowed = self._large(differs), self.settings.allowed
+        differing = int(kept[:, cv2.CC_STAT_AREA].sum())
+        unknown = int(self._large(hidden & ~differs)[:, cv2.CC_STAT_AREA].sum())
+        ok = differing + unknown <= allowed
+        reason = f"{differing} pixels differ, allowed {allowed}"
+        if differing <= allowed:
+            reason = (
+                f"{'over-exposed' if too_light else 'too dark'}: {unknown} pixels cannot be "
+                f"judged, {differing} differ, allowed {allowed}"
+            )
+        return Finding(
+            ok=ok,
+            reason="" if ok else reason,
+            values={
+                "differing": differing,
+                "count": min(len(kept), 0xFFFF),
+                **self._moved(motion),
+            },
+            drawings=[
+                Drawing(
+                    "polygon", tuple((float(x), float(y)) for x, y in view.region.corners), "region"
+                ),
+                *(self._drawn(one, motion, view) for one in kept[:MAX_DRAWN]),
+            ],
+        )
+
+    def _large(self, mask: NDArray[np.bool_]) -> NDArray[Any]:
+        """Return the statistics of the connected areas that are large enough to count."""
+        cv2 = load("cv2", "inspection needs")
+        _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+        large: NDArray[Any] = stats[1:][stats[1:, cv2.CC_STAT_AREA] >= self.settings.area]
+        return large
+
+    def _patch(self, view: View) -> NDArray[np.uint8]:
+        """Return the region upright, as large as the taught picture."""
+        width, height = self._size
+        if not view.follows:
+            x, y = (round(one) for one in self._corner)
+            return view.picture.grey[y : y + height, x : x + width]
+        cv2 = load("cv2", "inspection needs")
+        corners = self._to_picture(np.array([(0, 0), (1, 0), (0, 1)], float), view)
+        turn = np.column_stack([corners[1] - corners[0], corners[2] - corners[0], corners[0]])
+        how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        patch: NDArray[np.uint8] = cv2.warpAffine(
+            view.picture.grey, turn, (width, height), flags=how, borderMode=cv2.BORDER_REPLICATE
+        )
+        return patch
+
+    def _to_picture(self, points: NDArray[Any], view: View) -> NDArray[Any]:
+        """Return pixels of the region, upright, in the picture."""
+        if not view.follows:
+            return points + np.rint(self._corner)
+        return view.reference.to_picture(points + self._corner + 0.5)
+
+    def _motion(self, patch: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the small motion of the part from the taught picture to this one, (2, 3)."""
+        shift = self.settings.shift
+        motion = np.eye(2, 3, dtype=np.float32)
+        cv2 = load("cv2", "inspection needs")
+        inner = self._taught[shift : self._size[1] - shift, shift : self._size[0] - shift]
+        if shift == 0 or inner.std() < 1.0:  # nothing that could be matched
+            return motion
+        score = np.nan_to_num(cv2.matchTemplate(patch, inner, cv2.TM_CCOEFF_NORMED), nan=-1.0)
+        row, column = np.unravel_index(int(score.argmax()), score.shape)
+        if score[row, column] < MIN_CORRELATION:
+            return motion
+        motion[:, 2] = column - shift, row - shift
+        end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, MAX_ITERATIONS, 1e-4)
+        fine = motion.copy()
+        try:
+            cv2.findTransformECC(self._taught, patch, fine, cv2.MOTION_EUCLIDEAN, end, None, 5)
+        except cv2.error:  # it did not converge
+            return motion
+        turn = abs(math.atan2(fine[1, 0], fine[0, 0]))
+        middle = np.array(self._size) / 2
+        moved = np.abs(fine[:, :2] @ middle + fine[:, 2] - middle)
+        good = np.isfinite(fine).all() and turn <= MAX_TURN and (moved <= shift + 0.5).all()
+        return fine if good else motion
+
+    def _moved(self, motion: NDArray[np.float32]) -> dict[str, float]:
+        """Return by how much the middle of the region moved."""
+        middle = (np.array(self._size) - 1) / 2
+        x, y = motion[:, :2] @ middle + motion[:, 2] - middle
+        return {"shift_x": float(x), "shift_y": float(y)}
+
+    def _drawn(self, stats: NDArray[Any], motion: NDArray[np.float32], view: View) -> Drawing:
+        left, top, width, height, area = map(int, stats)
+        x, y = left - 0.5, top - 0.5
+        box = np.array([(x, y), (x + width, y), (x + width, y + height), (x, y + height)])
+        places = self._to_picture(box @ motion[:, :2].T + motion[:, 2], view)
+        return Drawing(
+            "polygon", tuple((float(a), float(b)) for a, b in places), "wrong", f"{area}"
+        )
+
+
+def _hidden(lit: NDArray[np.float32], level: float) -> NDArray[np.bool_]:
+    """Return a mask of the pixels whose difference to their surroundings is cut off.
+
+    Args:
+        lit: taught levels in the light that is there, (H, W), also below 0 and above 255.
+        level: grey levels from which on a pixel differs.
+    """
+    if lit.min() >= 0 and lit.max() <= 255:
+        return np.zeros(lit.shape, bool)
+    cv2 = load("cv2", "inspection needs")
+
+    def differs(levels: NDArray[np.float32]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        steep = cv2.morphologyEx(levels, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) / 2.0
+        least = level + EDGE_TOLERANCE_PX * steep
+        around = np.ones((SURROUNDINGS_PX, SURROUNDINGS_PX), np.uint8)
+        return (
+            cv2.dilate(levels, around) - levels >= least,
+            levels - cv2.erode(levels, around) >= least,
+        )
+
+    shown = np.clip(lit, 0, 255)
+    (darker, lighter), (seen_darker, seen_lighter) = differs(lit), differs(shown)
+    # beside an edge that can be seen, a pixel is between the levels of its two sides
+    edge = cv2.morphologyEx(shown, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8))
+    plain = edge * (1 - EDGE_TOLERANCE_PX / 2) < level
+    mask: NDArray[np.bool_] = ((darker & ~seen_darker) | (lighter & ~seen_lighter)) & plain
+    return mask
+
+
+def _light(taught: NDArray[np.uint8], seen: NDArray[np.uint8]) -> tuple[float, float]:
+    """Return the gain and the offset that the light has beside the taught one.
+
+    It is the taught light where what is seen is not like what was taught: nothing at all would
+    otherwise look like a thing in bad light.
+    """
+    step = max(taught.size // LIGHT_PIXELS, 1) | 1  # an odd one takes all columns
+    x, y = (one.ravel()[::step].astype(np.float64) for one in (taught, seen))
+    kept = np.ones(x.shape, bool)
+    gain, offset = 1.0, 0.0
+    for _ in range(FIT_ROUNDS):
+        a, b = x[kept], y[kept]
+        da, db = a - a.mean(), b - b.mean()
+        both, one, other = float(da @ db), float(da @ da), float(db @ db)
+        alike = both > MIN_CORRELATION * math.sqrt(one * other) and one > len(a)
+        if not alike:
+            return 1.0, 0.0
+        gain = min(max(both / one, 1 / MAX_GAIN), MAX_GAIN)
+        offset = float(np.median(b - gain * a))
+        rest = np.abs(y - gain * x - offset)
+        kept = rest <= max(OUTLIER_SIGMAS * 1.4826 * float(np.median(rest)), 3.0)
+    return gain, offset

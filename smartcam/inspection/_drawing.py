@@ -1,0 +1,70 @@
+"""Draw what the tools of a program saw into their picture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam._extras import load
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.inspection._finding import Drawing, Inspection
+
+COLOURS: Final = {
+    "found": (46, 204, 64),
+    "wrong": (255, 65, 54),
+    "region": (0, 116, 217),
+    "hint": (255, 220, 0),
+}
+"""Red, green and blue of each role."""
+
+_SHIFT: Final = 4  # OpenCV draws at sixteenths of a pixel
+
+
+def draw(inspection: Inspection) -> NDArray[Any]:
+    """Return an inspection's picture with the marks of its tools, (H, W, 3), uint8, red first."""
+    canvas = inspection.picture.rgb.copy()
+    thick = max(1, round(max(canvas.shape) / 800))
+    for found in inspection.findings.values():
+        for mark in found.drawings:
+            _draw(canvas, mark, thick)
+    verdict = "ok" if inspection.ok else f"not ok: {inspection.reason}"
+    colour = COLOURS["found" if inspection.ok else "wrong"]
+    _write(canvas, f"{inspection.name}: {verdict}", (4, 18 * thick), colour, thick)
+    return canvas
+
+
+def _draw(canvas: NDArray[Any], mark: Drawing, thick: int) -> None:
+    cv2 = load("cv2", "inspection needs")
+    colour = COLOURS[mark.role]
+    if not mark.points or not np.isfinite(mark.points).all():
+        return
+    limit = 4.0 * max(canvas.shape)  # OpenCV's coordinates are integers of 32 bits
+    places = np.clip(np.asarray(mark.points, np.float64), -limit, limit)
+    fixed = np.rint(places * (1 << _SHIFT)).astype(np.int32)
+    if mark.kind in ("line", "polygon"):
+        closed = mark.kind == "polygon"
+        cv2.polylines(canvas, [fixed], closed, colour, thick, cv2.LINE_AA, _SHIFT)
+    elif mark.kind == "points":
+        for x, y in fixed:
+            cv2.circle(canvas, (int(x), int(y)), 3 * thick << _SHIFT, colour, thick, 16, _SHIFT)
+    if mark.text:
+        x, y = places[0]
+        _write(canvas, mark.text, (int(x) + 4 * thick, int(y) - 4 * thick), colour, thick)
+
+
+def _write(
+    canvas: NDArray[Any],
+    text: str,
+    place: tuple[int, int],
+    colour: tuple[int, int, int],
+    thick: int,
+) -> None:
+    cv2 = load("cv2", "inspection needs")
+    plain = text[:120].encode("ascii", "replace").decode()
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.5 * thick
+    cv2.putText(canvas, plain, place, font, size, (0, 0, 0), thick + 2, cv2.LINE_AA)
+    cv2.putText(canvas, plain, place, font, size, colour, thick, cv2.LINE_AA)

@@ -1,0 +1,33 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.inspection._camera.judged_frames import judged_source
+    from smartcam.inspection._teaching import (
+        learned,
+        read_settings,
+        setting_text,
+        tool_settings,
+    )
+
+__all__ = [
+    "judged_source",
+    "learned",
+    "read_settings",
+    "setting_text",
+    "tool_settings",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_camera.judged_frames": "judged_source",
+            "_teaching": "learned read_settings setting_text tool_settings",
+        },
+    )

@@ -1,0 +1,640 @@
+"""Find edges in strips, to a fraction of a pixel and with a standard deviation.
+
+The derivative of a Gaussian along the profile of a strip says where edges are; a fit of blurred
+steps to the strip's pixels says where exactly. Pixels are not interpolated for it, so their noise
+stays independent.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.inspection._measure.steps import StepFits, fit_steps
+from smartcam.inspection._measure.strips import (
+    Sectors,
+    StripPixels,
+    Strips,
+    cut,
+    inside,
+    profiles,
+    steps_of,
+)
+from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+Polarity: TypeAlias = Literal["any", "rising", "falling"]
+"""``rising``: from dark to light along the strip; ``falling``: from light to dark."""
+
+Choice: TypeAlias = Literal["single", "first", "last", "strongest", "nearest"]
+"""The edge that counts, of several. ``single``: there must not be several; ``nearest``: to the
+middle of the strip."""
+
+PairChoice: TypeAlias = Literal["single", "first", "last", "strongest", "outermost"]
+"""The pair of edges that counts, of several. ``single``: there must be two edges, no more."""
+
+PIXEL_VARIANCE: Final = 1 / 12
+"""Variance of a place in a pixel of width 1, which adds to the blur's, pixels^2."""
+
+SIGNIFICANCE = 6.0
+"""Standard deviations of the noise that an edge stands out from it at least."""
+
+MIN_PART = 0.2
+"""Height of the weakest edge of a strip in parts of the strongest one; weaker ones are none."""
+
+MAX_SAMPLES = 8_000_000
+"""Pixels in all strips of a search together at most."""
+
+MAX_WIDTH_PX = 250.0
+"""Pixels that a strip may be wide."""
+
+MAX_EDGES = 12
+"""Edges of a strip that are fitted at most, the strongest ones."""
+
+MAX_TOGETHER = 4
+"""Edges that are fitted together at most, where they are so near that their blurs overlap."""
+
+NEAR_PX = 8.0
+"""Pixels between two edges below which they are fitted together."""
+
+BLURS_APART = 7.0
+"""Blurs between two edges below which they are fitted together."""
+
+BLURS_BESIDE = 1.5
+"""Blurs that must be visible at each side of an edge; the fit gets its levels from there."""
+
+BLURS_REACH, REACH_PX = 4.0, 8.0
+"""Blurs and pixels to each side of an edge whose pixels are fitted. The place of an edge is known
+as well as the levels beside it: with 3 pixels its sigma is 8 % larger than with 15, with 8 it is
+2 % larger; far away the levels may be others."""
+
+FIRST_REACH_PX = 12.0
+"""Pixels to each side of an edge that are fitted while the blur is not known."""
+
+MAX_SIGMA_PX = 0.5
+"""Pixels of standard deviation up to which an edge is one."""
+
+MAX_MISFIT = 0.15
+"""Rms of the residuals in parts of an edge's height up to which the picture shows a step."""
+
+MISFIT_NOISES = 3.0
+"""Rms of the residuals in parts of the picture's noise below which it is always a step."""
+
+MISFIT_SEEN = 1.3
+"""Rms of the residuals in parts of the picture's noise from which on they show that the edge is not
+quite a blurred step, as a lens, sharpening or compression make it."""
+
+MAX_CUT_OFF = 0.03
+"""Part of an edge's pixels that may be black or white to the limit: more of them move the edge by
+more than a tenth of its standard deviation (simulated)."""
+
+LEAST_NOISE = 0.5
+"""Grey steps of noise from which on pixels of one level differ, unless it is cut off."""
+
+NOISE_KEPT = 0.5
+"""Part of the dark side's noise that the bright side has at least: a tone curve takes some."""
+
+CHANCE = 1e-4
+"""Probability that noise leaves so many pixels at the largest level and none above it, below which
+that level is where the picture is cut off."""
+
+ROUNDING: Final = math.sqrt(1 / 12)
+"""Standard deviation of a rounded grey level: the least noise of a picture."""
+
+FINE_SAMPLE = 1 << 16
+"""Pixels from which a picture's noise is estimated at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeSettings:
+    """Settings of the search for edges.
+
+    Attributes:
+        polarity: kind of step that is looked for.
+        smoothing: standard deviation of the Gaussian whose derivative finds edges, pixels.
+        contrast: grey levels from one side of an edge to the other one at least.
+        most_blur: pixels of blur that an edge may have.
+        white: largest grey level that the picture can have.
+        cut_off: whether edges beside levels that are cut off at black or white count.
+        clipped: mask (H, W) of other pixels that are cut off, as of one colour; None: of none.
+    """
+
+    polarity: Polarity = "any"
+    smoothing: float = 1.2
+    contrast: float = 10.0
+    most_blur: float = 5.0
+    white: float = 255.0
+    cut_off: bool = False
+    clipped: NDArray[np.bool_] | None = field(default=None, repr=False, compare=False)
+
+
+class Edge(NamedTuple):
+    """One edge in a strip."""
+
+    place: float  # along the strip, from its middle, pixels
+    # (K + 1, K + 1), for noise of one grey level: of the places of the K edges that were fitted
+    # together, and of their tilt; K edges share one array
+    unit_covariance: Array
+    number: int  # of the edge among these, from 0
+    noise: float  # standard deviation of the pixels about the fit, grey levels
+    height: float  # grey levels from before to behind it; negative from light to dark
+    blur: float  # standard deviation of the lens' blur, pixels
+    tilt: float  # tangent of the angle out of the strip
+    misfit: float  # pixels by which the place may be wrong, as the edge is no blurred step
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the place, pixels."""
+        return self.noise * self.unit_sigma
+
+    @property
+    def unit_sigma(self) -> float:
+        """Standard deviation of the place for noise of one grey level, pixels."""
+        return math.sqrt(float(self.unit_covariance[self.number, self.number]))
+
+
+class JudgedEdge(NamedTuple):
+    """An edge, and the reason why its place cannot be told, or None."""
+
+    edge: Edge
+    trouble: NotMeasuredError | None
+
+
+class StripEdges(NamedTuple):
+    """The edges of one strip that are looked for, in their order; or the reason for none."""
+
+    edges: tuple[JudgedEdge, ...]
+    trouble: NotMeasuredError | None = None
+    too_many: NotMeasuredError | None = None  # there are more, weaker ones that were not fitted
+
+
+def noise_of(image: NDArray[np.generic]) -> float:
+    """Return the standard deviation of the noise of a picture's pixels (H, W), grey levels.
+
+    Where the picture has edges, most of the second differences along both axes, of which this is
+    the median, see none.
+    """
+    height, width = image.shape
+    if height < 3 or width < 3:
+        return ROUNDING
+    step = max(1, math.ceil(height * width / FINE_SAMPLE))
+    rows = image if step == 1 else np.concatenate([image[i : i + 3] for i in _blocks(height, step)])
+    levels = rows.astype(np.float64)
+    twice = levels[:-2] - 2 * levels[1:-1] + levels[2:]
+    if step > 1:  # where two blocks meet there are no neighbours
+        twice = twice[::3]
+    cross = twice[:, :-2] - 2 * twice[:, 1:-1] + twice[:, 2:]
+    # the coefficients' squares add up to 36, and the median of a normal magnitude is 0.6745 sigma
+    return max(float(np.median(np.abs(cross))) / (6 * 0.6745), ROUNDING)
+
+
+def _blocks(height: int, step: int) -> range:
+    return range(0, height - 2, 3 * step)
+
+
+def find_edges(
+    image: NDArray[np.generic],
+    strips: Strips | Sectors,
+    settings: EdgeSettings,
+    *,
+    tilted: bool = False,
+) -> list[StripEdges]:
+    """Return all edges of each strip whose contrast is enough, of the wanted polarity.
+
+    ``image`` (H, W), grey levels. ``tilted``: whether edges may be turned out of their strips;
+    those of lines and circles cross their strips at right angles.
+    """
+    number = len(strips.middles)
+    fits = inside(image, strips)
+    found = [
+        StripEdges(
+            (), NotMeasuredError(NoValueReason.OUTSIDE, "a part of it is outside of the picture")
+        )
+        for _ in range(number)
+    ]
+    there = np.flatnonzero(fits)
+    if not len(there):
+        return found
+    part = strips.some(there)
+    samples = len(there) * steps_of(strips.length) * steps_of(strips.width)
+    if samples > MAX_SAMPLES or strips.width > MAX_WIDTH_PX:
+        text = (
+            f"{samples} pixels in strips {strips.width:.0f} wide, {MAX_SAMPLES} and "
+            f"{MAX_WIDTH_PX:g} can be measured"
+        )
+        return [
+            StripEdges((), NotMeasuredError(NoValueReason.TOO_LARGE, text)) for _ in range(number)
+        ]
+    noise = noise_of(_around(image, part))
+    candidates, counts = _candidates(profiles(image, part), part, settings, noise)
+    steps = _steps(image, part, candidates, settings, noise, tilted=tilted)
+    for index, owner in enumerate(there.tolist()):
+        mine = [one for one in steps if one.owner == index]
+        crowded = sum(map(len, candidates[index : index + 1])) > len(mine)
+        found[owner] = _of_strip(mine, settings, noise, crowded=crowded, count=counts[index])
+    return found
+
+
+def _of_strip(
+    steps: list[_FittedStep], settings: EdgeSettings, noise: float, *, crowded: bool, count: int
+) -> StripEdges:
+    """Return the edges of a strip with a count of possible edges, of which not all were fitted."""
+    if crowded:
+        text = f"more than {MAX_TOGETHER} edges that are too near to each other to be told apart"
+        return StripEdges((), NotMeasuredError(NoValueReason.NO_STEP, text))
+    there = [one for one in steps if wanted(one.edge, settings) or not one.settled]
+    too_many = None
+    # where one of the strongest has too little contrast already, none is left out
+    if count > MAX_EDGES and all(abs(one.edge.height) >= settings.contrast for one in steps):
+        text = f"{count} edges in one strip, {MAX_EDGES} at most are told apart"
+        too_many = NotMeasuredError(NoValueReason.TWO_EDGES, text)
+    if not there and too_many is not None:
+        return StripEdges((), too_many)
+    if not there:
+        kind = {"any": "", "rising": " from dark to light", "falling": " from light to dark"}
+        text = f"no edge{kind[settings.polarity]} of {settings.contrast:g} grey levels"
+        return StripEdges((), NotMeasuredError(NoValueReason.NO_EDGE, text))
+    edges = tuple(JudgedEdge(one.edge, _trouble(one, settings, noise)) for one in there)
+    return StripEdges(edges, too_many=too_many)
+
+
+def _around(image: NDArray[np.generic], strips: Strips | Sectors) -> NDArray[np.generic]:
+    """Return the part of the picture in which strips lie."""
+    reach = math.hypot(strips.length, strips.width) / 2 + 1
+    low = np.floor(strips.middles.min(axis=0) - reach).astype(int).clip(0)
+    high = np.ceil(strips.middles.max(axis=0) + reach).astype(int)
+    return image[low[1] : high[1] + 1, low[0] : high[0] + 1]
+
+
+def _candidates(
+    levels: Array, strips: Strips | Sectors, settings: EdgeSettings, noise: float
+) -> tuple[list[Array], list[int]]:
+    """Return the places of possible edges in each strip, ascending, by profiles (N, T).
+
+    They are the strongest ones; the second list has the number of all in each strip.
+    """
+    smooth = settings.smoothing
+    slopes = _slopes(levels, smooth)
+    # The noise of a mean over the width, behind a derivative of a Gaussian: the integral of its
+    # square is 1 / (4 sqrt(pi) smooth^3).
+    of_mean = noise / math.sqrt(max(strips.width, 1.0))
+    floor = of_mean / math.sqrt(4 * math.sqrt(math.pi) * smooth**3)
+    middle = (levels.shape[1] - 1) / 2
+    found, counts = [], []
+    for row in slopes:
+        least = max(SIGNIFICANCE * floor, 0.5 * MIN_PART * float(np.abs(row).max()))
+        peaks = [(at, side) for side in (row, -row) for at in _peaks(side, least)]
+        strongest = sorted(peaks, key=lambda one: -one[1][one[0]])[:MAX_EDGES]
+        found.append(np.array(sorted(_peak(side, at) - middle for at, side in strongest)))
+        counts.append(len(peaks))
+    return found, counts
+
+
+def _slopes(levels: Array, smooth: float) -> Array:
+    """Return profiles (N, T) behind the derivative of a Gaussian; they go on as they end."""
+    reach = math.ceil(4 * smooth)
+    at = np.arange(-reach, reach + 1, dtype=np.float64)
+    kernel: Array = at * np.exp(-(at**2) / (2 * smooth**2))
+    kernel = kernel / float((kernel * at).sum())  # a ramp of 1 has the slope 1
+    padded = np.pad(levels, ((0, 0), (reach, reach)), mode="edge")
+    slopes: Array = np.lib.stride_tricks.sliding_window_view(padded, len(at), axis=1) @ kernel
+    return slopes
+
+
+def _peaks(slopes: Array, least: float) -> list[int]:
+    """Return the places of peaks (T,) of a height, each half of that above what is around it."""
+    after, before = np.append(slopes[1:], -np.inf), np.insert(slopes[:-1], 0, -np.inf)
+    found = []
+    for at in np.flatnonzero((slopes > before) & (slopes >= after) & (slopes >= least)).tolist():
+        higher = np.flatnonzero(slopes > slopes[at])
+        left = higher[higher < at].max(initial=-1)
+        right = higher[higher > at].min(initial=len(slopes))
+        # a peak is as prominent as it stands above the higher one of the valleys to both sides
+        # that are between it and higher ones; the end of the strip is no valley
+        valleys = [slopes[left + 1 : at + 1].min()] if left >= 0 else []
+        valleys += [slopes[at:right].min()] if right < len(slopes) else []
+        if not valleys or slopes[at] - max(valleys) >= least / 2:
+            found.append(at)
+    return found
+
+
+def _peak(slopes: Array, at: int) -> float:
+    """Return the top of a parabola through a peak and its neighbours."""
+    if not 0 < at < len(slopes) - 1:
+        return float(at)
+    before, top, after = slopes[at - 1 : at + 2]
+    bend = before - 2 * top + after
+    return at if bend >= 0 else at + 0.5 * float(before - after) / float(bend)
+
+
+class _EdgeGroup(NamedTuple):
+    """Edges of one strip that are fitted together."""
+
+    owner: int  # the strip
+    places: tuple[float, ...]
+    low: float  # the pixels from here on, along the strip
+    high: float  # up to here
+
+
+class _FittedStep(NamedTuple):
+    """A fitted step, before anything is asked about it."""
+
+    owner: int  # the strip
+    edge: Edge
+    beside: float  # pixels of the strip that are visible beside it at the shorter side
+    misfit: float  # rms of the residuals, grey levels
+    cut_off: tuple[float, float]  # part of the pixels that is black, and white, to the limit
+    settled: bool
+
+
+def _groups(candidates: list[Array], half: float, near: Array, reach: Array) -> list[_EdgeGroup]:
+    """Return the groups of edges; ``near`` and ``reach`` (N,), pixels, of each strip."""
+    found = []
+    for owner, places in enumerate(candidates):
+        if not len(places):
+            continue
+        parts = np.split(places, np.flatnonzero(np.diff(places) >= near[owner]) + 1)
+        between = [float(a[-1] + b[0]) / 2 for a, b in itertools.pairwise(parts)]
+        for part, before, after in zip(parts, [-half, *between], [*between, half], strict=True):
+            low = max(float(part[0] - reach[owner]), before)
+            high = min(float(part[-1] + reach[owner]), after)
+            found.append(_EdgeGroup(owner, tuple(part.tolist()), low, high))
+    return found
+
+
+def _steps(
+    image: NDArray[np.generic],
+    strips: Strips | Sectors,
+    candidates: list[Array],
+    settings: EdgeSettings,
+    noise: float,
+    *,
+    tilted: bool,
+) -> list[_FittedStep]:
+    """Return the steps: fitted once to find the blur, and once to the pixels that it asks for."""
+    number, half = len(candidates), strips.length / 2
+    near, reach = np.full(number, NEAR_PX), np.full(number, FIRST_REACH_PX)
+    blurs = np.ones(number)
+    groups = _groups(candidates, half, near, reach)
+    for one in _fit_groups(image, strips, groups, settings, noise, tilted=tilted):
+        if one.settled:
+            seen = _seen_blur(min(one.edge.blur, settings.most_blur))
+            near[one.owner] = max(near[one.owner], BLURS_APART * seen)
+            reach[one.owner] = BLURS_REACH * seen + REACH_PX
+            blurs[one.owner] = one.edge.blur
+    groups = _groups(candidates, half, near, reach)
+    return _fit_groups(image, strips, groups, settings, noise, tilted=tilted, blurs=blurs)
+
+
+def _seen_blur(blur: float) -> float:
+    """Return the standard deviation of an edge's slope: the lens' blur, and the pixels' area."""
+    return math.sqrt(blur * blur + PIXEL_VARIANCE)
+
+
+def _fit_groups(
+    image: NDArray[np.generic],
+    strips: Strips | Sectors,
+    groups: list[_EdgeGroup],
+    settings: EdgeSettings,
+    noise: float,
+    *,
+    tilted: bool,
+    blurs: Array | None = None,
+) -> list[_FittedStep]:
+    """Return the fitted steps of all groups; ``blurs`` (N,) of the strips, or None: not known."""
+    found = []
+    for count in sorted({len(one.places) for one in groups}):
+        some = [one for one in groups if len(one.places) == count]
+        owners = np.array([one.owner for one in some])
+        low, high = (np.array([one[end] for one in some]) for end in (2, 3))
+        pixels = cut(image, strips.some(owners), low, high)
+        if count > MAX_TOGETHER:
+            continue
+        places = np.array([one.places for one in some])
+        known = None if blurs is None else blurs[owners]
+        fits = fit_steps(pixels, places, tilted=tilted, blurs=known)
+        cut_off = np.zeros((len(some), 2))
+        if blurs is not None and not settings.cut_off:
+            cut_off = _cut_off(pixels, settings)
+            if settings.clipped is not None:
+                masks = cut(settings.clipped, strips.some(owners), low, high)
+                cut_off[:, 1] = np.maximum(cut_off[:, 1], _part(masks.levels > 0, pixels))
+            cut_off[:, 1] = np.maximum(cut_off[:, 1], _plateaus(pixels, fits))
+        found += _steps_of(some, fits, pixels, cut_off, strips.length / 2, noise)
+    return sorted(found, key=lambda one: (one.owner, one.edge.place))
+
+
+def _steps_of(
+    groups: list[_EdgeGroup],
+    fits: StepFits,
+    pixels: StripPixels,
+    cut_off: Array,
+    half: float,
+    noise: float,
+) -> list[_FittedStep]:
+    counts = np.maximum(pixels.counts, 1.0)
+    noises = np.maximum(np.sqrt(fits.variance), ROUNDING)
+    covariance = fits.unit_covariance()[:, : fits.steps + 1, : fits.steps + 1]
+    found = []
+    for i, group in enumerate(groups):
+        shared = covariance[i]
+        for k, place in enumerate(fits.places[i].tolist()):
+            edge = Edge(
+                place,
+                shared,
+                k,
+                float(noises[i]),
+                float(fits.heights[i, k]),
+                float(fits.blurs[i]),
+                float(fits.tilts[i]),
+                0.0,
+            )
+            edge = edge._replace(misfit=_misfit(edge, noise))
+            found.append(
+                _FittedStep(
+                    group.owner,
+                    edge,
+                    half - abs(place),
+                    math.sqrt(float(fits.cost[i] / counts[i])),
+                    (float(cut_off[i, 0]), float(cut_off[i, 1])),
+                    bool(fits.settled[i]) and group.low <= place <= group.high,
+                )
+            )
+    return found
+
+
+def _part(mask: NDArray[np.bool_], pixels: StripPixels) -> Array:
+    """Return the part (N,) of each strip's pixels that a mask (N, P) has."""
+    part: Array = (mask * pixels.weights).sum(axis=1) / np.maximum(pixels.counts, 1.0)
+    return part
+
+
+def _cut_off(pixels: StripPixels, settings: EdgeSettings) -> Array:
+    """Return the parts (N, 2) of the pixels that are black, and white, to the limit."""
+    black, white = pixels.levels <= 0, pixels.levels >= settings.white
+    return np.column_stack([_part(black, pixels), _part(white, pixels)])
+
+
+def _plateaus(pixels: StripPixels, fits: StepFits) -> Array:
+    """Return the part (N,) of the pixels at the largest level, where that cuts others off; else 0.
+
+    White may be less than the pixels' type can say. There is no such test of black: a camera's
+    dark pixels may well be equal, as there is no light whose noise they could have.
+    """
+    levels = np.where(pixels.weights > 0, pixels.levels, -np.inf)
+    parts = _part(levels == levels.max(axis=1, keepdims=True), pixels)
+    for i in np.flatnonzero(parts > MAX_CUT_OFF).tolist():
+        if not _is_plateau(pixels.some(np.array([i])), fits, i):
+            parts[i] = 0.0
+    return np.where(parts > MAX_CUT_OFF, parts, 0.0)
+
+
+def _is_plateau(pixels: StripPixels, fits: StepFits, strip: int) -> bool:
+    """Return True if noise as that of the darkest level does not explain how the brightest ends."""
+    there = pixels.weights[0] > 0
+    levels, beside = pixels.levels[0][there], pixels.beside[0][there]
+    along = pixels.along[0][there] - float(fits.tilts[strip]) * beside
+    order = np.argsort(fits.places[strip])
+    places = fits.places[strip][order]
+    heights = np.cumsum([0.0, *fits.heights[strip][order]])
+    apart = 2 * _seen_blur(float(fits.blurs[strip])) + 0.5
+    flat = np.abs(along[:, None] - places).min(axis=1) > apart
+    level = np.searchsorted(places, along)
+    dark, bright = (flat & (level == one) for one in (heights.argmin(), heights.argmax()))
+    noise = NOISE_KEPT * _noise_in_steps(levels[dark], along[dark], beside[dark])
+    values, counts = np.unique(levels[bright], return_counts=True)
+    if noise < NOISE_KEPT * LEAST_NOISE or not len(values):
+        return False
+    most = int(counts[-1])
+    if values[-1] < levels.max() or most < counts.max():  # it would be the commonest, too
+        return False
+    # Were the level's noise normal, its mean would be where the part of the pixels from the largest
+    # value on says, or in the middle of that value if these are nearly all.
+    special = load("scipy.special")
+    part = min(most / len(levels[bright]), float(special.ndtr(0.5 / noise)))
+    above = float(special.ndtr(special.ndtri(part) - 1 / noise)) / part
+    return most * math.log1p(-above) < math.log(CHANCE)
+
+
+def _noise_in_steps(levels: Array, along: Array, beside: Array) -> float:
+    """Return the standard deviation of pixels about a plane, without that of rounding, in steps.
+
+    A step is the least difference of two levels: those of 12 bits in 16 are 16 apart.
+    """
+    values = np.unique(levels)
+    if len(values) < 2 or len(levels) < 8:
+        return 0.0
+    plane = np.column_stack([np.ones(len(levels)), along, beside])
+    off = levels - plane @ np.linalg.lstsq(plane, levels, rcond=None)[0]
+    twice = np.diff(off, 2)  # of neighbours mostly: what JPEG leaves is no noise from each to each
+    variance = min(float(off @ off) / (len(levels) - 3), float(twice @ twice) / (6 * len(twice)))
+    return math.sqrt(max(variance / float(np.diff(values).min()) ** 2 - ROUNDING**2, 0.0))
+
+
+def _misfit(edge: Edge, noise: float) -> float:
+    """Return the residuals beyond the noise in pixels, where the edge is steepest."""
+    beyond = edge.noise**2 - noise**2
+    steepest = abs(edge.height) / (math.sqrt(2 * math.pi) * _seen_blur(edge.blur))
+    if edge.noise < MISFIT_SEEN * noise or steepest == 0.0:
+        return 0.0
+    return math.sqrt(beyond) / steepest
+
+
+def _trouble(step: _FittedStep, settings: EdgeSettings, noise: float) -> NotMeasuredError | None:
+    """Return the reason why a step is no edge whose place can be told, or None."""
+    edge, (black, bright) = step.edge, step.cut_off
+    height = abs(edge.height)
+    if step.settled and edge.blur > settings.most_blur:
+        text = f"the edge is blurred by {edge.blur:.1f} px, {settings.most_blur:g} px are allowed"
+        return NotMeasuredError(NoValueReason.BLURRED, text)
+    if step.beside < BLURS_BESIDE * _seen_blur(min(edge.blur, settings.most_blur)) + 0.5:
+        text = f"the edge is {max(step.beside, 0.0):.1f} px from the end of its region"
+        return NotMeasuredError(NoValueReason.AT_BORDER, text)
+    if not step.settled:
+        return NotMeasuredError(NoValueReason.NO_STEP, "the grey levels are none of a blurred step")
+    if max(black, bright) > MAX_CUT_OFF and not settings.cut_off:
+        end, part = ("black", black) if black > bright else ("white", bright)
+        text = f"{100 * part:.0f} % of the pixels beside the edge are {end} to the limit"
+        return NotMeasuredError(NoValueReason.SATURATED, text)
+    if step.misfit > MISFIT_NOISES * noise and step.misfit > MAX_MISFIT * height:
+        text = f"the grey levels are {step.misfit:.1f} from a step of {height:.0f}"
+        return NotMeasuredError(NoValueReason.NO_STEP, text)
+    if edge.sigma > min(MAX_SIGMA_PX, 0.5 * _seen_blur(edge.blur)):
+        text = f"noise leaves the edge open by {edge.sigma:.2f} px (one standard deviation)"
+        return NotMeasuredError(NoValueReason.NOISY, text)
+    return None
+
+
+def wanted(edge: Edge, settings: EdgeSettings) -> bool:
+    """Return True if an edge has the contrast and the polarity that are looked for."""
+    rises = settings.polarity == "any" or (edge.height > 0) == (settings.polarity == "rising")
+    return rises and abs(edge.height) >= settings.contrast
+
+
+def choose(found: StripEdges, which: Choice) -> Edge:
+    """Return the edge that counts; NotMeasuredError: there is none, or no telling which."""
+    if found.trouble is not None:
+        raise found.trouble
+    if found.too_many is not None and which != "strongest":
+        raise found.too_many
+    edges = found.edges
+    if which == "single" and len(edges) > 1:
+        raise _several(edges, "one was")
+    if which == "strongest":
+        return sound(max(edges, key=lambda one: abs(one.edge.height)))
+    if which == "nearest":
+        return sound(min(edges, key=lambda one: abs(one.edge.place)))
+    return sound(edges[-1 if which == "last" else 0])
+
+
+def choose_pair(found: StripEdges, which: PairChoice) -> tuple[Edge, Edge]:
+    """Return the two edges of a bar; NotMeasuredError: there is none, or no telling which."""
+    if found.trouble is not None:
+        raise found.trouble
+    if found.too_many is not None:
+        raise found.too_many
+    edges = found.edges
+    if len(edges) < 2:
+        place = found.edges[0].edge.place
+        text = f"only one edge where two were expected, {place:.1f} px from the middle"
+        raise NotMeasuredError(NoValueReason.NO_EDGE, text)
+    if which == "outermost":
+        return sound(edges[0]), sound(edges[-1])
+    if which == "single" and len(edges) > 2:
+        raise _several(edges, "two were")
+    pairs = [
+        (one, other)
+        for one, other in itertools.pairwise(edges)
+        if one.edge.height * other.edge.height < 0
+    ]
+    if not pairs:
+        text = (
+            "no two edges of which one is from dark to light and the other one from light to dark"
+        )
+        raise NotMeasuredError(NoValueReason.NO_EDGE, text)
+    pair = pairs[-1 if which == "last" else 0]
+    if which == "strongest":
+        pair = max(pairs, key=lambda two: min(abs(one.edge.height) for one in two))
+    return sound(pair[0]), sound(pair[1])
+
+
+def sound(found: JudgedEdge) -> Edge:
+    """Return an edge whose place can be told; NotMeasuredError: the reason why not."""
+    if found.trouble is not None:
+        raise found.trouble
+    return found.edge
+
+
+def _several(edges: tuple[JudgedEdge, ...], expected: str) -> NotMeasuredError:
+    places = ", ".join(f"{one.edge.place:.1f}" for one in edges[:4])
+    text = f"{len(edges)} edges where {expected} expected, {places} px from the region's middle"
+    return NotMeasuredError(NoValueReason.TWO_EDGES, text)

@@ -1,0 +1,194 @@
+"""Find edges, lines and circles in a picture's regions.
+
+Regions are in pixels. What comes back are edges in pixels, which a plane turns into points, lines
+and circles.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.inspection._measure.edges import (
+    BLURS_REACH,
+    PIXEL_VARIANCE,
+    REACH_PX,
+    Edge,
+    choose,
+    choose_pair,
+    find_edges,
+)
+from smartcam.inspection._measure.fits import Edges, fit_circle, fit_line
+from smartcam.inspection._measure.strips import Sectors, Strips
+from smartcam.inspection._measure.troubles import NotMeasuredError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+    from smartcam.inspection._measure.edges import Choice, EdgeSettings, PairChoice
+
+    Image = NDArray[np.generic]
+
+MIN_TILT_WIDTH_PX = 5.0
+"""Pixels that a strip is wide at least for the tilt of its edge to be told."""
+
+MIN_FOUND = 0.5
+"""Part of the strips of a line or a circle that must have an edge."""
+
+NOISE_APART = 2.0
+"""The noise of an edge in parts of the noise of most edges, from which on it counts as its own."""
+
+
+class FoundPoint(NamedTuple):
+    """An edge where it crosses the middle of its strip."""
+
+    strip: Strips  # one
+    edge: Edge
+
+    @property
+    def pixel(self) -> Array:
+        """(2,), the place in the picture."""
+        at: Array = self.strip.points(np.array([self.edge.place]), np.zeros(1))[0]
+        return at
+
+
+class FoundShape(NamedTuple):
+    """The edges of a line or a circle, in pixels."""
+
+    edges: Edges
+    troubles: tuple[NotMeasuredError, ...]  # of the strips without an edge
+    blur: float  # standard deviation of most edges' slopes, pixels
+    misfit: float  # pixels by which all edges may be wrong on the same side
+    kept: NDArray[np.bool_] | None = None  # (N,), the edges that count; None: not known yet
+
+
+def strip_between(start: Array, end: Array, width: float) -> Strips:
+    """Return the strip from a point to another one."""
+    ahead = end - start
+    length = float(np.hypot(*ahead))
+    return Strips((start + end)[None] / 2, ahead[None] / length, length, width)
+
+
+def find_point(image: Image, strip: Strips, settings: EdgeSettings, which: Choice) -> FoundPoint:
+    """Return the edge that crosses a strip."""
+    tilted = strip.width >= MIN_TILT_WIDTH_PX
+    found = find_edges(image, strip, settings, tilted=tilted)[0]
+    return FoundPoint(strip, choose(found, which))
+
+
+def find_pair(
+    image: Image, strip: Strips, settings: EdgeSettings, which: PairChoice
+) -> tuple[FoundPoint, FoundPoint]:
+    """Return the two edges of a bar that crosses a strip."""
+    tilted = strip.width >= MIN_TILT_WIDTH_PX
+    first, second = choose_pair(find_edges(image, strip, settings, tilted=tilted)[0], which)
+    return FoundPoint(strip, first), FoundPoint(strip, second)
+
+
+def find_line(
+    image: Image,
+    start: Array,
+    end: Array,
+    *,
+    search: float,
+    width: float,
+    count: int,
+    settings: EdgeSettings,
+    which: Choice,
+) -> FoundShape:
+    """Return the edges of a line that runs near the one from ``start`` to ``end``.
+
+    Strips cross it, ``search`` pixels long, from its left to its right as one goes along it.
+    """
+    parts = (np.arange(count) + 0.5) / count
+    strips = _across(start, end - start, parts, search, width)
+    first = _collected(image, strips, settings, which)
+    ahead = end - start
+    line = fit_line(first.edges, ahead).shape
+    # the strips again, at right angles to the line that they showed, so that edges are not tilted
+    begin, stop = (
+        line.at + ((one - line.at) @ line.direction) * line.direction for one in (start, end)
+    )
+    strips = _across(begin, stop - begin, parts, min(search, _short(first)), width)
+    return _collected(image, strips, settings, "nearest")
+
+
+def _across(start: Array, way: Array, parts: Array, search: float, width: float) -> Strips:
+    direction = np.array([-way[1], way[0]]) / np.hypot(*way)
+    middles = start + parts[:, None] * way
+    return Strips(middles, np.tile(direction, (len(parts), 1)), search, width)
+
+
+def find_circle(
+    image: Image,
+    centre: Array,
+    radius: float,
+    *,
+    arc: tuple[float, float],
+    search: float,
+    width: float,
+    count: int,
+    settings: EdgeSettings,
+    which: Choice,
+) -> FoundShape:
+    """Return the edges of a circle that lies near the one given.
+
+    Strips cross it from inside to outside, ``search`` pixels long; ``arc``: angles between which
+    they stand, radians from u to v.
+    """
+    angles = arc[0] + (np.arange(count) + 0.5) / count * (arc[1] - arc[0])
+    strips = Sectors(centre, radius, angles, search, width)
+    first = _collected(image, strips, settings, which)
+    circle = fit_circle(first.edges).shape
+    off = strips.middles - circle.centre  # the same places as before, seen from the better centre
+    angles = np.arctan2(off[:, 1], off[:, 0])
+    width *= min(circle.radius / radius, 1.0)
+    strips = Sectors(circle.centre, circle.radius, angles, min(search, _short(first)), width)
+    return _collected(image, strips, settings, "nearest")
+
+
+def _collected(
+    image: Image, strips: Strips | Sectors, settings: EdgeSettings, which: Choice
+) -> FoundShape:
+    """Return an edge of each strip that has one; NotMeasuredError: too few have."""
+    owners, edges, troubles = [], [], []
+    for owner, found in enumerate(find_edges(image, strips, settings)):
+        try:
+            edges.append(choose(found, which))
+        except NotMeasuredError as trouble:
+            troubles.append(trouble)
+        else:
+            owners.append(owner)
+    number = len(edges) + len(troubles)
+    if len(edges) < MIN_FOUND * number:
+        raise _few(troubles, number)
+    places = np.array([one.place for one in edges])
+    noises = np.array([one.noise for one in edges])
+    noise = float(np.median(noises))
+    noises = np.where(noises > NOISE_APART * noise, noises, noise)
+    blur = math.sqrt(float(np.median([one.blur for one in edges])) ** 2 + PIXEL_VARIANCE)
+    some, middle = strips.some(np.array(owners)), np.zeros(len(owners))
+    if isinstance(strips, Sectors):
+        # a blur draws the rim of a disc inwards, as heat flows: by s^2 / (2 r)
+        places = places + blur**2 / (2 * (strips.radius + places))
+    unit = np.array([one.unit_sigma for one in edges])
+    seen = Edges(some.points(places, middle), np.array(some.ahead(middle)), unit * noises)
+    misfit = float(np.median([one.misfit for one in edges]))
+    return FoundShape(seen, tuple(troubles), blur, misfit)
+
+
+def _few(troubles: list[NotMeasuredError], number: int) -> NotMeasuredError:
+    """Return the error of a line or a circle most of whose strips have no edge."""
+    kinds = [one.why for one in troubles]
+    most = max(kinds, key=kinds.count)
+    example = next(one for one in troubles if one.why is most)
+    text = f"{len(troubles)} of {number} strips have no edge: {example.text}"
+    return NotMeasuredError(most, text)
+
+
+def _short(found: FoundShape) -> float:
+    """Return the length of a strip that shows one edge and both of its sides, pixels."""
+    return 2 * (BLURS_REACH * found.blur + REACH_PX)

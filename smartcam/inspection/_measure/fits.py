@@ -1,0 +1,293 @@
+"""Fit lines and circles to edges, some of which may be wrong.
+
+An edge is known across only: how far it lies from a line or a circle is measured along its own
+direction, in its own standard deviations. The start is the line or circle through two or three
+edges from which the median edge is least far (least median of squares), so that up to half of the
+edges may lie anywhere. Edges that lie too far from it are left out; a least-squares fit to the
+others, weighted by their sigmas, is the most likely answer.
+
+Units are those of the points: pixels or millimetres.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+    Mask = NDArray[np.bool_]
+
+MAX_STARTS = 600
+"""Lines or circles through two or three edges that are tried at most."""
+
+GATE = 3.5
+"""Standard deviations to a line or a circle from which on an edge is left out."""
+
+MAX_ROUNDS = 10
+"""Times that edges are left out and a fit is made again, at most; two or three are usual."""
+
+MAX_STEPS = 30
+"""Steps of a fit at most; three to five are usual."""
+
+MOST_LEFT_OUT = 0.5
+"""Part of the edges that may be left out."""
+
+
+class Edges(NamedTuple):
+    """N edges in a plane."""
+
+    points: Array  # (N, 2)
+    normals: Array  # (N, 2), directions across the edges, of length 1
+    sigmas: Array  # (N,), along the normals
+
+    def some(self, which: Mask) -> Edges:
+        """Return some of them."""
+        return Edges(*(one[which] for one in self))
+
+
+class Line(NamedTuple):
+    """A straight line."""
+
+    at: Array  # (2,), the middle of its edges
+    direction: Array  # (2,), of length 1
+    # (2, 2), of the offset along the normal at that middle, and of the angle in radians
+    covariance: Array
+    reach: float  # from the middle to the edges at both ends
+
+    @property
+    def normal(self) -> Array:
+        """(2,), the direction turned by a right angle from the first axis to the second one."""
+        return np.array([-self.direction[1], self.direction[0]])
+
+    def offset_variance(self, point: Array) -> float:
+        """Return the variance of the line's place along its normal, beside a point."""
+        lever = np.array([1.0, float((point - self.at) @ self.direction)])
+        return float(lever @ self.covariance @ lever)
+
+
+class Circle(NamedTuple):
+    """A circle, or the circle of an arc."""
+
+    centre: Array  # (2,)
+    radius: float
+    covariance: Array  # (3, 3), of the centre and the radius
+
+
+ShapeT = TypeVar("ShapeT", Line, Circle)
+
+
+class ShapeFit(NamedTuple, Generic[ShapeT]):
+    """A line or a circle, and the edges that it is of."""
+
+    shape: ShapeT
+    kept: Mask  # (N,), the edges that agree with it
+    residuals: Array  # (N,), distances of the edges from it along their normals
+    excess: float  # by which the edges spread more than their sigmas say, 1 at least
+
+
+def fit_line(edges: Edges, ahead: Array, kept: Mask | None = None) -> ShapeFit[Line]:
+    """Return the line through edges, with its direction near ``ahead`` (2,).
+
+    ``kept`` (N,): the edges to use; None: those that agree.
+
+    Raises:
+        NotMeasuredError: FEW_EDGES; NO_AGREEMENT.
+    """
+    return _robust(edges, kept, _lines_through, lambda some, start: _line(some, start, ahead), 2)
+
+
+def fit_circle(edges: Edges, kept: Mask | None = None) -> ShapeFit[Circle]:
+    """Return the circle through edges; ``kept`` and errors are as of :func:`fit_line`."""
+    return _robust(edges, kept, _circles_through, _circle, 3)
+
+
+def _robust(
+    edges: Edges,
+    kept: Mask | None,
+    through: Callable[[Array], Array],
+    fit: Callable[[Edges, Array], tuple[ShapeT, Array]],
+    least: int,
+) -> ShapeFit[ShapeT]:
+    """Return the fit; ``through`` makes values (H, 3) of points (H, least, 2)."""
+    number = len(edges.points)
+    if number <= least:
+        text = f"{number} edges, more than {least} are needed"
+        raise NotMeasuredError(NoValueReason.FEW_EDGES, text)
+    if kept is not None:
+        return _fitted(edges, kept, fit, _start(edges.some(kept), through, least), least)
+    start = _start(edges, through, least)
+    everybody = np.ones(number, dtype=np.bool_)
+    found = _fitted(edges, everybody, fit, start, least)
+    far = np.abs(found.residuals) / edges.sigmas
+    if found.excess == 1.0 and far.max() <= GATE:
+        return found
+    # edges that are far from two or three others may still agree with all
+    far = np.abs(_distances(start[None], edges)[0]) / edges.sigmas
+    agree = far <= GATE * max(1.4826 * (1 + 5 / (number - least)) * float(np.median(far)), 1.0)
+    seen = set()
+    for _ in range(MAX_ROUNDS):
+        if np.count_nonzero(agree) < max(least, math.ceil((1 - MOST_LEFT_OUT) * number)):
+            text = f"{np.count_nonzero(agree)} of {number} edges agree, half of them are needed"
+            raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
+        found = _fitted(edges, agree, fit, start, least)
+        far = np.abs(found.residuals) / edges.sigmas
+        again = far <= GATE * _spread(far[agree])
+        if (again == agree).all() or again.tobytes() in seen:
+            break
+        seen.add(agree.tobytes())
+        agree = again
+    return found
+
+
+def _spread(far: Array) -> float:
+    """Return by how much edges spread more than their sigmas say, 1 where chance may do it.
+
+    ``far`` (N,): magnitudes of their distances, in sigmas. An edge of a real part is not quite
+    straight or round.
+    """
+    spread = 1.4826 * float(np.median(far))
+    return spread if spread > 1 + 4 / math.sqrt(len(far)) else 1.0
+
+
+def _fitted(
+    edges: Edges,
+    kept: Mask,
+    fit: Callable[[Edges, Array], tuple[ShapeT, Array]],
+    start: Array,
+    least: int,
+) -> ShapeFit[ShapeT]:
+    some = edges.some(kept)
+    shape, values = fit(some, start)
+    residuals = _distances(values[None], edges)[0]
+    freedom = int(np.count_nonzero(kept)) - least
+    squares = float(((residuals[kept] / some.sigmas) ** 2).sum())
+    # chance alone gives more than three sigmas of a sum of squares once in several hundred fits
+    much = freedom > 0 and squares > freedom + 3 * math.sqrt(2 * freedom)
+    excess = math.sqrt(squares / freedom) if much else 1.0
+    shape = shape._replace(covariance=shape.covariance * excess**2)
+    return ShapeFit(shape, kept, residuals, excess)
+
+
+def _start(edges: Edges, through: Callable[[Array], Array], least: int) -> Array:
+    """Return the values (3,) from which the median edge is least far, in sigmas."""
+    number = len(edges.points)
+    if math.comb(number, least) <= MAX_STARTS:
+        drawn = np.array(list(itertools.combinations(range(number), least)))
+    else:
+        # the same each time, so that a picture has one answer; each edge of another part
+        random = np.random.default_rng(number)
+        drawn = np.argsort(random.random((MAX_STARTS, number)), axis=1)[:, :least]
+    with np.errstate(all="ignore"):
+        values = through(edges.points[drawn])
+        far = np.abs(_distances(values, edges)) / edges.sigmas
+        median = np.median(far, axis=1)
+    median = np.where(np.isfinite(median), median, np.inf)
+    best = int(np.argmin(median))
+    if not math.isfinite(float(median[best])):
+        raise NotMeasuredError(NoValueReason.NO_AGREEMENT, "all edges are at one place")
+    start: Array = values[best]
+    return start
+
+
+def _distances(values: Array, edges: Edges) -> Array:
+    """Return the distances (H, N) of edges along their normals.
+
+    ``values`` (H, 3) of lines are a unit normal's angle, the offset along it and NaN; of circles
+    the centre and the radius.
+    """
+    points, normals = edges.points, edges.normals
+    first, second, third = values.T[:, :, None]
+    lines = np.isnan(third)
+    normal = np.stack([np.cos(first), np.sin(first)], axis=-1)
+    off = points[None] - np.stack([first, second], axis=-1)
+    far = np.hypot(off[..., 0], off[..., 1])
+    across = np.where(lines[..., None], normal, off / np.maximum(far, 1e-12)[..., None])
+    beside = np.where(lines, (normal * points[None]).sum(axis=-1) - second, far - third)
+    seen = np.abs((across * normals[None]).sum(axis=-1))
+    distances: Array = beside / np.maximum(seen, 0.1)
+    return distances
+
+
+def _lines_through(points: Array) -> Array:
+    ahead = points[:, 1] - points[:, 0]
+    angle = np.arctan2(ahead[:, 0], -ahead[:, 1])
+    offset = np.cos(angle) * points[:, 0, 0] + np.sin(angle) * points[:, 0, 1]
+    same = (ahead == 0).all(axis=1)
+    return np.column_stack([angle, np.where(same, np.inf, offset), np.full(len(points), np.nan)])
+
+
+def _circles_through(points: Array) -> Array:
+    # |p - c|^2 is the same for three points: (p_k - p_0) . c' = |p_k - p_0|^2 / 2, c' = c - p_0
+    first = points[:, 0]
+    (a, b), (c, d) = (points[:, 1] - first).T, (points[:, 2] - first).T
+    doubled = 2 * (a * d - b * c)
+    x = (d * (a * a + b * b) - b * (c * c + d * d)) / doubled
+    y = (a * (c * c + d * d) - c * (a * a + b * b)) / doubled
+    radius = np.hypot(x, y)
+    radius[np.isnan(radius)] = np.inf
+    return np.column_stack([first[:, 0] + x, first[:, 1] + y, radius])
+
+
+def _line(edges: Edges, start: Array, ahead: Array) -> tuple[Line, Array]:
+    weights = 1 / edges.sigmas**2
+    middle = (weights[:, None] * edges.points).sum(axis=0) / weights.sum()
+    off = edges.points - middle
+    angle = float(start[0])
+    hessian: NDArray[Any] = np.eye(2)
+    offset = float(start[1] - np.array([math.cos(angle), math.sin(angle)]) @ middle)
+    for _ in range(MAX_STEPS):
+        normal = np.array([math.cos(angle), math.sin(angle)])
+        along = off @ np.array([-normal[1], normal[0]])
+        seen = edges.normals @ normal
+        jacobian = np.column_stack([np.ones(len(off)), -along]) / seen[:, None]
+        residuals = (off @ normal - offset) / seen
+        hessian = (jacobian * weights[:, None]).T @ jacobian
+        move = np.linalg.solve(hessian, jacobian.T @ (weights * residuals))
+        offset, angle = offset + float(move[0]), angle + float(move[1])
+        if abs(move[1]) < 1e-12 and abs(move[0]) < 1e-9 * (1 + abs(offset)):
+            break
+    normal = np.array([math.cos(angle), math.sin(angle)])
+    direction = np.array([normal[1], -normal[0]])
+    covariance: Array = np.linalg.inv(hessian)
+    if direction @ ahead < 0:  # offsets count along the direction's normal, which turns with it
+        direction, covariance = -direction, covariance * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    along = off @ direction
+    at = middle + offset * normal
+    line = Line(at, direction, covariance, float(np.abs(along).max()))
+    return line, np.array([angle, float(normal @ at), np.nan])
+
+
+def _circle(edges: Edges, start: Array) -> tuple[Circle, Array]:
+    weights = 1 / edges.sigmas**2
+    values = start.copy()
+    hessian: NDArray[Any] = np.eye(3)
+    for _ in range(MAX_STEPS):
+        off = edges.points - values[:2]
+        far = np.maximum(np.hypot(off[:, 0], off[:, 1]), 1e-12)
+        across = off / far[:, None]
+        seen = np.maximum(np.abs((across * edges.normals).sum(axis=1)), 0.1)
+        jacobian = np.column_stack([across, np.ones(len(off))]) / seen[:, None]
+        residuals = (far - values[2]) / seen
+        hessian = (jacobian * weights[:, None]).T @ jacobian
+        if np.linalg.cond(hessian) > 1e14:
+            raise NotMeasuredError(
+                NoValueReason.UNCERTAIN, "the edges lie on no circle, or on many"
+            )
+        move = np.linalg.solve(hessian, jacobian.T @ (weights * residuals))
+        values = values + move
+        if np.abs(move).max() < 1e-10 * (1 + abs(values[2])):
+            break
+    if not (np.isfinite(values).all() and values[2] > 0):
+        raise NotMeasuredError(NoValueReason.UNCERTAIN, "the edges lie on no circle, or on many")
+    return Circle(values[:2], float(values[2]), np.linalg.inv(hessian)), values

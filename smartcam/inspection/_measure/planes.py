@@ -1,0 +1,161 @@
+"""Planes in which lengths are measured: the picture in pixels, a calibrated one in millimetres.
+
+Edges are mapped to the plane, and what is measured is measured there: so neither a camera's tilt
+nor, with a lens in the calibration, its distortion bends a line or shortens a length.
+
+A calibration has errors of its own, the same ones for all edges of a picture. They are made of
+independent parts, each of one standard deviation; a map without such a part, beside the one with
+it, says what the part does to a result.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.inspection._measure.fits import Edges
+from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.geometry._inside import Array
+
+STEP_PX = 0.5
+"""Pixels to each side of a point between which a map's derivative is taken."""
+
+MM = 1000.0
+"""Millimetres of a metre."""
+
+
+class Plane(NamedTuple):
+    """A plane in which lengths are measured."""
+
+    unit: str  # "px" or "mm"
+    # from pixels (N, 2) to points of the plane (N, 2)
+    map: Callable[[Array], Array]
+    # maps that are off by one standard deviation each, in independent ways
+    variants: tuple[Callable[[Array], Array], ...] = ()
+    # True if nothing tells the errors of the map
+    unverified: bool = False
+
+    def points(self, pixels: Array) -> Array:
+        """Return pixels (N, 2) in the plane; NotMeasuredError: it does not reach there."""
+        try:
+            return self.map(pixels)
+        except CalibrationError as exc:
+            raise NotMeasuredError(NoValueReason.OFF_CALIBRATION, str(exc)) from exc
+
+    def slopes(self, pixels: Array) -> Array:
+        """Return the derivatives (N, 2, 2) of points by pixels."""
+        ends = [
+            (self.points(pixels + way) - self.points(pixels - way)) / (2 * STEP_PX)
+            for way in STEP_PX * np.eye(2)
+        ]
+        return np.stack(ends, axis=2)
+
+    def edges(self, edges: Edges) -> Edges:
+        """Return edges of the picture in the plane."""
+        slopes = self.slopes(edges.points)
+        # an edge's line has the direction t; what moves it by s along its normal n moves the
+        # mapped line by s |det J| / |J t| across
+        turned = edges.normals[:, ::-1] * [-1.0, 1.0]
+        lines = np.einsum("nij,nj->ni", slopes, turned)
+        lengths = np.linalg.norm(lines, axis=1)
+        normals = lines[:, ::-1] * [1.0, -1.0] / lengths[:, None]
+        ahead = np.einsum("nij,nj->ni", slopes, edges.normals)
+        normals *= np.sign((normals * ahead).sum(axis=1))[:, None]
+        sigmas = edges.sigmas * np.abs(np.linalg.det(slopes)) / lengths
+        return Edges(self.points(edges.points), normals, sigmas)
+
+
+PIXELS = Plane("px", lambda points: points)
+"""The picture itself."""
+
+
+def picture_of(calibration: Any) -> Plane:
+    """Return the picture as the plane, without the distortion of a lens that is known."""
+    camera = getattr(calibration, "camera", None)
+    return PIXELS if camera is None else Plane("px", camera.undistort)
+
+
+def plane_of(calibration: Any) -> Plane:
+    """Return the plane of a calibration, in millimetres.
+
+    ``calibration``: a :class:`~smartcam.calibration.PlaneCalibration` of pixels or a
+    :class:`~smartcam.calibration.SheetCalibration`; a lens alone has no length.
+
+    Raises:
+        ConfigurationError: another calibration.
+    """
+    kind = getattr(calibration, "kind", None)
+    if kind == "plane":
+        return _with_variants(calibration, calibration, _plane_variants(calibration))
+    if kind == "sheet":
+        variants = [
+            dataclasses.replace(calibration, plane=one)
+            for one in _plane_variants(calibration.plane)
+        ] + _view_variants(calibration)
+        return _with_variants(calibration, calibration.plane, variants)
+    raise ConfigurationError(
+        "measure: calibration: expected one of a plane, with or without a lens, as fit_plane and "
+        f"calibrate_sheet make it, got {kind or type(calibration).__name__}: it does not say how "
+        "long a pixel is"
+    )
+
+
+def _with_variants(calibration: Any, plane: Any, variants: list[Any]) -> Plane:
+    axes = plane.rotation[:, :2]
+    origin = np.asarray(plane.robot_points, dtype=np.float64).mean(axis=0)
+    turned_up = calibration.kind == "plane" and calibration.y_down
+
+    def mapped(one: Any) -> Callable[[Array], Array]:
+        def points(pixels: Array) -> Array:
+            seen = pixels * [1.0, -1.0] if turned_up else pixels
+            flat: Array = MM * (one.transform(seen) - origin) @ axes
+            return flat
+
+        return points
+
+    return Plane(
+        "mm",
+        mapped(calibration),
+        tuple(mapped(one) for one in variants),
+        plane.touch_sigma is None,
+    )
+
+
+def _plane_variants(plane: Any) -> list[Any]:
+    if plane.touch_sigma is None:
+        return []
+    matrix = plane.place.inward(plane.matrix)
+    return [
+        dataclasses.replace(plane, matrix=plane.place.outward(matrix + part.reshape(4, 3)))
+        for part in _parts(plane.unit_covariance * plane.touch_sigma**2)
+    ]
+
+
+def _view_variants(calibration: Any) -> list[Any]:
+    sheet = calibration.sheet
+    return [
+        dataclasses.replace(
+            calibration,
+            sheet=type(sheet)(
+                sheet.size, sheet.matrix + part.reshape(3, 3), sheet.covariance, sheet.camera
+            ),
+        )
+        for part in _parts(sheet.covariance)
+    ]
+
+
+def _parts(covariance: Array) -> Array:
+    """Return independent vectors (K, M) of one standard deviation, whose squares add up to it."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scale[scale == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > 1e-12 * values.max(initial=0.0)
+    parts: Array = (vectors[:, kept] * np.sqrt(values[kept])).T * scale
+    return parts

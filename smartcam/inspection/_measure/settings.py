@@ -1,0 +1,253 @@
+"""Settings of a measurement in a program, as pydantic models."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, model_validator
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.inspection._measure.edges import MAX_WIDTH_PX, Choice, PairChoice, Polarity
+from smartcam.inspection._measure.tolerances import Tolerance
+from smartcam.inspection._tool import ToolSettings
+
+MAX_COORDINATE_PX: Final = 100_000.0
+"""Pixels that a coordinate may have; no picture is larger."""
+
+MAX_LENGTH_PX: Final = 4_000.0
+"""Pixels that a strip may be long."""
+
+MAX_STRIPS: Final = 500
+"""StripSearch of a line or a circle."""
+
+Coordinate = Annotated[float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)]
+Place = tuple[Coordinate, Coordinate]
+
+
+def _apart(given: tuple[Place, Place]) -> tuple[Place, Place]:
+    if math.dist(*given) < 1.0:
+        raise ValueError(f"expected two points that are a pixel or more apart, got {list(given)}")
+    return given
+
+
+Way = Annotated[tuple[Place, Place], AfterValidator(_apart)]
+"""A point, and the point that leads to."""
+
+
+class EdgeSearch(BaseModel):
+    """Settings of every search for edges."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    polarity: Polarity = Field(
+        "any",
+        description="rising: from dark to light along the way; falling: from light to dark; any",
+    )
+    contrast: float = Field(
+        10.0, gt=0, le=255, description="grey levels of 255 from one side to the other, at least"
+    )
+    smoothing: float = Field(
+        1.2,
+        ge=0.5,
+        le=10,
+        description="pixels over which the search for edges smooths; places do not depend on it",
+    )
+    blur: float = Field(
+        5.0, gt=0, le=10, description="pixels of blur that an edge may have; more is an error"
+    )
+    cut_off: bool = Field(
+        False,
+        description="measure edges beside black or white that is cut off, too: they may be wrong "
+        "by more than their sigma says",
+    )
+
+
+class Across(EdgeSearch):
+    """One edge, across which a strip leads."""
+
+    across: Way = Field(description="where the strip begins and ends, [[x, y], [x, y]]")
+    strip: float = Field(10.0, ge=1, le=MAX_WIDTH_PX, description="width of the strip, pixels")
+    which: Choice = Field(
+        "single",
+        description="first, last, strongest, or nearest to the strip's middle, of several edges; "
+        "single: several are an error",
+    )
+
+
+class AcrossPair(EdgeSearch):
+    """The two edges of a bar, across which a strip leads."""
+
+    across: Way = Field(description="where the strip begins and ends, [[x, y], [x, y]]")
+    strip: float = Field(10.0, ge=1, le=MAX_WIDTH_PX, description="width of the strip, pixels")
+    which: PairChoice = Field(
+        "single",
+        description="first, last or strongest pair of neighbours, one from dark to light and one "
+        "from light to dark; outermost: the first and the last edge; single: expect two edges",
+    )
+
+
+class StripSearch(EdgeSearch):
+    """Many edges, along which strips stand."""
+
+    search: float = Field(
+        20.0, ge=4, le=MAX_LENGTH_PX, description="length of the strips across, pixels"
+    )
+    strips: int = Field(24, ge=4, le=MAX_STRIPS, description="how many strips there are")
+    strip: float | None = Field(
+        None,
+        ge=1,
+        le=MAX_WIDTH_PX,
+        description="width of a strip, pixels; default, and at most: as wide as they are apart",
+    )
+    which: Choice = Field("single", description="which edge of several in a strip counts")
+
+
+class LineSearch(StripSearch):
+    """A straight line."""
+
+    along: Way = Field(description="two points near the line, [[x, y], [x, y]]")
+
+
+class CircleSearch(StripSearch):
+    """A circle, or an arc of one."""
+
+    centre: Place = Field(description="its centre, [x, y], roughly")
+    radius: float = Field(ge=2, le=MAX_COORDINATE_PX, description="its radius, pixels, roughly")
+    arc: tuple[float, float] = Field(
+        (0.0, 360.0), description="degrees from x towards y between which it is to be seen"
+    )
+
+    @model_validator(mode="after")
+    def _arc_is_one(self) -> CircleSearch:
+        begin, end = self.arc
+        if not (-360 <= begin < end <= 720 and end - begin <= 360):
+            raise ValueError(f"expected an arc [from, to] of 360 degrees at most, got {self.arc}")
+        if self.search / 2 > 0.9 * self.radius:
+            raise ValueError(
+                f"expected search up to {1.8 * self.radius:g} pixels at a radius of "
+                f"{self.radius:g}: strips would cross the centre"
+            )
+        return self
+
+
+class FeatureSearch(BaseModel):
+    """One thing whose distance or angle to another one is measured."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    edge: Across | None = Field(None, description="a point: where an edge crosses a strip")
+    line: LineSearch | None = Field(None, description="a line")
+    circle: CircleSearch | None = Field(None, description="the centre of a circle")
+
+    @model_validator(mode="after")
+    def _one_of(self) -> FeatureSearch:
+        given = [name for name in ("edge", "line", "circle") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"expected one of edge, line and circle, got {' and '.join(given) or 'none'}"
+            )
+        return self
+
+
+class Between(BaseModel):
+    """Two things whose distance is measured."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    first: FeatureSearch = Field(description="an edge, a line or a circle")
+    second: FeatureSearch = Field(description="an edge, a line or a circle")
+
+
+class LineFeature(BaseModel):
+    """A line whose angle to another one is measured."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    line: LineSearch = Field(description="a line; it has the direction of its two points")
+
+
+class BetweenLines(BaseModel):
+    """Two lines whose angle is measured."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    first: LineFeature = Field(description="a line")
+    second: LineFeature = Field(description="the other line")
+
+
+def _tolerance(given: Any) -> Tolerance:
+    if isinstance(given, Tolerance):
+        return given
+    try:
+        return Tolerance.parse(given)
+    except ConfigurationError as exc:
+        raise ValueError(str(exc)) from exc
+
+
+KINDS: Final = ("width", "edge", "line", "circle", "distance", "angle")
+"""Kinds of measurement; a tool does one of them."""
+
+
+class MeasureSettings(ToolSettings):
+    """One thing to measure, and the values that are good."""
+
+    width: AcrossPair | None = Field(None, description="the width of a bar")
+    edge: Across | None = Field(None, description="the place of an edge in its strip")
+    line: LineSearch | None = Field(None, description="the direction of a line")
+    circle: CircleSearch | None = Field(None, description="the diameter of a circle")
+    distance: Between | None = Field(None, description="the distance of two things")
+    angle: BetweenLines | None = Field(None, description="the angle between two lines")
+    tolerance: Annotated[Tolerance, PlainValidator(_tolerance)] | None = Field(
+        None, description="the values that are good, such as 12.00 +- 0.05 mm; default: any"
+    )
+    guard: float = Field(
+        2.0,
+        ge=0,
+        le=10,
+        description="sigmas by which a value has to be inside of its tolerance; 0: none",
+    )
+    unit: Literal["mm", "px"] | None = Field(
+        None,
+        description="mm, by the camera's calibration, or px; default: as the tolerance, else mm "
+        "where there is a calibration of a plane",
+    )
+
+    @property
+    def kind(self) -> str:
+        """The name of what is measured, one of :data:`KINDS`."""
+        return next(name for name in KINDS if getattr(self, name) is not None)
+
+    @model_validator(mode="after")
+    def _one_of(self) -> MeasureSettings:
+        given = [name for name in KINDS if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"expected one of {', '.join(KINDS)}, got {' and '.join(given) or 'none'}"
+            )
+        if self.region is not None:
+            raise ValueError("expected no region: strips say where it measures")
+        if self.tolerance is not None:
+            is_angle = given[0] in {"line", "angle"}
+            if is_angle != (self.tolerance.unit == "deg"):
+                expected = "deg" if is_angle else "a unit of length or px"
+                raise ValueError(f"tolerance: expected {expected}, got {self.tolerance.text!r}")
+            one_sided = math.inf in (-self.tolerance.least, self.tolerance.most)
+            if given[0] == "line" and one_sided:
+                raise ValueError(
+                    "tolerance: expected both limits of a direction, such as '-5 to 5 deg', "
+                    f"got {self.tolerance.text!r}"
+                )
+            if self.unit is not None and self.tolerance.unit not in {"deg", self.unit}:
+                raise ValueError(f"tolerance: expected {self.unit}, got {self.tolerance.text!r}")
+        return self

@@ -1,0 +1,235 @@
+"""Lengths and angles of edges, lines and circles in a plane, each with its standard deviation."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+
+from smartcam.inspection._measure.fits import (
+    Circle,
+    Line,
+    ShapeFit,
+    ShapeT,
+    fit_circle,
+    fit_line,
+)
+from smartcam.inspection._measure.planes import STEP_PX
+from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.geometry._inside import Array
+    from smartcam.inspection._measure.features import FoundPoint, FoundShape
+    from smartcam.inspection._measure.planes import Plane
+
+STEP: float = 1e-3
+"""Pixels, and tangents of an angle, by which values are moved to see what a result does."""
+
+MAX_RADIUS_SIGMA = 0.05
+"""Standard deviation of a radius in parts of it, above which an arc does not tell its circle."""
+
+MAX_SPREAD_PX = 1.5
+"""Rms of the distances of edges from their line or circle, in pixels, up to which it is one."""
+
+MAX_LINES_APART = math.radians(10.0)
+"""Angle between two lines up to which they have a distance."""
+
+
+class Point(NamedTuple):
+    """A point in a plane."""
+
+    at: Array  # (2,)
+    covariance: Array  # (2, 2)
+
+
+Feature: TypeAlias = Point | Line | Circle
+
+
+class Value(NamedTuple):
+    """A measured value in the plane's unit, or in radians."""
+
+    value: float
+    sigma: float
+
+
+def point_of(found: FoundPoint, plane: Plane) -> Point:
+    """Return an edge in a plane; it is uncertain along its strip only."""
+    pixel = found.pixel[None]
+    sigma = math.hypot(found.edge.sigma, found.edge.misfit)
+    way = plane.slopes(pixel)[0] @ found.strip.directions[0] * sigma
+    return Point(plane.points(pixel)[0], np.outer(way, way))
+
+
+def line_of(found: FoundShape, ahead: Array, plane: Plane) -> ShapeFit[Line]:
+    """Return the line of edges in a plane.
+
+    ``ahead`` (2, 2): pixels of two points, from one of which the line leads to the other one.
+    """
+    start, end = plane.points(ahead)
+    fit = fit_line(plane.edges(found.edges), end - start, found.kept)
+    return _checked(fit, found, plane, 0)
+
+
+def circle_of(found: FoundShape, plane: Plane) -> ShapeFit[Circle]:
+    """Return the circle of edges in a plane.
+
+    Raises:
+        NotMeasuredError: UNCERTAIN: the arc is too short to tell the radius.
+    """
+    fit = fit_circle(plane.edges(found.edges), found.kept)
+    circle = fit.shape
+    sigma = math.sqrt(float(circle.covariance[2, 2]))
+    if sigma > MAX_RADIUS_SIGMA * circle.radius:
+        text = (
+            f"the arc is too short: its radius is {circle.radius:.3g} {plane.unit}, give or take "
+            f"{sigma:.2g} {plane.unit}"
+        )
+        raise NotMeasuredError(NoValueReason.UNCERTAIN, text)
+    return _checked(fit, found, plane, 2)
+
+
+def _checked(
+    fit: ShapeFit[ShapeT], found: FoundShape, plane: Plane, which: int
+) -> ShapeFit[ShapeT]:
+    """Return a fit whose offset or radius may be wrong by what all edges may be wrong.
+
+    Raises:
+        NotMeasuredError: NO_AGREEMENT: its edges are of several lines or circles.
+    """
+    scale = float(np.median(plane.edges(found.edges).sigmas / found.edges.sigmas))
+    spread = float(np.sqrt(np.mean(fit.residuals[fit.kept] ** 2))) / scale
+    if spread > MAX_SPREAD_PX:
+        text = f"the edges are {spread:.1f} px (rms) from one line or circle"
+        raise NotMeasuredError(NoValueReason.NO_AGREEMENT, text)
+    covariance = fit.shape.covariance.copy()
+    covariance[which, which] += (scale * found.misfit) ** 2
+    return fit._replace(shape=fit.shape._replace(covariance=covariance))
+
+
+def with_calibration(measure: Callable[[Plane], Value], plane: Plane) -> Value:
+    """Return a value whose sigma has the calibration's own errors in it."""
+    found = measure(plane)
+    variance = found.sigma**2
+    for variant in plane.variants:
+        other = measure(plane._replace(map=variant, variants=()))
+        variance += (other.value - found.value) ** 2
+    return Value(found.value, math.sqrt(variance))
+
+
+def width(first: FoundPoint, second: FoundPoint, plane: Plane) -> Value:
+    """Return the distance between two edges of one strip, at right angles to them."""
+    strip = first.strip
+
+    ahead = strip.directions[0]
+    aside = ahead[::-1] * [-1.0, 1.0]
+
+    def measured(values: Array) -> float:
+        places, tilts = values[[0, 2]], values[[1, 3]]
+        at = strip.middles[0] + places[:, None] * ahead
+        along = STEP_PX * (tilts[:, None] * ahead + aside)
+        ends, after, before = plane.points(np.concatenate([at, at + along, at - along])).reshape(
+            3, 2, 2
+        )
+        lines = (after - before) / np.linalg.norm(after - before, axis=1)[:, None]
+        across = lines.sum(axis=0)[::-1] * [1.0, -1.0]
+        return abs(float((ends[1] - ends[0]) @ across) / math.hypot(*across))
+
+    values, covariance = _joint(first, second)
+    slopes = np.array(
+        [(measured(values + way) - measured(values - way)) / (2 * STEP) for way in STEP * np.eye(4)]
+    )
+    misfit = abs(slopes[0]) * first.edge.misfit + abs(slopes[2]) * second.edge.misfit
+    return Value(measured(values), math.sqrt(float(slopes @ covariance @ slopes + misfit**2)))
+
+
+def _joint(first: FoundPoint, second: FoundPoint) -> tuple[Array, Array]:
+    """Return place and tilt of two edges (4,), and their covariance (4, 4)."""
+    edges = first.edge, second.edge
+    values = np.array([one for edge in edges for one in (edge.place, edge.tilt)])
+    covariance = np.zeros((4, 4))
+    together = edges[0].unit_covariance is edges[1].unit_covariance
+    for i, one in enumerate(edges):
+        for j, other in enumerate(edges):
+            if i == j or together:
+                rows, columns = [one.number, -1], [other.number, -1]
+                part = one.unit_covariance[np.ix_(rows, columns)] * one.noise * other.noise
+                covariance[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = part
+    return values, covariance
+
+
+def distance(first: Feature, second: Feature) -> Value:
+    """Return the distance of two points, of a point and a line, or of two parallel lines.
+
+    A circle counts as its centre. Two lines are compared halfway between their middles, at right
+    angles to the mean of their directions.
+
+    Raises:
+        NotMeasuredError: UNCERTAIN: lines that are not parallel.
+    """
+    if isinstance(first, Line) and isinstance(second, Line):
+        return _between_lines(first, second)
+    if isinstance(first, Line):
+        return _from_line(first, _as_point(second))
+    if isinstance(second, Line):
+        return _from_line(second, _as_point(first))
+    one, other = _as_point(first), _as_point(second)
+    way = other.at - one.at
+    length = math.hypot(*way)
+    covariance = one.covariance + other.covariance
+    if length == 0.0:
+        return Value(0.0, math.sqrt(float(np.trace(covariance))))
+    ahead = way / length
+    return Value(length, math.sqrt(float(ahead @ covariance @ ahead)))
+
+
+def _as_point(feature: Feature) -> Point:
+    if isinstance(feature, Circle):
+        return Point(feature.centre, feature.covariance[:2, :2])
+    assert isinstance(feature, Point)  # noqa: S101 - lines have been dealt with
+    return feature
+
+
+def _from_line(line: Line, point: Point) -> Value:
+    normal = line.normal
+    variance = float(normal @ point.covariance @ normal) + line.offset_variance(point.at)
+    return Value(abs(float((point.at - line.at) @ normal)), math.sqrt(variance))
+
+
+def _between_lines(first: Line, second: Line) -> Value:
+    ahead = second.direction if first.direction @ second.direction > 0 else -second.direction
+    apart = math.acos(min(1.0, float(first.direction @ ahead)))
+    if apart > MAX_LINES_APART:
+        text = f"the lines are not parallel: {math.degrees(apart):.1f} degrees apart"
+        raise NotMeasuredError(NoValueReason.UNCERTAIN, text)
+    mean = (first.direction + ahead) / np.linalg.norm(first.direction + ahead)
+    normal = np.array([-mean[1], mean[0]])
+    middle = (first.at + second.at) / 2
+    places, variance = [], 0.0
+    for line in (first, second):
+        # where the line passes the middle, along the mean's normal
+        places.append(float((line.at - middle) @ line.normal / (line.normal @ normal)))
+        variance += line.offset_variance(middle)
+    return Value(abs(places[1] - places[0]), math.sqrt(variance))
+
+
+def direction(line: Line, pixel: Array, axis: Array, plane: Plane) -> Value:
+    """Return the angle from an axis of the picture to a line, more than -pi, at most pi.
+
+    ``axis`` (2,) is a direction at ``pixel`` (2,); angles go from the picture's x to its y.
+    """
+    slopes = plane.slopes(pixel[None])[0]
+    start = slopes @ axis
+    cross = start[0] * line.direction[1] - start[1] * line.direction[0]
+    turned = math.atan2(float(cross), float(start @ line.direction))
+    turned = math.copysign(turned, turned * float(np.linalg.det(slopes)))
+    return Value(turned, math.sqrt(float(line.covariance[1, 1])))
+
+
+def angle(first: Line, second: Line) -> Value:
+    """Return the angle between the directions of two lines, 0 to pi."""
+    cross = first.direction[0] * second.direction[1] - first.direction[1] * second.direction[0]
+    between = math.atan2(abs(float(cross)), float(first.direction @ second.direction))
+    return Value(between, math.sqrt(float(first.covariance[1, 1] + second.covariance[1, 1])))

@@ -1,0 +1,170 @@
+"""A picture as tools take it: grey levels and colours, each made once, whoever asks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam._arguments import check_integer, check_path, wrong_argument
+from smartcam._extras import load
+from smartcam._forks import cached_property
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames import Frame
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+MAX_SIDE_PX: Final = 20_000
+"""Width and height that a picture may have, in pixels."""
+
+MAX_FILE_BYTES: Final = 1 << 28
+"""Bytes that a picture's file may have."""
+
+
+class Picture:
+    """One picture to inspect.
+
+    Args:
+        pixels: uint8 or uint16, (H, W) grey or (H, W, 3) with red first. They must not change.
+        depth: bits of a sample that mean something; None: all of them.
+        frame: the frame that the pixels are of.
+
+    Raises:
+        FrameFormatError: it has no pixels, or too many, or is of another type or shape.
+
+    Attributes:
+        frame: the frame that it is of; None: pixels alone.
+        depth: bits of a sample that mean something.
+        size: width and height, pixels.
+    """
+
+    def __init__(
+        self, pixels: NDArray[Any], *, depth: int | None = None, frame: Frame | None = None
+    ) -> None:
+        if not isinstance(pixels, np.ndarray):
+            raise wrong_argument("pixels", "an array of uint8 or uint16", pixels, "Picture")
+        good_shape = pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)
+        if pixels.dtype not in (np.uint8, np.uint16) or not good_shape:
+            raise FrameFormatError(
+                "picture: expected uint8 or uint16 of the shape (H, W) or (H, W, 3), "
+                f"got {pixels.dtype} of the shape {pixels.shape}"
+            )
+        height, width = pixels.shape[:2]
+        if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX):
+            raise FrameFormatError(
+                f"picture: expected 1 to {MAX_SIDE_PX} pixels along each side, "
+                f"got {width} x {height}"
+            )
+        most = 8 * pixels.dtype.itemsize
+        self.depth: int = (
+            most if depth is None else check_integer(depth, "depth", 1, most, "Picture")
+        )
+        self.frame: Frame | None = frame
+        self.size: tuple[int, int] = (width, height)
+        self._pixels = pixels
+
+    @classmethod
+    def of(cls, source: Frame | Picture | NDArray[Any]) -> Picture:
+        """Return the picture of a frame, or of pixels as :class:`Picture` takes them.
+
+        Raises:
+            FrameFormatError: the frame's bytes are wrong, or no picture.
+            MissingExtraError: the frame is compressed, and the extra ``frames`` is not installed.
+        """
+        if isinstance(source, Picture):
+            return source
+        if isinstance(source, np.ndarray):
+            return cls(source)
+        if not isinstance(source, Frame):
+            raise wrong_argument("picture", "a Frame, a Picture or an array", source)
+        grey = source.format.grey_is_sent
+        pixels = source.grey() if grey else source.rgb()
+        depth = min(source.format.depth, 8 * pixels.dtype.itemsize)
+        picture = cls(pixels, depth=depth, frame=source)
+        if grey and source.format.name.startswith("Mono"):
+            picture._has_colours = False
+        return picture
+
+    @classmethod
+    def read(cls, path: str | Path) -> Picture:
+        """Return the picture in a file: PNG, JPEG, BMP, TIFF, or what else OpenCV reads.
+
+        Raises:
+            FrameFormatError: the file cannot be read, is too large, or is no picture.
+            MissingExtraError: OpenCV is not installed.
+        """
+        path = check_path(path, "path", "Picture.read")
+        cv2 = load("cv2", "inspection needs")
+        try:
+            with path.open("rb") as file:
+                data = file.read(MAX_FILE_BYTES + 1)
+        except OSError as exc:
+            raise FrameFormatError(f"picture {path}: {exc}", source=str(path)) from exc
+        if len(data) > MAX_FILE_BYTES:
+            raise FrameFormatError(f"picture {path}: expected {MAX_FILE_BYTES} bytes at most")
+        how = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), how)
+        except cv2.error:  # of no bytes, and of more pixels than OpenCV takes
+            pixels = None
+        if pixels is None:
+            raise FrameFormatError(
+                f"picture {path}: expected PNG, JPEG, BMP or TIFF, got {len(data)} bytes: "
+                f"{data[:16].hex(' ')}",
+                source=str(path),
+            )
+        return cls(pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[:, :, ::-1]))
+
+    @property
+    def has_colours(self) -> bool:
+        """True if the camera sent colours."""
+        return self._has_colours
+
+    @cached_property
+    def _has_colours(self) -> bool:
+        return self._pixels.ndim == 3 or self.frame is not None
+
+    @cached_property
+    def levels(self) -> NDArray[Any]:
+        """Brightness as the camera sent it, (H, W), uint8 or uint16 of :attr:`depth` bits."""
+        if self._pixels.ndim == 2:
+            return self._pixels
+        cv2 = load("cv2", "inspection needs")
+        mixed: NDArray[Any] = cv2.cvtColor(self._pixels, cv2.COLOR_RGB2GRAY)
+        return mixed
+
+    @cached_property
+    def clipped(self) -> NDArray[np.bool_] | None:
+        """Mask of pixels with a colour at its top, (H, W); None where there are no colours."""
+        if self._pixels.ndim == 2:
+            return None
+        top = 2**self.depth - 1
+        red, green, blue = (self._pixels[:, :, one] >= top for one in range(3))
+        mask: NDArray[np.bool_] = red | green | blue
+        return mask
+
+    @cached_property
+    def grey(self) -> NDArray[np.uint8]:
+        """Brightness, (H, W), uint8: of 16 bits the upper eight of those that mean something."""
+        return _eight_bits(self.levels, self.depth)
+
+    @cached_property
+    def rgb(self) -> NDArray[np.uint8]:
+        """Colours, (H, W, 3), uint8, red first; a grey picture's level three times."""
+        if self._pixels.ndim == 3:
+            return _eight_bits(self._pixels, self.depth)
+        if self.frame is not None and self.has_colours:
+            colours = self.frame.rgb()
+            return _eight_bits(colours, min(self.depth, 8 * colours.dtype.itemsize))
+        return np.repeat(self.grey[:, :, np.newaxis], 3, axis=2)
+
+
+def _eight_bits(pixels: NDArray[Any], depth: int) -> NDArray[np.uint8]:
+    if pixels.dtype == np.uint8:
+        return pixels
+    shifted = pixels >> (depth - 8) if depth > 8 else pixels
+    upper: NDArray[np.uint8] = np.minimum(shifted, 255).astype(np.uint8)
+    return upper

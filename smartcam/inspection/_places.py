@@ -1,0 +1,184 @@
+"""Places in a picture: frames of reference, and regions that a tool looks at.
+
+Pixel coordinates have x to the right and y down; the centre of the upper left pixel is (0, 0), as
+in all of smartcam. Angles are in radians from x towards y, so a positive one turns clockwise as
+people see it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+
+import numpy as np
+from pydantic import PlainValidator, WithJsonSchema
+
+from smartcam._extras import load
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+MAX_CORNERS: Final = 200
+"""Corners that a region may have."""
+
+MAX_COORDINATE_PX: Final = 100_000.0
+"""Largest coordinate of a region, in pixels; no picture is larger."""
+
+
+class PixelPose(NamedTuple):
+    """A frame of reference in a picture: what a tool found, and later tools may follow.
+
+    Attributes:
+        x: place of its origin, pixels.
+        y: place of its origin, pixels.
+        angle: direction of its x axis, radians from the picture's x towards the picture's y.
+        scale: pixels of the picture for one unit of the frame.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    angle: float = 0.0
+    scale: float = 1.0
+
+    def to_picture(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return points of this frame in the picture's pixels, (..., 2)."""
+        cos, sin = self.scale * math.cos(self.angle), self.scale * math.sin(self.angle)
+        turn = np.array([[cos, sin], [-sin, cos]])
+        moved: NDArray[np.float64] = np.asarray(points, np.float64) @ turn + (self.x, self.y)
+        return moved
+
+    def from_picture(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return points of the picture in this frame, (..., 2)."""
+        cos, sin = math.cos(self.angle) / self.scale, math.sin(self.angle) / self.scale
+        turn = np.array([[cos, -sin], [sin, cos]])
+        moved: NDArray[np.float64] = (np.asarray(points, np.float64) - (self.x, self.y)) @ turn
+        return moved
+
+
+IDENTITY: Final = PixelPose()
+"""The frame of reference of the picture itself."""
+
+
+class Region(tuple[tuple[float, float], ...]):
+    """The corners of what a tool looks at, in order; in a program file ``[x, y, width, height]``.
+
+    The numbers count pixels: ``[0, 0, 640, 480]`` are the first 640 columns of the first 480 rows.
+    A polygon is a list of three corners or more, ``[[x, y], ...]``. The coordinates are pixels of
+    the picture, or of the frame of reference that the tool follows.
+    """
+
+    __slots__ = ()
+
+
+def _region(given: object) -> Region:
+    if isinstance(given, Region):
+        return given
+    items: list[Any] = list(given) if isinstance(given, (list, tuple)) else []
+    if len(items) == 4 and all(_is_coordinate(one) for one in items):
+        x, y, width, height = map(float, items)
+        if width <= 0 or height <= 0:
+            raise ValueError(f"expected a width and a height above 0, got {width:g} x {height:g}")
+        right, below = x + width, y + height
+        return Region(((x, y), (right, y), (right, below), (x, below)))
+    if 3 <= len(items) <= MAX_CORNERS and all(
+        isinstance(one, (list, tuple)) and len(one) == 2 and all(map(_is_coordinate, one))
+        for one in items
+    ):
+        return Region((float(x), float(y)) for x, y in items)
+    raise ValueError(
+        f"expected [x, y, width, height], or 3 to {MAX_CORNERS} corners [[x, y], ...], in pixels; "
+        f"got {given!r:.80}"
+    )
+
+
+def _is_coordinate(value: object) -> bool:
+    return (
+        isinstance(value, (int, float))
+        and not isinstance(value, bool)
+        and abs(value) <= MAX_COORDINATE_PX
+    )
+
+
+_PLACE: Final = {"type": "array", "items": {"type": "number"}, "minItems": 2}
+RegionSetting = Annotated[
+    Region,
+    PlainValidator(_region),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
+                {"type": "array", "items": _PLACE, "minItems": 3, "maxItems": MAX_CORNERS},
+            ]
+        }
+    ),
+]
+"""A region as a field of a tool's settings."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedRegion:
+    """A region where it lies in one picture.
+
+    Attributes:
+        corners: corners in the picture's pixels, (N, 2).
+        left: first column of the pixels that it touches, within the picture.
+        top: first row.
+        right: column behind the last one.
+        below: row behind the last one.
+        outside: how far it reaches out of the picture, pixels; 0: not at all.
+    """
+
+    corners: NDArray[np.float64]
+    left: int
+    top: int
+    right: int
+    below: int
+    outside: float
+
+    @property
+    def is_empty(self) -> bool:
+        """True if nothing of the region is in the picture."""
+        return self.right <= self.left or self.below <= self.top
+
+    @property
+    def rows_columns(self) -> tuple[slice, slice]:
+        """The pixels around the region, to index a picture with."""
+        return slice(self.top, self.below), slice(self.left, self.right)
+
+    def contains(self, point: tuple[float, float]) -> bool:
+        """Return True if a point of the picture is in the region, or on its border."""
+        cv2 = load("cv2", "inspection needs")
+        corners = self.corners.astype(np.float32)[:, np.newaxis]
+        return bool(cv2.pointPolygonTest(corners, point, measureDist=False) >= 0)
+
+    def mask(self) -> NDArray[np.uint8]:
+        """Return 255 where a pixel around the region belongs to it, else 0; (H, W)."""
+        found = np.zeros((self.below - self.top, self.right - self.left), np.uint8)
+        corners = np.rint(self.corners - (self.left, self.top)).astype(np.int32)
+        load("cv2", "inspection needs").fillPoly(found, [corners], 255)
+        return found
+
+
+def place(region: Region | None, pose: PixelPose | None, size: tuple[int, int]) -> PlacedRegion:
+    """Return a region's place in a picture.
+
+    Args:
+        region: the region; None: the whole picture.
+        pose: frame of reference that its corners are in. None: they count the picture's pixels, so
+            that ``[0, 0, width, height]`` is all of it, from half a pixel before the first centre.
+        size: width and height of the picture, pixels.
+    """
+    width, height = size
+    if region is None:
+        region, pose = _region([0, 0, width, height]), None
+    corners = np.asarray(region) - 0.5 if pose is None else pose.to_picture(region)
+    (left, top), (right, below) = corners.min(axis=0) + 0.5, corners.max(axis=0) + 0.5
+    return PlacedRegion(
+        corners,
+        max(math.floor(left), 0),
+        max(math.floor(top), 0),
+        min(math.ceil(right), width),
+        min(math.ceil(below), height),
+        float(max(-left, -top, right - width, below - height, 0.0)),
+    )

@@ -1,0 +1,189 @@
+"""The tool `present`: spots of a colour or a grey level, counted, with their places."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
+
+from smartcam._extras import load
+from smartcam.depth import ColourRange
+from smartcam.inspection._finding import Drawing, Finding
+from smartcam.inspection._places import PixelPose
+from smartcam.inspection._tool import Tool, ToolSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from smartcam.inspection._tool import ToolSetup, View
+
+MAX_SPOTS: Final = 1000
+"""Spots in one result."""
+
+MAX_AREA_PX: Final = 1_000_000_000
+"""Largest area of a spot that can be asked for, in pixels."""
+
+
+def _rising(given: tuple[int, int]) -> tuple[int, int]:
+    if given[0] > given[1]:
+        raise ValueError(f"expected the smaller number first, got {list(given)}")
+    return given
+
+
+Level = Annotated[int, Field(ge=0, le=255)]
+Area = Annotated[int, Field(ge=1, le=MAX_AREA_PX)]
+Number = Annotated[int, Field(ge=0, le=MAX_SPOTS)]
+
+
+class PresentSettings(ToolSettings):
+    """The spots that are looked for, and the number that there has to be."""
+
+    grey: Annotated[tuple[Level, Level], AfterValidator(_rising)] | None = Field(
+        None, description="grey levels of a spot, from and to, 0 to 255"
+    )
+    colour: ColourRange | None = Field(
+        None,
+        description="colours of a spot: {hue: [from, to], saturation: [from, to], value: [from, "
+        "to]}, as the page of smartcam frames colours finds them",
+    )
+    area: Annotated[tuple[Area, Area], AfterValidator(_rising)] = Field(
+        (20, MAX_AREA_PX), description="pixels of a spot, from and to; others do not count"
+    )
+    count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number = Field(
+        (1, MAX_SPOTS), description="how many there have to be: a number, or from and to"
+    )
+    most: int = Field(
+        1, ge=1, le=MAX_SPOTS, description="spots in the result at most, the largest first"
+    )
+
+    @model_validator(mode="after")
+    def _one_of(self) -> PresentSettings:
+        if (self.grey is None) == (self.colour is None):
+            got = "neither" if self.grey is None else "both"
+            raise ValueError(f"expected either grey or colour, got {got}")
+        return self
+
+
+class Spot(NamedTuple):
+    """A connected spot.
+
+    Attributes:
+        x: centre of gravity, pixels of the picture.
+        y: centre of gravity.
+        angle: direction of its long axis, radians from x towards y, more than -pi/2, at most pi/2;
+            NaN where it is as wide as long.
+        area: pixels.
+        box: left, top, width, height.
+    """
+
+    x: float
+    y: float
+    angle: float
+    area: int
+    box: tuple[int, int, int, int]
+
+    def values(self) -> Mapping[str, Any]:
+        """Return the fields of a spot."""
+        return {"x": self.x, "y": self.y, "angle": self.angle, "area": self.area}
+
+
+_FIELDS: Final = "x: real32 px, y: real32 px, angle: real32 deg, area: uint32"
+MIN_ELONGATION: Final = 1.05
+"""Length over width from which on a spot has a direction."""
+
+
+class Present(Tool[PresentSettings]):
+    """Spots of a colour or a grey level."""
+
+    settings_model = PresentSettings
+
+    def __init__(self, settings: PresentSettings, setup: ToolSetup) -> None:
+        super().__init__(settings, setup)
+        count = settings.count
+        self._least, self._most = count if isinstance(count, tuple) else (count, count)
+
+    @property
+    def fields(self) -> str:
+        """The number of spots, and the largest one."""
+        return f"count: uint16, {_FIELDS}" if self.settings.most == 1 else "count: uint16"
+
+    @property
+    def records(self) -> str:
+        """Each spot."""
+        return "" if self.settings.most == 1 else _FIELDS
+
+    def inspect(self, view: View) -> Finding:
+        """Return the spots, the largest first."""
+        spots = self._spots(view)
+        count = len(spots)
+        ok = self._least <= count <= self._most
+        wanted = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
+        kept = spots[: self.settings.most]
+        alone = dict(kept[0].values()) if kept and self.settings.most == 1 else {}
+        return Finding(
+            ok=ok,
+            reason="" if ok else f"{count} spots, expected {wanted}",
+            values={"count": min(count, 0xFFFF), **alone},
+            records=[] if self.settings.most == 1 else [spot.values() for spot in kept],
+            drawings=[
+                Drawing("polygon", _corners(view.region.corners), "region"),
+                *(_drawn(spot, ok=ok) for spot in spots[:MAX_SPOTS]),
+            ],
+            reference=PixelPose(kept[0].x, kept[0].y, _or_zero(kept[0].angle)) if kept else None,
+            details=tuple(kept),
+        )
+
+    def _spots(self, view: View) -> list[Spot]:
+        cv2 = load("cv2", "inspection needs")
+        if self.settings.colour is not None:
+            mask = self.settings.colour.mask(view.rgb).view(np.uint8)
+        else:
+            assert self.settings.grey is not None  # noqa: S101 - the settings say so
+            low, high = self.settings.grey
+            mask = cv2.inRange(view.grey, low, high)
+        mask = cv2.bitwise_and(mask, view.region.mask())
+        _, labels, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
+        least, most = self.settings.area
+        areas = stats[1:, cv2.CC_STAT_AREA]
+        kept = 1 + np.flatnonzero((areas >= least) & (areas <= most))
+        kept = kept[np.argsort(-stats[kept, cv2.CC_STAT_AREA], kind="stable")]
+        return [_spot(labels, int(one), stats[one], centres[one], view) for one in kept]
+
+
+def _spot(
+    labels: NDArray[Any], label: int, stats: NDArray[Any], centre: NDArray[Any], view: View
+) -> Spot:
+    left, top, width, height, area = map(int, stats)
+    cut = labels[top : top + height, left : left + width] == label
+    moments = load("cv2", "inspection needs").moments(cut.view(np.uint8), binaryImage=True)
+    xx, yy, xy = moments["mu20"], moments["mu02"], moments["mu11"]
+    spread = math.hypot(xx - yy, 2 * xy)
+    long, short = xx + yy + spread, max(xx + yy - spread, 0.0)
+    has_direction = long > MIN_ELONGATION**2 * short
+    x0, y0 = view.origin
+    return Spot(
+        x=float(centre[0]) + x0,
+        y=float(centre[1]) + y0,
+        angle=0.5 * math.atan2(2 * xy, xx - yy) if has_direction else math.nan,
+        area=area,
+        box=(left + x0, top + y0, width, height),
+    )
+
+
+def _or_zero(angle: float) -> float:
+    return 0.0 if math.isnan(angle) else angle
+
+
+def _corners(corners: NDArray[Any]) -> tuple[tuple[float, float], ...]:
+    return tuple((float(x), float(y)) for x, y in corners)
+
+
+def _drawn(spot: Spot, *, ok: bool) -> Drawing:
+    left, top, width, height = spot.box
+    right, below = left + width - 0.5, top + height - 0.5
+    corners = ((left - 0.5, top - 0.5), (right, top - 0.5), (right, below), (left - 0.5, below))
+    return Drawing("polygon", corners, "found" if ok else "wrong", f"{spot.area}")

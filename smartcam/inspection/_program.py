@@ -1,0 +1,364 @@
+"""Programs: the tools of an application, in order, over one picture."""
+
+from __future__ import annotations
+
+import re
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from pydantic import ValidationError
+
+from smartcam._arguments import check_bytes, check_text, wrong_argument
+from smartcam._suggestions import did_you_mean, hint
+from smartcam.exceptions import ConfigurationError, InspectionError, PluginError, SmartCamError
+from smartcam.inspection._finding import Finding, Inspection
+from smartcam.inspection._picture import Picture
+from smartcam.inspection._places import IDENTITY, place
+from smartcam.inspection._tool import Tool, ToolSettings, View
+from smartcam.layout import Field, Layout
+from smartcam.registry import TOOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.frames import Frame
+    from smartcam.inspection._tool import AnyTool, ToolSetup
+
+MAX_TOOLS: Final = 50
+"""Tools of one program."""
+
+MAX_REASON_BYTES: Final = 80
+"""Bytes of the reason in a result container; a longer one is cut there."""
+
+OWN_FIELDS: Final = ("ok", "reason")
+"""Fields of the program's own, which no tool may have."""
+
+_NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,29}")
+
+Place = tuple[int | str, ...]
+
+
+class ProgramError(ConfigurationError):
+    """A mistake in a program's settings.
+
+    Attributes:
+        place: keys that lead to it, from the application's own mapping.
+    """
+
+    def __init__(self, message: str, place: Place = ()) -> None:
+        super().__init__(message)
+        self.place = place
+
+
+@dataclass(frozen=True, slots=True)
+class ProgramStep:
+    """A tool in a program.
+
+    Attributes:
+        name: name of the tool in its program, unique there.
+        tool: the tool.
+        own: False for a tool of another application that a tool of this one follows: it runs, but
+            its values are not in the result.
+        fields: the fields of its values, with the names that they have in the result.
+        records: the fields of what it finds several of.
+    """
+
+    name: str
+    tool: AnyTool
+    own: bool
+    fields: tuple[Field, ...] = ()
+    records: tuple[Field, ...] = ()
+
+
+class Program:
+    """The tools of an application, in the order in which they look at a picture.
+
+    Args:
+        application: number of the application.
+        name: name of the application.
+        steps: tools of the application.
+        sequence: True: the result has the sequence number in front.
+
+    Raises:
+        ConfigurationError: two tools find several things each, or the fields do not go together.
+
+    Attributes:
+        application: number of the application.
+        name: name of the application.
+        steps: tools of the application.
+        layout: layout of a result, which follows from the tools: ``ok: bool, reason: string[80]``,
+            and their fields. With several tools, the name of each is in front of its fields, and
+            each has an ``ok`` of its own.
+    """
+
+    def __init__(
+        self, application: int, name: str, steps: Sequence[ProgramStep], *, sequence: bool = False
+    ) -> None:
+        self.application = application
+        self.name = name
+        several = sum(step.own for step in steps) > 1
+        self.steps: tuple[ProgramStep, ...] = tuple(
+            _with_fields(step, several=several) for step in steps
+        )
+        head = [Field("sequence", "int32", sequence=True)] if sequence else []
+        head += [Field("ok", "bool"), Field("reason", "string", MAX_REASON_BYTES)]
+        head += (field for step in self.steps for field in step.fields)
+        text = ", ".join(map(str, head))
+        groups = [step for step in self.steps if step.records]
+        if len(groups) > 1:
+            raise ConfigurationError(
+                f"{groups[0].name} and {groups[1].name} each find several things, and a result has "
+                "room for one list: expected one of them, and the other one in another application"
+            )
+        if groups:
+            text += f", {groups[0].name}: ({', '.join(map(str, groups[0].records))})*"
+        self.layout: Layout = Layout(text)
+        self._several = several
+
+    @property
+    def interpret_as(self) -> str:
+        """The layout's text: what a client interprets results as."""
+        return self.layout.text
+
+    def inspect(self, source: Frame | Picture | NDArray[Any], *, input: bytes = b"") -> Inspection:
+        """Return the answers of the tools about a picture. Blocks; runs in any thread.
+
+        Args:
+            source: a frame, or pixels as :class:`Picture` takes them.
+            input: input data of the trigger.
+
+        Raises:
+            FrameFormatError: it is no picture.
+            InspectionError: a tool failed.
+            MissingExtraError: what a tool needs is not installed.
+        """
+        input = check_bytes(input, "input", "Program.inspect")
+        picture = Picture.of(source)
+        findings, seconds = self._run(picture, input)
+        values: dict[str, Any] = {
+            "ok": all(found.ok for found in findings.values()),
+            "reason": "",
+        }
+        if self.layout.sequence_field is not None:
+            values["sequence"] = 0
+        for step in self.steps:
+            values |= _values(step, findings[step.name], several=self._several)
+        reason = _reason(findings)
+        values["reason"] = _cut(reason)
+        return Inspection(
+            application=self.application,
+            name=self.name,
+            ok=values["ok"],
+            reason=reason,
+            values=values,
+            findings=findings,
+            seconds=seconds,
+            layout=self.layout,
+            picture=picture,
+        )
+
+    def _run(self, picture: Picture, input: bytes) -> tuple[dict[str, Finding], dict[str, float]]:
+        findings: dict[str, Finding] = {}
+        seconds: dict[str, float] = {}
+        for step in self.steps:
+            started = time.perf_counter()
+            try:
+                findings[step.name] = _ask(step.tool, picture, input, findings)
+            except SmartCamError:
+                raise
+            except Exception as exc:
+                raise InspectionError(
+                    f"application {self.application} ({self.name}): the tool {step.name} failed: "
+                    f"{exc!r}",
+                    application=self.application,
+                    tool=step.name,
+                ) from exc
+            seconds[step.name] = time.perf_counter() - started
+        return findings, seconds
+
+
+class FollowedApplication(Tool[ToolSettings]):
+    """The tools of another application that a tool follows, as one tool.
+
+    Its frame of reference is that of the last one of them which has one.
+    """
+
+    settings_model = ToolSettings
+
+    def __init__(self, steps: Sequence[ProgramStep], setup: ToolSetup) -> None:
+        super().__init__(ToolSettings.model_validate({}), setup)
+        self._steps = tuple(steps)
+
+    def inspect(self, view: View) -> Finding:
+        """Return the verdict of all of them, and the last frame of reference."""
+        findings: dict[str, Finding] = {}
+        for step in self._steps:
+            findings[step.name] = _ask(step.tool, view.picture, view.input, findings)
+        references = [one.reference for one in findings.values() if one.reference is not None]
+        return Finding(
+            ok=all(one.ok for one in findings.values()),
+            reason=_reason(findings),
+            drawings=[mark for one in findings.values() for mark in one.drawings],
+            reference=references[-1] if references else None,
+        )
+
+
+def _reason(findings: Mapping[str, Finding]) -> str:
+    """Return the first reason among findings; "" where all are ok."""
+    for name, found in findings.items():
+        if not found.ok:
+            why = found.reason or "not ok"
+            return f"{name}: {why}" if len(findings) > 1 else why
+    return ""
+
+
+def _ask(tool: AnyTool, picture: Picture, input: bytes, earlier: Mapping[str, Finding]) -> Finding:
+    """Return the finding of a tool, or the reason that it cannot be asked."""
+    settings: ToolSettings = tool.settings
+    reference = None
+    if settings.follow is not None:
+        reference = earlier[settings.follow].reference
+        if reference is None:
+            return Finding(ok=False, reason=f"{settings.follow} was not found, which it follows")
+    region = place(settings.region, reference, picture.size)
+    outside = region.outside > 0.5 and tool.needs_whole_region
+    if region.is_empty or outside:
+        width, height = picture.size
+        return Finding(
+            ok=False,
+            reason=f"the region reaches {region.outside:.0f} px out of the picture of {width} x "
+            f"{height}",
+        )
+    view = View(
+        picture=picture,
+        region=region,
+        reference=IDENTITY if reference is None else reference,
+        follows=reference is not None,
+        input=input,
+        earlier=earlier,
+    )
+    return tool.inspect(view)
+
+
+def _with_fields(step: ProgramStep, *, several: bool) -> ProgramStep:
+    if not step.own:
+        return step
+    fields = Layout(step.tool.fields).fields if step.tool.fields else ()
+    records = Layout(step.tool.records).fields if step.tool.records else ()
+    for field in (*fields, *records):
+        if field.name in OWN_FIELDS or field.sequence:
+            raise ConfigurationError(f"{step.name}: a tool may not have the field {field.name!r}")
+    if several:
+        own = Field("ok", "bool")
+        fields = tuple(replace(one, name=f"{step.name}_{one.name}") for one in (own, *fields))
+    return replace(step, fields=fields, records=records)
+
+
+def _values(step: ProgramStep, found: Finding, *, several: bool) -> dict[str, Any]:
+    """Return a finding's values by the names in the result; what is missing has no value."""
+    if not step.own:
+        return {}
+    prefix = f"{step.name}_" if several else ""
+    given = {**found.values, "ok": found.ok} if several else found.values
+    values = {
+        field.name: given.get(field.name.removeprefix(prefix), _nothing(field))
+        for field in step.fields
+    }
+    if step.records:
+        values[step.name] = [
+            {field.name: one.get(field.name, _nothing(field)) for field in step.records}
+            for one in found.records
+        ]
+    return values
+
+
+def _nothing(field: Field) -> Any:
+    """Return the value of a field that has none."""
+    if field.type == "bool":
+        return False
+    if field.type == "string":
+        return ""
+    if field.type.startswith("real"):
+        return float("nan")
+    return 0
+
+
+def _cut(reason: str) -> str:
+    data = reason.encode()
+    if len(data) <= MAX_REASON_BYTES:
+        return reason
+    return data[: MAX_REASON_BYTES - 3].decode(errors="ignore") + "..."
+
+
+# ---------------------------------------------------------------------- making one
+
+
+def split_name(key: str) -> tuple[str, str]:
+    """Return the tool of a key in an application, and its name: ``read`` or ``read left``."""
+    kind, _, name = key.partition(" ")
+    return kind, name.strip() or kind
+
+
+def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] = ()) -> ProgramStep:
+    """Return the step that an application's entry says.
+
+    Args:
+        key: ``TOOL``, or ``TOOL NAME`` where a program has several of one kind.
+        given: settings of the tool, as YAML gives them.
+        setup: what the tool may use.
+        others: names of settings that stand beside tools, for the hint at what was meant.
+
+    Raises:
+        ProgramError: the tool is unknown, or a setting is wrong.
+    """
+    kind, name = split_name(key)
+    if _NAME.fullmatch(name) is None:
+        raise ProgramError(
+            f"expected a name of small letters, digits and _, such as 'read left'; got "
+            f"{name!r:.60}",
+            (key,),
+        )
+    if kind not in TOOLS:
+        tools = [info.name for info in TOOLS.available()]
+        raise ProgramError(
+            f"no tool is called {kind!r:.60}; tools are {', '.join(tools)}"
+            f"{did_you_mean(kind, [*tools, *others])}",
+            (key,),
+        )
+    try:
+        tool_class = cast("type[AnyTool]", TOOLS.load(kind))
+    except PluginError as exc:
+        raise ProgramError(str(exc), (key,)) from exc
+    if not (isinstance(tool_class, type) and issubclass(tool_class, Tool)):
+        raise ProgramError(f"{kind} is no subclass of smartcam.inspection.Tool", (key,))
+    model = tool_class.settings_model
+    try:
+        settings = model.model_validate({} if given is None else given)
+    except ValidationError as exc:
+        first = exc.errors(include_url=False)[0]
+        text = first["msg"].removeprefix("Value error, ") + hint(first, model.model_fields)
+        raise ProgramError(text, (key, *first["loc"])) from exc
+    try:
+        return ProgramStep(name, tool_class(settings, setup), own=True)
+    except ProgramError as exc:
+        raise ProgramError(str(exc), (key, *exc.place)) from exc
+    except (SmartCamError, OSError) as exc:
+        raise ProgramError(str(exc), (key,)) from exc
+
+
+def register_tool(name: str, tool: type[AnyTool]) -> None:
+    """Have a tool in this process, without a package that brings it.
+
+    Raises:
+        ConfigurationError: it is no tool, or the name cannot be one.
+        PluginError: the name is taken by another one.
+    """
+    if not (isinstance(tool, type) and issubclass(tool, Tool)):
+        raise wrong_argument("tool", "a subclass of smartcam.inspection.Tool", tool)
+    name = check_text(name, "name", "register_tool")
+    if _NAME.fullmatch(name) is None:
+        raise wrong_argument("name", "a name of small letters, digits and _", name)
+    TOOLS.register(name, tool)

@@ -1,0 +1,146 @@
+"""Codes as zxing-cpp reads them."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._extras import load
+from smartcam._suggestions import did_you_mean
+from smartcam.inspection._read.gs1 import elements
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+Point = tuple[float, float]
+Corners = tuple[Point, Point, Point, Point]
+
+USE: Final = "reading codes needs"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadCode:
+    """A code that was read.
+
+    Attributes:
+        kind: kind of the code, such as ``DataMatrix``.
+        data: bytes that the code holds; in a GS1 code with GS (0x1D) between elements.
+        text: the bytes as text, by the character set that the code says.
+        gs1: application identifier and value of each GS1 element; empty: it is no GS1 code.
+        symbology: symbology identifier of ISO/IEC 15424, such as ``]d2``.
+        corners: upper left, upper right, lower right, lower left of the code as it is printed,
+            pixels of the picture.
+        angle: direction of its upper edge, radians from x towards y.
+        unused_correction: share of the code's error correction that reading did not need, 0 to 1;
+            None: the kind has none.
+        level: error correction level, such as ``H``; "" where the kind has none.
+        version: size of the symbol, such as ``12x26``; "" where the kind has none.
+        prepared: what had to be done to the picture before; "" for nothing.
+    """
+
+    kind: str
+    data: bytes
+    text: str
+    gs1: tuple[tuple[str, str], ...]
+    symbology: str
+    corners: Corners
+    angle: float
+    unused_correction: float | None = None
+    level: str = ""
+    version: str = ""
+    prepared: str = ""
+
+    @property
+    def centre(self) -> Point:
+        """Mean of the corners, pixels of the picture."""
+        return sum(x for x, _ in self.corners) / 4, sum(y for _, y in self.corners) / 4
+
+
+@functools.cache
+def kinds() -> dict[str, Any]:
+    """Return the kinds of codes that can be read, by name.
+
+    Raises:
+        MissingExtraError: zxing-cpp is not installed.
+    """
+    zxing = load("zxingcpp", USE)
+    return {one.name: one for one in zxing.barcode_formats_list(zxing.BarcodeFormat.AllReadable)}
+
+
+def formats_of(names: Sequence[str]) -> Any:
+    """Return zxing-cpp's set of the kinds with these names; all where none is named.
+
+    Raises:
+        ValueError: a name is unknown.
+        MissingExtraError: zxing-cpp is not installed.
+    """
+    zxing = load("zxingcpp", USE)
+    known = kinds()
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"no kind of code is called {name!r:.40}; known are {', '.join(known)}"
+                f"{did_you_mean(name, known)}"
+            )
+    chosen = [known[name] for name in names] or [zxing.BarcodeFormat.AllReadable]
+    return zxing.BarcodeFormats(chosen)
+
+
+def read_codes(
+    grey: NDArray[np.uint8],
+    formats: Any,
+    back: NDArray[np.float64],
+    binarizer: str = "LocalAverage",
+    prepared: str = "",
+) -> list[ReadCode]:
+    """Return the codes in a picture.
+
+    Args:
+        grey: (H, W), in one block.
+        formats: as :func:`formats_of` gives them.
+        back: (2, 3), where its pixels are in the picture that corners are of.
+        binarizer: zxing-cpp's name for how it tells dark from light.
+        prepared: what was done to the picture before.
+    """
+    zxing = load("zxingcpp", USE)
+    found = zxing.read_barcodes(
+        grey,
+        formats=formats,
+        text_mode=zxing.TextMode.Plain,
+        binarizer=getattr(zxing.Binarizer, binarizer),
+    )
+    is_gs1 = zxing.ContentType.GS1
+    return [_code(one, back, prepared, gs1=one.content_type == is_gs1) for one in found]
+
+
+def _code(one: Any, back: NDArray[np.float64], prepared: str, *, gs1: bool) -> ReadCode:
+    place = one.position  # whole numbers, which name pixels
+    corners = [
+        (float(x), float(y))
+        for x, y in (
+            back[:, :2] @ (at.x, at.y) + back[:, 2]
+            for at in (place.top_left, place.top_right, place.bottom_right, place.bottom_left)
+        )
+    ]
+    (x1, y1), (x2, y2) = corners[:2]
+    extra = one.extra or {}
+    text = one.text
+    unused = extra.get("UEC")
+    return ReadCode(
+        kind=one.format.name,
+        data=one.bytes,
+        text=text,
+        gs1=elements(text) if gs1 else (),
+        symbology=one.symbology_identifier,
+        corners=(corners[0], corners[1], corners[2], corners[3]),
+        angle=math.atan2(y2 - y1, x2 - x1),
+        unused_correction=None if unused is None else float(unused),
+        level=one.ec_level or str(extra.get("ECLevel", "")),
+        version=str(extra.get("Version", "")),
+        prepared=prepared,
+    )

@@ -1,0 +1,55 @@
+"""GS1 element strings, cut into application identifiers and values.
+
+GS1 General Specifications, 7.8: an element whose first two digits are in the table of predefined
+lengths has that length; every other one ends at GS or at the end.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+GS: Final = "\x1d"
+
+_PREDEFINED: Final = {
+    "00": 20,
+    "01": 16,
+    "02": 16,
+    "03": 16,
+    "04": 18,
+    "20": 4,
+    "41": 16,
+    **{str(one): 8 for one in range(11, 20)},
+    **{str(one): 10 for one in range(31, 37)},
+}
+"""Characters of an element, its identifier included, by the first two digits."""
+
+_IDENTIFIER_DIGITS: Final = {
+    **dict.fromkeys(["23", "24", "25", "40", "41", "42", "71"], 3),
+    **dict.fromkeys(["31", "32", "33", "34", "35", "36", "39", "43", "70", "72"], 4),
+    **dict.fromkeys(["80", "81", "82"], 4),
+}
+"""Digits of an application identifier by its first two; 2 for all others."""
+
+
+def elements(text: str) -> tuple[tuple[str, str], ...]:
+    """Return application identifier and value of each element.
+
+    An element that is cut off, or whose identifier is no number, ends the list: it and what follows
+    are the last value, behind the identifier "".
+    """
+    found: list[tuple[str, str]] = []
+    at = 1 if text.startswith(GS) else 0
+    while at < len(text):
+        digits = _IDENTIFIER_DIGITS.get(text[at : at + 2], 2)
+        identifier = text[at : at + digits]
+        length = _PREDEFINED.get(text[at : at + 2])
+        reach = len(text) if length is None else min(at + length, len(text))
+        end = text.find(GS, at, reach)
+        end = reach if end < 0 else end
+        stop = end if length is None else at + length
+        if not (identifier.isascii() and identifier.isdigit()) or not at + digits < stop <= end:
+            found.append(("", text[at:]))
+            break
+        found.append((identifier, text[at + digits : stop]))
+        at = stop + 1 if text[stop : stop + 1] == GS else stop
+    return tuple(found)

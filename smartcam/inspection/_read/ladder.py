@@ -1,0 +1,257 @@
+"""Try again after a miss: the same reader, on the picture prepared otherwise.
+
+Each rung stands here because it reads codes of the measured sets that those before it miss; they
+stand in the order of what they gain for their time. ``tests.proofs.codes`` measures them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.inspection._read.codes import ReadCode, read_codes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    Affine = NDArray[np.float64]
+    Prepared = tuple[NDArray[np.uint8], Affine]
+
+MAX_RUNG_PIXELS: Final = 16_000_000
+"""Pixels of a prepared picture; a rung that would make more is left out."""
+
+CONFIRMED: Final = frozenset(
+    {
+        *("Codabar", "Code32", "Code39", "Code39Ext", "Code39Std", "Code93", "Code128"),
+        *("DXFilmEdge", "EAN13", "EAN8", "EANUPC", "ISBN", "ITF", "ITF14", "PZN", "UPCA", "UPCE"),
+        *("Telepen", "TelepenAlpha", "TelepenNumeric", "OtherBarcode"),
+        *("DataBar", "DataBarLtd", "DataBarOmni", "DataBarStk", "DataBarStkOmni"),
+        *("PDF417", "CompactPDF417", "MicroPDF417"),
+    }
+)
+"""Kinds whose checksum is weak or missing, and those with rows that may be misread one by one: in a
+prepared picture they count only if a second reading is the same: that of another rung, or of the
+same one on a smaller picture."""
+
+CONFIRMING_SCALE: Final = 0.9
+"""Size of the picture of the second reading: its samples lie elsewhere."""
+
+MAX_SAME_PLACE: Final = 0.5
+"""Distance of the centres of two readings of one code, as a share of its longest edge."""
+
+
+class Rung(NamedTuple):
+    """One preparation.
+
+    Attributes:
+        name: what it does.
+        prepare: picture to prepared picture, with where its pixels are in the picture.
+        scale: pixels of the prepared picture along a side for one of the picture.
+        binarizer: zxing-cpp's name for how it tells dark from light.
+    """
+
+    name: str
+    prepare: Callable[[NDArray[np.uint8]], Prepared]
+    scale: float = 1.0
+    binarizer: str = "LocalAverage"
+
+
+class CodeSearch(NamedTuple):
+    """The picture that is read, and the codes that count.
+
+    Attributes:
+        grey: picture, (H, W).
+        formats: kinds that are looked for.
+        origin: place of the first pixel in the picture that corners are of.
+        counts: function that says whether a code lies where it counts.
+    """
+
+    grey: NDArray[np.uint8]
+    formats: Any
+    origin: tuple[float, float]
+    counts: Callable[[ReadCode], bool]
+
+
+def read_again(
+    search: CodeSearch, found: Sequence[ReadCode], least: int, deadline: float, expected: float
+) -> list[ReadCode]:
+    """Return the codes found before, with those that the rungs find, until there are enough.
+
+    Args:
+        search: the picture, and what is looked for.
+        found: codes found before.
+        least: how many are enough.
+        deadline: seconds of ``time.monotonic()`` at which no further rung begins; one that would
+            take longer is left out.
+        expected: seconds that reading took without preparation.
+    """
+    grey, counts = search.grey, search.counts
+    codes = list(found)
+    waiting: list[ReadCode] = []
+    for rung in RUNGS:
+        if len(codes) >= least:
+            break
+        cost = max(rung.scale**2, 1.0)
+        if cost * grey.size > MAX_RUNG_PIXELS or time.monotonic() + cost * expected > deadline:
+            continue
+        smaller: list[ReadCode] | None = None
+        for code in _by_rung(rung, search):
+            if not counts(code) or any(_is_same(code, one) for one in codes):
+                continue
+            if code.kind in CONFIRMED and not any(_is_same(code, one) for one in waiting):
+                if smaller is None:
+                    smaller = _by_rung(rung, search, CONFIRMING_SCALE)
+                if not any(_is_same(code, one) for one in smaller):
+                    waiting.append(code)
+                    continue
+            codes.append(code)
+    return codes
+
+
+def _by_rung(rung: Rung, search: CodeSearch, scale: float = 1.0) -> list[ReadCode]:
+    """Return the codes that one rung finds, in the picture or in a smaller one."""
+    grey = search.grey if scale == 1.0 else _resize(search.grey, scale)
+    prepared, back = rung.prepare(grey)
+    places = _scaled_by(scale)
+    back = places[:, :2] @ back + np.column_stack([np.zeros((2, 2)), places[:, 2]])
+    back[:, 2] += search.origin
+    ready = np.ascontiguousarray(prepared)
+    return read_codes(ready, search.formats, back, rung.binarizer, rung.name)
+
+
+def _is_same(one: ReadCode, other: ReadCode) -> bool:
+    if one.data != other.data or one.kind != other.kind:
+        return False
+    reach = max(math.dist(a, b) for a, b in zip(other.corners, other.corners[1:], strict=False))
+    return math.dist(one.centre, other.centre) <= MAX_SAME_PLACE * max(reach, 1.0)
+
+
+# ---------------------------------------------------------------------- preparations
+
+
+def _scaled_by(scale: float) -> Affine:
+    """Return the map from a scaled picture's pixels to the picture's."""
+    shift = 0.5 / scale - 0.5
+    return np.array([[1 / scale, 0, shift], [0, 1 / scale, shift]])
+
+
+def _resize(grey: NDArray[np.uint8], scale: float) -> NDArray[np.uint8]:
+    cv2 = load("cv2", "inspection needs")
+    how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    size = [max(round(side * scale), 1) for side in (grey.shape[1], grey.shape[0])]
+    resized: NDArray[np.uint8] = cv2.resize(grey, size, interpolation=how)
+    return resized
+
+
+def _blur(grey: NDArray[np.uint8], sigma: float) -> NDArray[np.uint8]:
+    blurred: NDArray[np.uint8] = load("cv2", "inspection needs").GaussianBlur(grey, (0, 0), sigma)
+    return blurred
+
+
+def _sharpen(grey: NDArray[np.uint8], sigma: float, amount: float) -> NDArray[np.uint8]:
+    cv2 = load("cv2", "inspection needs")
+    sharp: NDArray[np.uint8] = cv2.addWeighted(grey, 1 + amount, _blur(grey, sigma), -amount, 0)
+    return sharp
+
+
+def _local_contrast(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    cv2 = load("cv2", "inspection needs")
+    level: NDArray[np.uint8] = cv2.createCLAHE(3.0, (8, 8)).apply(grey)
+    return level
+
+
+def _median(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    smooth: NDArray[np.uint8] = load("cv2", "inspection needs").medianBlur(grey, 5)
+    return smooth
+
+
+def _threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return black and white by Otsu's threshold."""
+    cv2 = load("cv2", "inspection needs")
+    black: NDArray[np.uint8] = cv2.threshold(grey, 0, 255, cv2.THRESH_OTSU)[1]
+    return black
+
+
+def _local_threshold(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return black and white by the mean of the neighbourhood."""
+    cv2 = load("cv2", "inspection needs")
+    how = cv2.ADAPTIVE_THRESH_GAUSSIAN_C
+    black: NDArray[np.uint8] = cv2.adaptiveThreshold(grey, 255, how, cv2.THRESH_BINARY, 51, 4)
+    return black
+
+
+def _turned(grey: NDArray[np.uint8], degrees: float) -> Prepared:
+    """Return the picture turned clockwise, the rest white."""
+    cv2 = load("cv2", "inspection needs")
+    height, width = grey.shape
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    wide = math.ceil(width * abs(cos) + height * abs(sin))
+    high = math.ceil(width * abs(sin) + height * abs(cos))
+    back = np.array([[cos, sin, 0.0], [-sin, cos, 0.0]])
+    middle = np.array([(wide - 1) / 2, (high - 1) / 2])
+    back[:, 2] = ((width - 1) / 2, (height - 1) / 2) - back[:, :2] @ middle
+    how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    turned: NDArray[np.uint8] = cv2.warpAffine(
+        grey, back, (wide, high), flags=how, borderMode=cv2.BORDER_CONSTANT, borderValue=255
+    )
+    return turned, back
+
+
+def _rung(
+    name: str,
+    *steps: Callable[[NDArray[np.uint8]], NDArray[np.uint8]],
+    scale: float = 1.0,
+    binarizer: str = "LocalAverage",
+) -> Rung:
+    """Return the rung that scales the picture and then does the steps."""
+
+    def prepare(grey: NDArray[np.uint8]) -> Prepared:
+        made = grey if scale == 1.0 else _resize(grey, scale)
+        for step in steps:
+            made = step(made)
+        return made, _scaled_by(scale)
+
+    return Rung(name, prepare, scale, binarizer)
+
+
+def _turning(degrees: float) -> Rung:
+    return Rung(f"turned by {degrees:g} degrees", lambda grey: _turned(grey, degrees), 1.3)
+
+
+_FIXED: Final = "FixedThreshold"
+
+RUNGS: Final[tuple[Rung, ...]] = (
+    _rung(
+        "half as large, blurred, threshold",
+        partial(_blur, sigma=1.0),
+        _threshold,
+        scale=0.5,
+        binarizer=_FIXED,
+    ),
+    _rung("local contrast", _local_contrast),
+    _rung("median, threshold", _median, _threshold, binarizer=_FIXED),
+    _rung("a quarter as large, blurred", partial(_blur, sigma=1.0), scale=0.25),
+    _rung("inverted, threshold", np.invert, _threshold, binarizer=_FIXED),
+    _rung("half again as large", scale=1.5),
+    _turning(-22),
+    _rung("local threshold", _local_threshold, binarizer=_FIXED),
+    _rung("twice as large, sharpened", partial(_sharpen, sigma=3.0, amount=3.0), scale=2),
+    _rung("twice as large, local contrast", _local_contrast, scale=2),
+    _turning(22),
+    _turning(45),
+    _rung("twice as large, one threshold", scale=2, binarizer="GlobalHistogram"),
+    _rung(
+        "twice as large, sharpened, local contrast",
+        partial(_sharpen, sigma=3.0, amount=2.0),
+        _local_contrast,
+        scale=2,
+    ),
+)
+"""All of them, in the order in which they are tried."""

@@ -1,0 +1,208 @@
+"""The tool `read`: what is asked of it, and its finding."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.inspection._finding import Drawing, Finding
+from smartcam.inspection._places import PixelPose
+from smartcam.inspection._read.codes import ReadCode, formats_of, read_codes
+from smartcam.inspection._read.ladder import CodeSearch, read_again
+from smartcam.inspection._read.patterns import nested_repetition
+from smartcam.inspection._tool import Tool, ToolSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from smartcam.inspection._tool import ToolSetup, View
+
+MAX_CODES: Final = 255
+"""Codes in one result; zxing-cpp finds no more."""
+
+MAX_TEXT_BYTES: Final = 4000
+"""Bytes of a code's text; no code holds many more."""
+
+INPUT: Final = "input"
+"""The word for the value of the input, as what a code has to hold."""
+
+
+def _pattern(given: str | None) -> str | None:
+    if given is not None and given != INPUT:
+        try:
+            re.compile(given)
+        except (re.error, RecursionError, OverflowError) as exc:
+            raise ValueError(f"expected a regular expression, or the word {INPUT}: {exc}") from exc
+        if (part := nested_repetition(given)) is not None:
+            raise ValueError(
+                "expected no repetition without an end inside another one, "
+                f"which can take years to match, got {part[:80]!r}"
+            )
+    return given
+
+
+class ReadSettings(ToolSettings):
+    """The codes that are read, and the text that they have to hold."""
+
+    codes: Annotated[
+        tuple[str, ...],
+        BeforeValidator(lambda given: (given,) if isinstance(given, str) else given),
+    ] = Field((), description="kinds such as DataMatrix, Code128, QRCode, EAN13; default: all")
+    expect: Annotated[str | None, AfterValidator(_pattern)] = Field(
+        None,
+        max_length=1000,
+        description="what the whole text has to be: a regular expression, or input: the value of "
+        "the input",
+    )
+    most: int = Field(1, ge=1, le=MAX_CODES, description="codes in the result at most")
+    least: int = Field(1, ge=0, le=MAX_CODES, description="codes that there have to be")
+    length: int = Field(
+        64, ge=1, le=MAX_TEXT_BYTES, description="bytes that the result has for a text"
+    )
+    corners: bool = Field(False, description="put the four corners into the result, too")
+    seconds: float = Field(
+        0.5,
+        ge=0,
+        le=60,
+        description="how long it goes on trying after a miss, with the picture prepared otherwise; "
+        "0: not at all",
+    )
+
+
+_CORNERS: Final = ("x1", "y1", "x2", "y2", "x3", "y3", "x4", "y4")
+
+
+class ReadTool(Tool[ReadSettings]):
+    """Codes."""
+
+    settings_model = ReadSettings
+    needs_whole_region = False  # a code that is read is whole
+
+    def __init__(self, settings: ReadSettings, setup: ToolSetup) -> None:
+        super().__init__(settings, setup)
+        if settings.least > settings.most:
+            raise ConfigurationError(f"expected least up to most, {settings.most}")
+        try:
+            self._formats = formats_of(settings.codes)
+        except ValueError as exc:
+            raise ConfigurationError(str(exc)) from exc
+        if settings.expect in (None, INPUT):
+            self._pattern = None
+        else:
+            self._pattern = re.compile(str(settings.expect))
+
+    @property
+    def fields(self) -> str:
+        """The number of codes, and the first one."""
+        return f"count: uint8, {self._of_code}" if self.settings.most == 1 else "count: uint8"
+
+    @property
+    def records(self) -> str:
+        """Each code."""
+        return "" if self.settings.most == 1 else self._of_code
+
+    @property
+    def _of_code(self) -> str:
+        text = f"text: string[{self.settings.length}], kind: string[20], "
+        text += "x: real32 px, y: real32 px, angle: real32 deg, unused_correction: real32"
+        if self.settings.corners:
+            text += "".join(f", {name}: real32 px" for name in _CORNERS)
+        return text
+
+    def inspect(self, view: View) -> Finding:
+        """Return the codes in the region."""
+        settings = self.settings
+        grey = np.ascontiguousarray(view.grey)
+        region = view.region
+        codes = self.read(grey, view.origin, lambda code: region.contains(code.centre))
+        reason = self._reason(codes, view.input)
+        fits = [code for code in codes if self._fits_layout(code)][: settings.most]
+        values = [self._values(code) for code in fits]
+        alone = values[0] if values and settings.most == 1 else {}
+        return Finding(
+            ok=not reason,
+            reason=reason,
+            values={"count": len(codes), **alone},
+            records=values if settings.most > 1 else [],
+            drawings=[
+                Drawing(
+                    "polygon",
+                    tuple((float(x), float(y)) for x, y in view.region.corners),
+                    "region",
+                ),
+                *(
+                    Drawing("polygon", code.corners, "wrong" if reason else "found", code.text[:40])
+                    for code in codes
+                ),
+            ],
+            reference=PixelPose(*codes[0].centre, codes[0].angle) if codes else None,
+            details=tuple(codes),
+        )
+
+    def read(
+        self,
+        grey: NDArray[np.uint8],
+        origin: tuple[int, int] = (0, 0),
+        counts: Callable[[ReadCode], bool] = lambda _: True,
+    ) -> list[ReadCode]:
+        """Return the codes, the upper ones first.
+
+        Args:
+            grey: the picture, (H, W), in one block.
+            origin: place of its first pixel in the picture that corners are of.
+            counts: function that says whether a code lies where it counts.
+        """
+        started = time.monotonic()
+        back = np.array([[1.0, 0, origin[0]], [0, 1, origin[1]]])
+        codes = [code for code in read_codes(grey, self._formats, back) if counts(code)]
+        if len(codes) < self.settings.least and self.settings.seconds:
+            took = time.monotonic() - started
+            deadline = started + self.settings.seconds
+            codes = read_again(
+                CodeSearch(grey, self._formats, origin, counts),
+                codes,
+                self.settings.least,
+                deadline,
+                took,
+            )
+        return sorted(codes, key=lambda code: (code.centre[1], code.centre[0]))
+
+    def _reason(self, codes: list[ReadCode], given: bytes) -> str:
+        """Return why these codes are not what they have to be; "" where they are."""
+        settings = self.settings
+        if len(codes) < settings.least:
+            return f"{len(codes)} codes, expected {settings.least}"
+        for code in codes:
+            if settings.expect == INPUT and code.data != given:
+                return f"read {code.data[:40]!r}, expected the input {given[:40]!r}"
+            if not self._fits_layout(code):
+                size = len(code.text.encode())
+                return f"the text has {size} bytes or a zero, expected up to {settings.length}"
+            if self._pattern is not None and self._pattern.fullmatch(code.text) is None:
+                return f"read {code.text[:40]!r}, expected {settings.expect}"
+        return ""
+
+    def _fits_layout(self, code: ReadCode) -> bool:
+        return len(code.text.encode()) <= self.settings.length and "\0" not in code.text
+
+    def _values(self, code: ReadCode) -> Mapping[str, Any]:
+        x, y = code.centre
+        values: dict[str, Any] = {
+            "text": code.text,
+            "kind": code.kind,
+            "x": x,
+            "y": y,
+            "angle": code.angle,
+        }
+        if code.unused_correction is not None:
+            values["unused_correction"] = code.unused_correction
+        if self.settings.corners:
+            values |= zip(_CORNERS, (one for corner in code.corners for one in corner), strict=True)
+        return values

@@ -1,0 +1,307 @@
+"""Teaching an application: its tools are tried on pictures, changed, and written into the file.
+
+The YAML stays as people wrote it: comments, order and quotes are kept, and only what differs is
+written.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from pydantic import ValidationError
+
+from smartcam._arguments import check_application, check_path, check_text
+from smartcam._extras import load
+from smartcam._suggestions import did_you_mean
+from smartcam._whole_files import replace_file
+from smartcam.exceptions import ConfigurationError
+from smartcam.inspection._cell import Software, make_camera
+from smartcam.inspection._program import ProgramError, split_name
+from smartcam.layout._inside import BadYamlError
+from smartcam.layout._inside import load as load_yaml
+from smartcam.registry import TOOLS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.inspection._finding import Finding, Inspection
+    from smartcam.inspection._program import Program
+
+MAX_FILE_BYTES: Final = 1 << 22
+"""Bytes of a cell file that is taught."""
+
+AREA_MARGIN: Final = 0.2
+"""Share by which a spot may be smaller or larger than those of the good pictures."""
+
+DIFFERENCE_MARGIN: Final = 1.5
+"""Times as many pixels may differ as in the good pictures."""
+
+LINE_WIDTH: Final = 4096
+"""Characters after which a written line is wrapped: none is."""
+
+OWN_KEYS: Final = ("name", "sequence", "rate")
+"""Keys of an application that are no tools."""
+
+
+class Teaching:
+    """An application of a cell file, while it is taught.
+
+    Args:
+        path: the cell file, or a fleet file.
+        camera: name of the software camera in it.
+        application: number of the application; one that is not there is added when it is saved.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or has no such software camera.
+        MissingExtraError: the extra ``inspection`` is not installed.
+
+    Attributes:
+        path: the file.
+        camera: name of the camera.
+        application: number of the application.
+        frames: address of the camera's frames.
+    """
+
+    def __init__(self, path: str | Path, camera: str, application: int) -> None:
+        self.path: Path = check_path(path, "path", "Teaching")
+        self.camera: str = check_text(camera, "camera", "Teaching")
+        self.application: int = check_application(application, who="Teaching")
+        software = self._software(self._read())
+        self.frames: str = Software.model_validate(software).frames_address(self.path.parent)
+        found = software["applications"].get(self.application, {})
+        self._entry: dict[str, Any] = found if isinstance(found, dict) else {}
+
+    @property
+    def name(self) -> str:
+        """Name of the application, its number where it has none."""
+        return str(self._entry.get("name") or self.application)
+
+    @property
+    def tools(self) -> dict[str, dict[str, Any]]:
+        """Settings of the application's tools by their keys, as the file has them."""
+        return {key: dict(given or {}) for key, given in self._entry.items() if key not in OWN_KEYS}
+
+    def program(self, tools: Mapping[str, Mapping[str, Any]]) -> Program:
+        """Return the program that these tools make, among the file's other applications.
+
+        Raises:
+            ConfigurationError: a tool or a setting is wrong; the text says which.
+        """
+        software = self._software(self._read())
+        software["applications"][self.application] = self._changed(tools)
+        try:
+            checked = Software.model_validate(software)
+        except ValidationError as exc:
+            first = exc.errors(include_url=False)[0]
+            raise ConfigurationError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from exc
+        try:
+            made = make_camera(self.camera, checked, self.path.parent)
+        except ProgramError as exc:
+            place = [str(one) for one in exc.place if one not in {"applications", self.application}]
+            text = f"{'.'.join(place)}: {exc}" if place else str(exc)
+            raise ConfigurationError(text) from exc
+        return made.programs[self.application]
+
+    def _changed(self, tools: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+        """Return the application's entry with other tools."""
+        own = {key: one for key, one in self._entry.items() if key in OWN_KEYS}
+        return {**own, **{key: dict(given) for key, given in tools.items()}}
+
+    def save(self, tools: Mapping[str, Mapping[str, Any]]) -> None:
+        """Write the tools into the file, which otherwise stays as it is, comments and all.
+
+        Raises:
+            ConfigurationError: a tool or setting is wrong, or the file cannot be written; it is as
+                it was.
+            MissingExtraError: the extra ``inspection`` is not installed.
+        """
+        self.program(tools)
+        entry = self._changed(tools)
+        yaml: Any = load("ruamel.yaml", "teaching needs").YAML()
+        yaml.preserve_quotes = True
+        yaml.width = LINE_WIDTH
+        text = self._text()
+        if re.search(r"^( *)[^\s#-].*:\s*(#.*)?\n\1 +- ", text, re.MULTILINE):
+            yaml.indent(mapping=2, sequence=4, offset=2)
+        whole = yaml.load(text)
+        applications = whole["cameras"][self.camera]["software"]["applications"]
+        if isinstance(applications.get(self.application), dict):
+            _update(applications[self.application], entry)
+        else:
+            applications[self.application] = _flow(entry)
+        written = io.StringIO()
+        yaml.dump(whole, written)
+        self._check_written(written.getvalue(), entry)
+        try:
+            replace_file(self.path, written.getvalue().encode())
+        except OSError as exc:
+            raise ConfigurationError(f"{self.path} cannot be written: {exc}") from exc
+        self._entry = entry
+
+    def _check_written(self, text: str, entry: dict[str, Any]) -> None:
+        """Refuse to write what another reader would not read as it is meant."""
+        wanted = self._read()
+        self._software(wanted)["applications"][self.application] = entry
+        if _plain(load_yaml(text, what=str(self.path))) != _plain(wanted):
+            raise ConfigurationError(
+                f"{self.path}: the settings cannot be written without changing other lines; write "
+                f"them by hand: {entry!r}"
+            )
+
+    def _text(self) -> str:
+        try:
+            with self.path.open("rb") as file:
+                data = file.read(MAX_FILE_BYTES + 1)
+            if len(data) > MAX_FILE_BYTES:
+                raise ConfigurationError(f"{self.path}: expected {MAX_FILE_BYTES} bytes at most")
+            return data.decode()
+        except (OSError, UnicodeDecodeError) as exc:
+            raise ConfigurationError(f"{self.path} cannot be read: {exc}") from exc
+
+    def _read(self) -> Any:
+        try:
+            return load_yaml(self._text(), what=str(self.path))
+        except BadYamlError as exc:
+            raise ConfigurationError(f"{self.path}: {exc}") from exc
+
+    def _software(self, whole: Any) -> dict[str, Any]:
+        """Return the mapping of the camera's ``software:`` in a file."""
+        cameras = whole.get("cameras") if isinstance(whole, dict) else None
+        entry = cameras.get(self.camera) if isinstance(cameras, dict) else None
+        software = entry.get("software") if isinstance(entry, dict) else None
+        if not isinstance(software, dict) or not isinstance(software.get("applications"), dict):
+            known = [*map(str, cameras)] if isinstance(cameras, dict) else []
+            raise ConfigurationError(
+                f"{self.path}: no software camera {self.camera!r:.80} with applications; there are "
+                f"{', '.join(known) or 'no cameras'}{did_you_mean(self.camera, known)}"
+            )
+        return cast("dict[str, Any]", software)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value that equals what another reader of YAML gives: tuples as lists."""
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    return value
+
+
+def _update(old: Any, new: Mapping[str, Any]) -> None:
+    """Change a mapping of a file where it differs; what is the same stays as it was written."""
+    for key in [key for key in old if key not in new]:
+        del old[key]
+    for key, value in new.items():
+        if isinstance(value, dict) and isinstance(old.get(key), dict):
+            _update(old[key], value)
+        elif key not in old or _plain(old[key]) != _plain(value):
+            old[key] = _flow(value)
+
+
+def _flow(value: Any) -> Any:
+    """Return a value that is written in one line."""
+    kinds = load("ruamel.yaml.comments", "teaching needs")
+    if isinstance(value, dict):
+        made = kinds.CommentedMap({key: _flow(one) for key, one in value.items()})
+    elif isinstance(value, (list, tuple)):
+        made = kinds.CommentedSeq([_flow(one) for one in value])
+    else:
+        return value
+    made.fa.set_flow_style()
+    return made
+
+
+# ---------------------------------------------------------------------- tolerances
+
+
+def learned(
+    tools: Mapping[str, Mapping[str, Any]], good: Sequence[Inspection]
+) -> dict[str, dict[str, Any]]:
+    """Return the tools with tolerances by which all of the good pictures are good.
+
+    Args:
+        tools: settings of the tools by their keys.
+        good: inspections of good pictures by these tools.
+    """
+    found = {key: dict(given) for key, given in tools.items()}
+    for key, settings in found.items():
+        kind, name = split_name(key)
+        seen = [one.findings[name] for one in good if name in one.findings]
+        if seen and kind in _LEARNERS:
+            settings.update(_LEARNERS[kind](seen))
+    return found
+
+
+def _of_present(seen: Sequence[Finding]) -> dict[str, Any]:
+    counts = [int(one.values.get("count", 0)) for one in seen]
+    found: dict[str, Any] = {"count": [min(counts), max(counts)]}
+    each = [one.records or (one.values,) for one in seen]
+    areas = [float(record["area"]) for records in each for record in records if record.get("area")]
+    if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
+        least, most = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
+        found["area"] = [max(1, math.floor(least)), math.ceil(most)]
+    return found  # of spots that are not in the result nobody knows the area
+
+
+def _of_compare(seen: Sequence[Finding]) -> dict[str, Any]:
+    most = max(int(one.values.get("differing", 0)) for one in seen)
+    return {"allowed": math.ceil(DIFFERENCE_MARGIN * most)}
+
+
+def _of_read(seen: Sequence[Finding]) -> dict[str, Any]:
+    texts = {
+        str(one["text"])
+        for found in seen
+        for one in (found.records or (found.values,))
+        if one.get("text")
+    }
+    return {"expect": re.escape(texts.pop())} if len(texts) == 1 else {}
+
+
+_LEARNERS: Final[dict[str, Callable[[Sequence[Finding]], dict[str, Any]]]] = {
+    "compare": _of_compare,
+    "present": _of_present,
+    "read": _of_read,
+}
+
+
+# ---------------------------------------------------------------------- settings
+
+
+def tool_settings() -> dict[str, dict[str, str]]:
+    """Return descriptions of settings by their names, by the kinds of tools."""
+    found: dict[str, dict[str, str]] = {}
+    for info in TOOLS.available():
+        kind: Any = TOOLS.load(info.name)
+        fields = kind.settings_model.model_fields
+        found[info.name] = {name: one.description or "" for name, one in fields.items()}
+    return found
+
+
+def read_settings(given: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, Any]]:
+    """Return the settings of tools whose values are texts in YAML; an empty one is left out.
+
+    Raises:
+        ConfigurationError: a text is no YAML.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for key, settings in given.items():
+        found[key] = {}
+        for name, text in settings.items():
+            if text.strip():
+                try:
+                    found[key][name] = load_yaml(text, what=f"{key}: {name}")
+                except BadYamlError as exc:
+                    raise ConfigurationError(f"{key}: {name}: {exc}") from exc
+    return found
+
+
+def setting_text(value: Any) -> str:
+    """Return a setting's value as YAML in one line."""
+    yaml: Any = load("yaml")
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=LINE_WIDTH)
+    return text.removesuffix("\n").removesuffix("\n...").strip()

@@ -1,0 +1,134 @@
+"""Lines and circles through edges: outliers, rough parts, and what no fit can tell."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from smartcam.inspection._measure.features import FoundShape
+from smartcam.inspection._measure.fits import Edges, fit_circle, fit_line
+from smartcam.inspection._measure.planes import PIXELS
+from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
+from smartcam.inspection._measure.values import circle_of, line_of
+from tests.inspection.rendering import Array
+
+AHEAD = np.array([1.0, 0.0])
+
+
+def on_line(offsets: Array, sigma: float = 0.01) -> Edges:
+    count = len(offsets)
+    points = np.column_stack([np.linspace(0, 100, count), 50 + offsets])
+    return Edges(points, np.tile([0.0, 1.0], (count, 1)), np.full(count, sigma))
+
+
+def on_circle(
+    offsets: Array, arc: float = 360.0, radius: float = 40.0, sigma: float = 0.01
+) -> Edges:
+    angles = np.radians((np.arange(len(offsets)) + 0.5) / len(offsets) * arc)
+    rim = np.column_stack([np.cos(angles), np.sin(angles)])
+    return Edges([60.0, 70.0] + (radius + offsets)[:, None] * rim, rim, np.full(len(angles), sigma))
+
+
+@pytest.mark.parametrize("wrong", [1, 4, 9])
+def test_wrong_edges_of_a_line_are_told_and_do_not_move_it(wrong: int) -> None:
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        offsets = random.normal(0, 0.01, 20)
+        out = random.choice(20, wrong, replace=False)
+        offsets[out] += random.choice([-1.0, 1.0], wrong) * random.uniform(0.2, 6.0, wrong)
+        fit = fit_line(on_line(offsets), AHEAD)
+        assert not fit.kept[out].any()
+        assert fit.kept.sum() >= 20 - wrong - 2
+        assert abs(fit.shape.at[1] - 50) < 0.03
+
+
+@pytest.mark.parametrize("wrong", [1, 4, 10])
+def test_wrong_edges_of_a_circle_are_told_and_do_not_move_it(wrong: int) -> None:
+    for seed in range(10):
+        random = np.random.default_rng(seed)
+        offsets = random.normal(0, 0.01, 24)
+        out = random.choice(24, wrong, replace=False)
+        offsets[out] += random.choice([-1.0, 1.0], wrong) * random.uniform(0.2, 6.0, wrong)
+        fit = fit_circle(on_circle(offsets))
+        assert not fit.kept[out].any()
+        assert abs(fit.shape.radius - 40) < 0.03
+
+
+def test_edges_on_two_lines_agree_on_none() -> None:
+    offsets = np.where(np.arange(24) % 3 == 0, 0.0, np.where(np.arange(24) % 3 == 1, 4.0, 8.0))
+    offsets = offsets + np.random.default_rng(1).normal(0, 0.01, 24)
+    with pytest.raises(NotMeasuredError) as caught:
+        line_of(FoundShape(on_line(offsets), (), 0.8, 0.0), np.array([[0, 50], [9, 50]]), PIXELS)
+    assert caught.value.why is NoValueReason.NO_AGREEMENT
+
+
+def test_part_that_is_rougher_than_the_noise_keeps_its_edges_and_has_a_larger_sigma() -> None:
+    offsets = np.random.default_rng(1).normal(0, 0.1, 40)
+    fit = fit_line(on_line(offsets, sigma=0.01), AHEAD)
+    assert fit.kept.sum() >= 36
+    assert fit.excess == pytest.approx(10, rel=0.3)
+    assert math.sqrt(fit.shape.covariance[0, 0]) == pytest.approx(0.1 / math.sqrt(40), rel=0.3)
+
+
+def test_sigmas_of_a_line_and_a_circle_are_true() -> None:
+    line, circle = [], []
+    for seed in range(400):
+        random = np.random.default_rng(seed)
+        fit = fit_line(on_line(random.normal(0, 0.01, 12)), AHEAD)
+        line.append(
+            (fit.shape.at[1] - 50) / math.sqrt(fit.shape.offset_variance(np.array([50.0, 50])))
+        )
+        round_ = fit_circle(on_circle(random.normal(0, 0.01, 16), arc=100.0)).shape
+        circle.append((round_.radius - 40) / math.sqrt(round_.covariance[2, 2]))
+    assert np.std(line) == pytest.approx(1.0, abs=0.12)  # chance does 0.035
+    assert np.std(circle) == pytest.approx(1.0, abs=0.12)
+
+
+def test_line_runs_the_way_that_was_asked_for() -> None:
+    edges = on_line(np.zeros(8))
+    assert fit_line(edges, AHEAD).shape.direction @ AHEAD > 0.99
+    assert fit_line(edges, -AHEAD).shape.direction @ AHEAD < -0.99
+
+
+def test_turned_line_says_the_same_of_places_beside_it() -> None:
+    edges = on_line(np.random.default_rng(1).normal(0, 0.01, 12))
+    one, other = fit_line(edges, AHEAD).shape, fit_line(edges, -AHEAD).shape
+    for place in (np.array([-50.0, 40.0]), np.array([180.0, 60.0])):
+        assert one.offset_variance(place) == pytest.approx(other.offset_variance(place))
+    assert one.offset_variance(np.array([180.0, 50.0])) > 4 * one.offset_variance(one.at)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_too_few_edges_are_refused(count: int) -> None:
+    with pytest.raises(NotMeasuredError) as caught:
+        fit_circle(on_circle(np.zeros(count)))
+    assert caught.value.why is NoValueReason.FEW_EDGES
+
+
+def test_edges_at_one_place_are_refused() -> None:
+    edges = Edges(np.full((6, 2), 5.0), np.tile([0.0, 1.0], (6, 1)), np.full(6, 0.1))
+    for fit in (lambda: fit_line(edges, AHEAD), lambda: fit_circle(edges)):
+        with pytest.raises(NotMeasuredError):
+            fit()
+
+
+def test_straight_edges_are_no_circle() -> None:
+    edges = on_line(np.random.default_rng(1).normal(0, 0.01, 12))
+    with pytest.raises(NotMeasuredError) as caught:
+        circle_of(FoundShape(edges, (), 0.8, 0.0), PIXELS)
+    assert caught.value.why is NoValueReason.UNCERTAIN
+
+
+def test_arc_that_is_too_short_for_its_radius_is_refused() -> None:
+    edges = on_circle(np.random.default_rng(1).normal(0, 0.05, 12), arc=12.0, sigma=0.05)
+    with pytest.raises(NotMeasuredError) as caught:
+        circle_of(FoundShape(edges, (), 0.8, 0.0), PIXELS)
+    assert caught.value.why is NoValueReason.UNCERTAIN
+
+
+def test_what_all_edges_may_be_wrong_by_is_not_averaged_away() -> None:
+    edges = on_circle(np.random.default_rng(1).normal(0, 0.01, 24))
+    found = circle_of(FoundShape(edges, (), 0.8, 0.2), PIXELS).shape
+    assert math.sqrt(found.covariance[2, 2]) == pytest.approx(0.2, rel=0.01)

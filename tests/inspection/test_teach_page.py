@@ -1,0 +1,127 @@
+"""The page of teaching in a real browser, from a drawn region to the saved file."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import pytest_asyncio
+
+from smartcam import frames
+from smartcam.inspection import Teaching, load_cell
+from smartcam.web import TeachSite
+from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong, see
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+    from playwright.async_api import Page
+
+cv2: Any = pytest.importorskip("cv2")
+pytest.importorskip("ruamel.yaml")
+
+pytestmark = BROWSER_MARKS
+
+FILE = """\
+# the cell of line 1
+cameras:
+  cam:
+    software:
+      frames: shots # beside this file
+      applications:
+        7: {name: glue, present: {grey: [0, 120]}} # spots
+"""
+
+
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def page() -> AsyncIterator[Page]:
+    async with new_page(1280, 900) as page:
+        yield page
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    path = tmp_path / "cell.yaml"
+    path.write_text(FILE)
+    (tmp_path / "shots").mkdir()
+    for number, spots in enumerate((2, 2, 1), start=1):
+        pixels = np.full((240, 320), 200, np.uint8)
+        for spot in range(spots):
+            pixels[100:130, 80 + 100 * spot : 110 + 100 * spot] = 20
+        cv2.imwrite(str(tmp_path / "shots" / f"part{number}.png"), pixels)
+    return path
+
+
+@contextlib.asynccontextmanager
+async def opened(page: Page, site: TeachSite) -> AsyncIterator[TeachSite]:
+    with nothing_wrong(page):
+        async with site:
+            await page.goto(site.url)
+            await see(page, "#live[data-state=live]", "ready")
+            yield site
+
+
+async def drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> None:
+    """Drag over the picture, between shares of its width and height."""
+    box = await page.locator("#canvas").bounding_box()
+    assert box is not None
+    places = [(box["x"] + box["width"] * x, box["y"] + box["height"] * y) for x, y in (begin, end)]
+    await page.mouse.move(*places[0])
+    await page.mouse.down()
+    await page.mouse.move(*places[1], steps=4)
+    await page.mouse.up()
+
+
+async def test_a_drawn_region_is_tried_learned_and_saved(page: Page, path: Path) -> None:
+    files = sorted((path.parent / "shots").iterdir())
+    async with opened(page, TeachSite(Teaching(path, "cam", 7), files)):
+        await see(page, "#rows tr[data-picture='1']", "count 2")
+        await see(page, "#rows tr[data-picture='3']", "count 1")
+        await drag(page, (0.1, 0.3), (0.9, 0.7))
+        await see(page, "#marks polygon.region")
+        region = await page.input_value("#set-region")
+        assert region.startswith("[")
+        await page.fill("#set-most", "4")
+        await page.locator("#rows tr[data-picture='3'] input").click()
+        await see(page, "#counts", "1 judged otherwise")
+        await page.click("#learn")
+        await see(page, "#counts", "0 judged otherwise")
+        await see(page, "#rows tr[data-picture='3'] .bad", "1 spot")
+        await page.click("#save")
+        await see(page, "#saved", "Saved in")
+    text = await asyncio.to_thread(path.read_text)
+    assert text.startswith("# the cell of line 1\n")
+    assert "# beside this file" in text
+    assert "# spots" in text
+    program = load_cell(path)["cam"].programs[7]
+    tool = program.steps[0].tool
+    assert tool.settings.count == (2, 2)
+    assert f"region: {region}" in text
+
+
+async def test_a_wrong_setting_is_told_beside_it_and_nothing_is_saved(
+    page: Page, path: Path
+) -> None:
+    files = sorted((path.parent / "shots").iterdir())
+    async with opened(page, TeachSite(Teaching(path, "cam", 7), files)):
+        await page.fill("#set-grey", "[9, 0]")
+        await see(page, "#problem", "smaller number first")
+        await page.fill("#set-grey", "[0, 120]")
+        await see(page, "#rows tr[data-picture='1']", "count 2")
+        assert await page.inner_text("#problem") == ""
+    assert await asyncio.to_thread(path.read_text) == FILE
+
+
+async def test_pictures_are_taken_with_the_camera(page: Page, path: Path) -> None:
+    async with frames.open("synthetic://?size=320x240&fps=50", linger=2.0) as source:
+        site = TeachSite(Teaching(path, "cam", 7), source=source)
+        async with opened(page, site):
+            await page.click("#shoot")
+            await see(page, "#rows tr[data-picture='1']", "ms")
+            await page.click("#shoot")
+            await see(page, "#rows tr[data-picture='2']", "ms")
+            assert len(site.pictures) == 2
