@@ -1,0 +1,1 @@
+"""ifm: the process interface PCIC."""

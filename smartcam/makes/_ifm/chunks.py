@@ -1,0 +1,84 @@
+"""Images as PCIC has them: chunks, each with a header of numbers and a picture."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+from smartcam.exceptions import FrameError
+
+JPEG, MONO8 = 260, 251
+"""Types of chunks: a JPEG file; grey levels of a byte each."""
+
+HEADER = struct.Struct("<13i")
+"""Type, size, size of the header, version, width, height, pixel format, microseconds, count,
+status, seconds, nanoseconds, and the first bytes of the texts behind it."""
+
+LEAST_HEADER_SIZE, VERSION = 0x40, 3
+
+
+class ImageChunk(NamedTuple):
+    """One picture of a device.
+
+    Attributes:
+        type: 260 for a JPEG file, 251 for grey levels, else what the device says.
+        width: width in pixels.
+        height: height in pixels.
+        number: count of the picture since the device began.
+        time: seconds since 1970 by the device's clock.
+        data: bytes of the picture.
+    """
+
+    type: int
+    width: int
+    height: int
+    number: int
+    time: float
+    data: bytes
+
+    @property
+    def file(self) -> bytes:
+        """The picture as a file: JPEG as it came, grey levels as PGM, else the bytes."""
+        if self.type == MONO8 and len(self.data) == self.width * self.height:
+            return b"P5\n%d %d\n255\n" % (self.width, self.height) + self.data
+        return self.data
+
+    @property
+    def encoded(self) -> bytes:
+        """The chunk as a device sends it."""
+        header_size = LEAST_HEADER_SIZE
+        seconds, rest = divmod(round(self.time * 1e9), 1_000_000_000)
+        numbers = (
+            *(self.type, header_size + len(self.data), header_size, VERSION, self.width),
+            *(self.height, 0, rest // 1000, self.number, 0, seconds & 0x7FFFFFFF, rest, 0),
+        )
+        return HEADER.pack(*numbers).ljust(header_size, b"\0") + self.data
+
+
+def read_chunks(data: bytes) -> list[ImageChunk]:
+    """Return the pictures of an answer to ``I01?`` or ``I02?``: nine digits of length, then chunks.
+
+    Raises:
+        FrameError: they do not fit together.
+    """
+    rest = data[9:]
+    if not data[:9].isdigit() or int(data[:9]) != len(rest):
+        raise FrameError(f"{data[:16]!r} begins no image of PCIC", data=data[:64])
+    found: list[ImageChunk] = []
+    at = 0
+    while at < len(rest):
+        if len(rest) - at < LEAST_HEADER_SIZE:
+            raise FrameError(f"{len(rest) - at} bytes are no image chunk", data=rest[at : at + 64])
+        kind, size, header, _, width, height, _, _, count, _, seconds, nano, _ = HEADER.unpack_from(
+            rest, at
+        )
+        if not LEAST_HEADER_SIZE <= header <= size <= len(rest) - at:
+            raise FrameError(
+                f"an image chunk of {size} bytes with a header of {header} came, "
+                f"{len(rest) - at} are there",
+                data=rest[at : at + 64],
+            )
+        picture = rest[at + header : at + size]
+        found.append(ImageChunk(kind, width, height, count, seconds + nano / 1e9, picture))
+        at += size
+    return found

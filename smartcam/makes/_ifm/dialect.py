@@ -1,0 +1,339 @@
+"""PCIC, the process interface of ifm's sensors: each answer carries the ticket of its question.
+
+What is known of the devices, and who says so, stands in ``docs/ifm.md``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.makes._ifm.chunks import read_chunks
+from smartcam.makes._ifm.layouts import MARK, layout_json, with_bools
+from smartcam.models import Status
+from smartcam.protocols import (
+    CodeMeaning,
+    LineCommand,
+    LineMachine,
+    LineReply,
+    LineRow,
+    Protocol,
+    TicketedDialect,
+    Transport,
+    Verdict,
+    unread,
+)
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Mapping
+
+    from smartcam.layout import Layout
+
+    Told = m.Message | tuple[m.Message, ...]
+    Script = Generator[str, str, Told]
+
+DEFAULT_PORT = 50010
+RESULTS, ERRORS, NOTIFICATIONS, DEBUG = "0000", "0001", "0010", "0020"
+"""Tickets of what a device says by itself."""
+
+READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+
+MAX_APPLICATION = 99
+"""Largest number of an application: the commands that switch have two digits for it."""
+
+MAX_INPUT = 256
+"""Bytes of an input container."""
+
+CODES: Mapping[str, int] = {"*": 0, "!": 1, "?": 2, "$": 3}
+"""Codes of our own for the answers of a single character."""
+
+NOT_NOW = 4
+"""Code of our own: a trigger that was answered with ``!``."""
+
+_MEANINGS: Mapping[int, CodeMeaning] = {
+    0: CodeMeaning("done", Verdict.DONE),
+    1: CodeMeaning("!: not now, or a wrong value", Verdict.REFUSED),
+    2: CodeMeaning("?: wrong syntax or length", Verdict.UNKNOWN),
+    3: CodeMeaning("$: unknown error code", Verdict.REFUSED),
+    NOT_NOW: CodeMeaning(
+        "!: busy, another trigger source, no application, or configuration mode", Verdict.BUSY
+    ),
+}
+
+FATAL = frozenset({110001001, 110001002, 110001003})
+"""Errors that are System Error: boot timeout, fatal software error, unknown hardware."""
+
+OVERTEMPERATURE, OVERRUN = 110004000, 110001006
+
+
+def _trigger_code(answer: str) -> int | None:
+    code = CODES.get(answer)
+    return NOT_NOW if code == 1 else code
+
+
+def _triggered(answer: str) -> tuple[m.Message, ...]:
+    code = _trigger_code(answer)
+    if code:
+        return (m.TriggerAnswer(code=code),)
+    return m.TriggerAnswer(), _result(answer)
+
+
+def _result(content: str) -> m.ResultContainer:
+    return m.ResultContainer(data=content.encode("latin-1"))
+
+
+def _status(answer: str) -> m.StatusReport:
+    """Return the status: an error state of nine digits, or ``!`` in configuration mode."""
+    if answer in CODES:
+        return m.StatusReport(status=Status(0))
+    return m.StatusReport(status=READY | _bits(int(answer)))
+
+
+def _bits(error: int) -> Status:
+    status = Status.SYSTEM_ERROR if error in FATAL else Status(0)
+    return status | Status.OVERHEAT if error == OVERTEMPERATURE else status
+
+
+def _active(answer: str) -> int:
+    """Return the active application of ``count TAB active TAB ...``; -1 where none is."""
+    if answer == "!":
+        return m.UNNAMED_APPLICATION
+    count, active, *_ = answer.split("\t")
+    if not active.isdecimal() or len(active) > 9 or int(active) > MAX_APPLICATION:
+        raise ValueError(answer)
+    return int(active) if int(count) and int(active) else m.UNNAMED_APPLICATION
+
+
+def _error(content: str) -> m.Notice:
+    code, text = _numbered(content)
+    return m.Notice(kind="error", code=code, text=text)
+
+
+def _error_or_overrun(content: str) -> tuple[m.Message, ...]:
+    """Return an error; an overrun also as the status of a dropped trigger, which may be ours."""
+    notice = _error(content)
+    if notice.code != OVERRUN:
+        return (notice,)
+    overrun = m.StatusReport(status=READY | Status.OVERTRIGGERED)
+    return notice, overrun, m.StatusReport(status=READY)
+
+
+def _notification(content: str) -> m.Notice:
+    code, text = _numbered(content)
+    return m.Notice(kind="notification", code=code, text=text)
+
+
+def _numbered(content: str) -> tuple[int, str]:
+    digits, colon, text = content.partition(":")
+    if colon and digits.isascii() and digits.isdecimal() and len(digits) <= 9:
+        return int(digits), text
+    return 0, content
+
+
+def _reply(answer: str) -> LineReply:
+    return LineReply(code=CODES.get(answer, 0), data=answer.encode("latin-1"))
+
+
+def _connect(dialect: PcicDialect, message: m.Connect) -> Script:
+    """Ask who it is, have it say results, errors and notifications, and give it the layout."""
+    who = yield "G?"
+    if not who.upper().startswith("IFM"):
+        raise FrameError(f"{who[:64]!r} came, a device of ifm says IFM ELECTRONIC first")
+    code = CODES[(yield "p7" if dialect.tickets else "p0")]
+    code = code or (yield from _upload(dialect))
+    return m.ConnectAnswer(code=code, version=1)
+
+
+def _upload(dialect: PcicDialect) -> Generator[str, str, int]:
+    if dialect.layout is None:
+        return 0
+    described = layout_json(dialect.layout)
+    return CODES[(yield f"c{len(described):09}{described}")]
+
+
+def _switch(dialect: PcicDialect, message: m.SwitchApplication) -> Script:
+    code = CODES[(yield f"a{message.application:02}")]
+    active = _active((yield "A?"))
+    if code == 0:
+        code = yield from _upload(dialect)  # which may be gone with the old application
+    return m.SwitchAnswer(code=code, application=active)
+
+
+def _image(dialect: PcicDialect, message: m.ReadImage) -> Script:
+    answer = yield "I01?"
+    if answer in CODES:
+        answer = yield "I02?"
+    if answer in CODES:
+        return m.Image(code=CODES[answer], data=b"")
+    chunks = read_chunks(answer.encode("latin-1"))
+    return m.Image(data=chunks[0].file if chunks else b"")
+
+
+def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
+    data = message.data
+    if len(data) > MAX_INPUT:
+        raise ConfigurationError(f"ifm: an input container has {MAX_INPUT} bytes, got {len(data)}")
+    answer = yield f"j{dialect.container:02}{len(data):09}{data.decode('latin-1')}"
+    return m.SetInputAnswer(code=CODES[answer])
+
+
+def _rows(trigger: LineRow, *, unasked: bool) -> tuple[LineRow, ...]:
+    error = _error if trigger.answer is m.ResultContainer else _error_or_overrun
+    said = (
+        LineRow(None, "results", m.ResultContainer, _result, word=RESULTS),
+        LineRow(None, "errors", m.Notice, error, word=ERRORS, also=(m.StatusReport,)),
+        LineRow(None, "notifications", m.Notice, _notification, word=NOTIFICATIONS),
+        LineRow(None, "debug", m.Notice, lambda text: m.Notice("debug", 0, text[:200]), word=DEBUG),
+    )
+    return (
+        LineRow(m.Connect, "G?", m.ConnectAnswer, unread, script=_connect),
+        LineRow(m.GetStatus, "E?", m.StatusReport, _status),
+        LineRow(
+            m.Query, "A?", m.QueryAnswer, lambda text: m.QueryAnswer(application=_active(text))
+        ),
+        LineRow(m.SwitchApplication, "a{application}", m.SwitchAnswer, unread, script=_switch),
+        trigger,
+        LineRow(m.ReadImage, "I01?", m.Image, unread, script=_image),
+        LineRow(m.SetInput, "j{data}", m.SetInputAnswer, unread, script=_input),
+        *(said if unasked else ()),
+        LineRow(LineCommand, "{line}", LineReply, _reply),
+    )
+
+
+SYNCHRONOUS = LineRow(m.Trigger, "T?", m.ResultContainer, _triggered, also=(m.TriggerAnswer,))
+ASYNCHRONOUS = LineRow(
+    m.Trigger, "t", m.TriggerAnswer, lambda text: m.TriggerAnswer(code=_trigger_code(text) or 0)
+)
+
+_COMMAND = re.compile(r"[A-Zabcdgjlop][^\r\n]*")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PcicDialect(TicketedDialect):
+    """One version of PCIC.
+
+    Args:
+        layout: what the results of the session hold; None for the device's own.
+        container: the input container that input data goes to.
+    """
+
+    layout: Layout | None = None
+    container: int = 0
+    make: str = "ifm"
+
+    def with_parameters(self, parameters: Mapping[str, str]) -> PcicDialect:
+        """Return the dialect with what a URL says.
+
+        Raises:
+            ConfigurationError: no such trigger or container.
+        """
+        kind = parameters.get("trigger", "sync")
+        container = parameters.get("input", str(self.container))
+        if kind not in {"sync", "async"} or not (container.isdecimal() and len(container) <= 2):
+            raise ConfigurationError(
+                f"trigger: sync or async was expected, got {kind!r}; "
+                f"input: 0 to 99 was expected, got {container!r}"
+            )
+        rows = self.rows if kind == "sync" else _rows(ASYNCHRONOUS, unasked=bool(self.tickets))
+        return replace(self, container=int(container), rows=rows, split=None)
+
+    def for_layout(self, layout: Layout | None) -> PcicDialect:
+        """Return the dialect for a session that uploads a layout.
+
+        Raises:
+            ConfigurationError: a device cannot give such results, or this version no binary ones,
+                or none that come by themselves.
+        """
+        row = self.row(m.Trigger)
+        if not self.tickets and row is ASYNCHRONOUS:
+            raise ConfigurationError(
+                f"ifm: dialect {self.name} has no results without a question, so no trigger=async"
+            )
+        if layout is None:
+            return self
+        if not self.digits:
+            raise ConfigurationError(
+                f"ifm: dialect {self.name} has no length, so no results in binary; use v3 or v4, "
+                "or interpret_as='raw'"
+            )
+        layout_json(layout)
+        rows = tuple(
+            one
+            if one.answer is not m.ResultContainer
+            else one._replace(read=_read_with(layout, one))
+            for one in self.rows
+        )
+        return replace(self, layout=layout, rows=rows, split=None)
+
+    def command(self, line: str) -> str:
+        """Return a command of one's own.
+
+        Raises:
+            ConfigurationError: it is none, or sets the version, which would end the session.
+        """
+        if not _COMMAND.fullmatch(line):
+            raise ConfigurationError(
+                f"ifm: {line[:32]!r} is no command; smartcam.makes has them in docs/ifm.md; "
+                "the version is the dialect's"
+            )
+        return line
+
+
+def _read_with(layout: Layout, row: LineRow) -> Callable[[str], Told]:
+    """Return a reader of results of an uploaded layout, which have a mark in front."""
+
+    def read(content: str) -> Told:
+        if row.request is m.Trigger and content in CODES:
+            return row.read(content)
+        data = content.encode("latin-1")
+        if content.startswith(MARK):
+            container = m.ResultContainer(data=with_bools(layout, data[len(MARK) :]))
+        else:
+            fault = f"{content[:32]!r} came, a result in the session's layout begins with {MARK!r}"
+            container = m.ResultContainer(data=data, cells=(), fault=fault)
+        return (m.TriggerAnswer(), container) if row.request is m.Trigger else container
+
+    return read
+
+
+def _version(name: str, about: str, *, tickets: bool, digits: int, header: bool) -> PcicDialect:
+    return PcicDialect(
+        name=name,
+        about=about,
+        source="docs/ifm.md, published",
+        ids=range(1, MAX_APPLICATION + 1),
+        rows=_rows(SYNCHRONOUS, unasked=tickets),
+        codes=_MEANINGS,
+        tickets=range(1000, 10000) if tickets else range(0),
+        at_once=tickets,
+        digits=digits,
+        asks_with_length=header,
+    )
+
+
+V3 = _version("v3", "ticket and length in both directions", tickets=True, digits=9, header=True)
+V4 = _version("v4", "answers with their length, no tickets", tickets=False, digits=9, header=False)
+V2 = _version("v2", "tickets, no length: texts only", tickets=True, digits=0, header=False)
+V1 = _version(
+    "v1", "neither: texts only, no results but a trigger's", tickets=False, digits=0, header=False
+)
+
+PCIC = Protocol(
+    name="pcic",
+    schemes={"pcic": Transport.TCP},
+    default_port=DEFAULT_PORT,
+    models=("O2D5XX", "O2I5XX", "O2U5XX", "O3D3XX"),
+    dialects={one.name: one for one in (V3, V4, V2, V1)},
+    machine=LineMachine,
+    parameters={
+        "trigger": "sync (default): T?, answered by the result; async: t, the result comes later",
+        "input": "number of the input container that input data goes to; default 0",
+    },
+    detection={Transport.TCP: ((V3,), (V4,), (V2,), (V1,))},
+    emulator="smartcam.makes._ifm.camera:EmulatedIfm",
+    greeting=b"",
+)
+"""The protocol that the scheme ``pcic`` names."""

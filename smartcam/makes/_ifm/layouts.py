@@ -1,0 +1,153 @@
+"""The layout of a session's results: from smartcam's language to PCIC's JSON, and JSON to bytes."""
+
+from __future__ import annotations
+
+import json
+import struct
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from smartcam.layout import Field, Layout
+
+MARK = "smartcam;"
+"""The text in front of each result of an uploaded layout: so it can be no code, and no result of
+another layout."""
+
+_TYPES: Mapping[str, tuple[str, str]] = {
+    **{f"int{bits}": (f"int{bits}", code) for bits, code in ((8, "b"), (16, "h"), (32, "i"))},
+    **{f"uint{bits}": (f"uint{bits}", code) for bits, code in ((8, "B"), (16, "H"), (32, "I"))},
+    "real32": ("float32", "f"),
+    "real64": ("float64", "d"),
+    "bool": ("uint8", "B"),
+}
+"""smartcam's types: ifm's name, and the letter in ``struct``."""
+
+_CODES: Mapping[str, str] = dict(_TYPES.values())
+
+MAX_DEPTH = 8
+"""Records in records that a layout may have."""
+
+
+def layout_json(layout: Layout) -> str:
+    """Return the layout that a device is given, so that it sends what is declared, in binary.
+
+    Raises:
+        ConfigurationError: it has no such type, or counts records by itself.
+    """
+    elements: list[dict[str, Any]] = [{"type": "string", "value": MARK, "id": "start_string"}]
+    elements += map(_element, layout.head)
+    fields = [_element(field) for field in layout.fields]
+    if isinstance(layout.repeat, int):
+        raise ConfigurationError(
+            f"ifm: a device sends as many records as there are, write ( ... )*: {layout.text}"
+        )
+    if layout.repeat is None:
+        elements += fields
+    else:
+        elements.append({"type": "records", "id": layout.group or "records", "elements": fields})
+    described = {
+        "layouter": "flexible",
+        "format": {"dataencoding": "binary", "order": "little"},
+        "elements": elements,
+    }
+    return json.dumps(described)
+
+
+def _element(field: Field) -> dict[str, Any]:
+    if field.type == "string":
+        width = {"width": field.size, "fill": "\0", "alignment": "left"}
+        return {"type": "string", "id": field.name, "format": width}
+    if field.type not in _TYPES:
+        raise ConfigurationError(f"ifm: a device has no {field.type}: {field.label}")
+    return {"type": _TYPES[field.type][0], "id": field.name}
+
+
+def with_bools(layout: Layout, data: bytes) -> bytes:
+    """Return a result's bytes with each bool as smartcam's layouts have it: 1 becomes 0xFF."""
+    heads, fields = _bools(layout.head), _bools(layout.fields)
+    if not heads and not fields:
+        return data
+    changed = bytearray(data)
+    size = sum(field.size for field in layout.fields)
+    begin = sum(field.size for field in layout.head)
+    starts = range(begin, len(data), size) if layout.repeat is not None else (begin,)
+    places = [*heads, *(start + place for start in starts for place in fields)]
+    for place in places:
+        if place < len(data) and data[place] == 1:
+            changed[place] = 0xFF
+    return bytes(changed)
+
+
+def _bools(fields: tuple[Field, ...]) -> list[int]:
+    places, at = [], 0
+    for field in fields:
+        if field.type == "bool":
+            places.append(at)
+        at += field.size
+    return places
+
+
+def check_layout(text: str) -> dict[str, Any]:
+    """Return a layout that a client uploads; ValueError: a device would refuse it."""
+    described = json.loads(text)
+    if not isinstance(described, dict) or described.get("layouter") != "flexible":
+        raise ValueError("no flexible layouter")
+    _check(described.get("elements"), MAX_DEPTH)
+    return described
+
+
+def _check(elements: object, depth: int) -> None:
+    if not isinstance(elements, list) or depth < 1:
+        raise ValueError("no elements")
+    for one in elements:
+        kind = one.get("type") if isinstance(one, dict) else None
+        if kind == "records":
+            _check(one.get("elements"), depth - 1)
+        elif kind not in {"string", "blob", *_CODES} or not isinstance(one.get("id"), str):
+            raise ValueError(f"no element: {one!r:.80}")
+
+
+def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
+    """Return a result as a device sends it in a layout.
+
+    Args:
+        described: the layout.
+        values: by the ids of elements; records are lists of such mappings.
+    """
+    default = described.get("format", {})
+    return b"".join(_encode(described["elements"], values, default))
+
+
+def _encode(
+    elements: list[dict[str, Any]], values: Mapping[str, Any], default: Mapping[str, Any]
+) -> Iterator[bytes]:
+    for one in elements:
+        form = {**default, **one.get("format", {})}
+        value = one.get("value", values.get(one.get("id", "")))
+        if one["type"] == "records":
+            for record in value or ():
+                yield from _encode(one["elements"], record, form)
+        elif one["type"] == "blob":
+            yield value or b""
+        elif one["type"] == "string" or form.get("dataencoding", "ascii") == "ascii":
+            yield _text(value, one["type"], form).encode()
+        else:
+            code = _CODES[one["type"]]
+            number = float(value or 0) if code in "fd" else int(value or 0)
+            yield struct.pack(("<" if form.get("order") == "little" else ">") + code, number)
+
+
+def _text(value: Any, kind: str, form: Mapping[str, Any]) -> str:
+    """Return a value as ASCII; ``scale`` and ``offset`` are applied to numbers."""
+    text = "" if value is None else str(value)
+    if kind != "string":
+        number = float(value or 0) * form.get("scale", 1) + form.get("offset", 0)
+        text = f"{number:.{form.get('precision', 4)}f}" if kind[0] == "f" else f"{number:.0f}"
+        text = text.replace(".", form.get("decimalseparator", "."))
+    width, fill = form.get("width", 0), form.get("fill", " ")
+    text = text[:width] if width and kind == "string" else text
+    return text.ljust(width, fill) if form.get("alignment") == "left" else text.rjust(width, fill)

@@ -1,0 +1,1 @@
+"""Keyence: lines that end with CR."""

@@ -1,0 +1,155 @@
+"""Keyence IV2 and IV3: sensors that answer each trigger with their judgement.
+
+What is known of them, and who says so, stands in ``docs/keyence.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from smartcam.makes._keyence.words import (
+    ENCODING,
+    LINE_END,
+    MAX_LINE,
+    READY,
+    asked_word,
+    check_done,
+    error_code,
+)
+from smartcam.protocols import (
+    CodeMeaning,
+    LineCommand,
+    LineDialect,
+    LineMachine,
+    LineReply,
+    LineRow,
+    Protocol,
+    Transport,
+    Verdict,
+    unread,
+)
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+    Script = Generator[str, str, m.Message]
+    TriggerScript = Generator[str, str, tuple[m.Message, ...]]
+
+DEFAULT_PORT = 8500
+LAST_PROGRAM = 127
+
+CODES = {
+    0: CodeMeaning("done", Verdict.DONE),
+    2: CodeMeaning("unknown command", Verdict.UNKNOWN),
+    3: CodeMeaning("not now", Verdict.BUSY),
+    22: CodeMeaning("wrong parameter", Verdict.REFUSED),
+}
+"""Codes behind ``ER,<command>``; those of other devices of the family (inferred)."""
+
+
+def read_result(line: str) -> m.ResultContainer:
+    """Return the result of ``RT,count,OK|NG[,tool,OK|NG,rate]...``; ValueError: it is none."""
+    word, count, judged, *tools = line.split(",")
+    if word != "RT":
+        raise ValueError(line)
+    cells = [m.CellValue("count", count), m.CellValue("judgement", _passed(judged))]
+    for place in range(0, len(tools) - len(tools) % 3, 3):
+        tool, passed, rate = tools[place : place + 3]
+        cells += (
+            m.CellValue(f"tool {tool}", tool),
+            m.CellValue(f"tool {tool} judgement", _passed(passed)),
+            m.CellValue(f"tool {tool} rate", rate),
+        )
+    if len(tools) % 3:
+        raise ValueError(line)
+    return m.ResultContainer(data=line.encode(ENCODING), cells=tuple(cells))
+
+
+def _passed(word: str) -> str:
+    return {"OK": "1", "NG": "0"}[word]
+
+
+def _trigger(dialect: LineDialect, message: m.Trigger) -> TriggerScript:
+    """Ask for the program behind each result, which does not say it."""
+    line = yield "T2"
+    code = error_code(line)
+    if code is not None:
+        return (m.TriggerAnswer(code=code),)
+    result = read_result(line)
+    program = _program((yield "PR")).application
+    return m.TriggerAnswer(), replace(result, application=program)
+
+
+def _unasked(line: str) -> m.Notice:
+    """Return a result that nobody has asked for as a notice: no sensor is known to send any."""
+    return m.Notice("notification", 0, line)
+
+
+def _connected(line: str) -> tuple[m.Message, ...]:
+    if error_code(line) is None:
+        read_result(line)
+    return m.ConnectAnswer(version=1), m.StatusReport(status=READY)
+
+
+def _program(line: str) -> m.QueryAnswer:
+    word, program = line.split(",")
+    if word != "PR" or not program.isdecimal() or len(program) > 9:
+        raise ValueError(line)
+    if int(program) > LAST_PROGRAM:
+        raise ValueError(line)
+    return m.QueryAnswer(application=int(program))
+
+
+def _switch(dialect: LineDialect, message: m.SwitchApplication) -> Script:
+    code = check_done((yield f"PW,{message.application}"))
+    program = _program((yield "PR")).application
+    return m.SwitchAnswer(code=code, application=program)
+
+
+def _reply(line: str) -> LineReply:
+    return LineReply(code=check_done(line), data=line.encode(ENCODING))
+
+
+LINES = LineDialect(
+    name="lines",
+    about="lines that end with CR",
+    source="docs/keyence.md, derived",
+    rows=(
+        LineRow(m.Connect, "RT", m.ConnectAnswer, _connected, also=(m.StatusReport,)),
+        LineRow(m.Query, "PR", m.QueryAnswer, _program),
+        LineRow(m.SwitchApplication, "PW,{application}", m.SwitchAnswer, unread, script=_switch),
+        LineRow(
+            m.Trigger,
+            "T2",
+            m.ResultContainer,
+            unread,
+            word="RT",
+            also=(m.TriggerAnswer,),
+            script=_trigger,
+        ),
+        LineRow(None, "result", m.Notice, _unasked, word="RT"),
+        LineRow(LineCommand, "{line}", LineReply, _reply),
+    ),
+    ids=range(LAST_PROGRAM + 1),
+    line_end=LINE_END,
+    max_line=MAX_LINE,
+    encoding=ENCODING,
+    split=lambda line: (asked_word(line, {"T2": "RT"}), line),
+    codes=CODES,
+    make="Keyence IV3",
+    shows_triggers=False,
+)
+
+IV3 = Protocol(
+    name="iv3",
+    schemes={"iv3": Transport.TCP},
+    default_port=DEFAULT_PORT,
+    models=("IV2", "IV3"),
+    dialects={LINES.name: LINES},
+    machine=LineMachine,
+    emulator="smartcam.makes._keyence.iv3_camera:EmulatedIv3",
+    greeting=b"",
+)
+"""The protocol that the scheme ``iv3`` names."""

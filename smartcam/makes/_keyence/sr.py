@@ -1,0 +1,174 @@
+"""Keyence SR readers: LON begins to read a code, LOFF ends it, and one line says what was read.
+
+What is known of them, and who says so, stands in ``docs/keyence.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.makes._keyence.words import (
+    ENCODING,
+    LINE_END,
+    MAX_LINE,
+    READY,
+    asked_word,
+    check_done,
+    error_code,
+)
+from smartcam.models import Status
+from smartcam.protocols import (
+    CodeMeaning,
+    LineCommand,
+    LineDialect,
+    LineMachine,
+    LineReply,
+    LineRow,
+    Protocol,
+    Transport,
+    Verdict,
+    unread,
+)
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+DEFAULT_PORT = 9004
+LAST_BANK = 15
+NOTHING_READ = "ERROR"
+"""The line of a reader that has read nothing."""
+
+CODES = {
+    0: CodeMeaning("done", Verdict.DONE),
+    **{code: CodeMeaning("unknown command or wrong format", Verdict.UNKNOWN) for code in (100, 1)},
+    **{code: CodeMeaning("wrong parameter", Verdict.REFUSED) for code in (2, 3)},
+    20: CodeMeaning("not now", Verdict.BUSY),
+    21: CodeMeaning("the buffer is full", Verdict.REFUSED),
+    22: CodeMeaning("a file is wrong", Verdict.REFUSED),
+    99: CodeMeaning("the reader is broken", Verdict.REFUSED),
+}
+"""Codes behind ``ER,<command>``; 00, an unknown command, is 100 here, since 0 is done."""
+
+
+def _code(line: str) -> int:
+    found = error_code(line)
+    return 0 if found is None else found or 100
+
+
+def read_code(line: str) -> m.ResultContainer:
+    """Return the result of a reading: whether a code was read, and its text."""
+    data = line.encode(ENCODING)
+    read = line != NOTHING_READ
+    text = data.decode("utf-8", "replace") if read else ""
+    cells = (m.CellValue("read", str(int(read))), m.CellValue("code", text))
+    return m.ResultContainer(data=data, cells=cells)
+
+
+def _scanned(line: str) -> tuple[m.Message, ...]:
+    if line.startswith("ER,LON,"):
+        return (m.TriggerAnswer(code=_code(line)),)
+    return m.TriggerAnswer(), _unasked(line)
+
+
+def _unasked(line: str) -> m.ResultContainer:
+    if line.startswith(("ER,", "OK,LON")):  # an answer, and no code: none is shown for LON
+        raise ValueError(line)
+    return read_code(line)
+
+
+def _busy(line: str) -> m.StatusReport:
+    """Return the status of ``OK,BUSYSTAT,NONE``, or of another word in place of NONE."""
+    if _code(line):
+        raise ValueError(line)
+    idle = line.split(",")[2] == "NONE"
+    return m.StatusReport(status=READY if idle else Status.RUNNING | Status.BUSY)
+
+
+def _reply(line: str) -> LineReply:
+    return LineReply(code=_code(line), data=line.encode(ENCODING))
+
+
+def _split(line: str) -> tuple[str, str]:
+    """Return the command that a line answers, "" where it is what was read."""
+    first, _, rest = line.partition(",")
+    return (asked_word(line, {}) if first in {"OK", "ER"} and rest else ""), line
+
+
+def _rows(bank: int | None) -> tuple[LineRow, ...]:
+    active = m.UNNAMED_APPLICATION if bank is None else bank
+    lon = "LON" if bank is None else f"LON,{bank:02}"
+
+    def counted(line: str) -> m.QueryAnswer:
+        if check_done(line) or not line.startswith("OK,NUM"):
+            raise ValueError(line)
+        return m.QueryAnswer(application=active)
+
+    def connected(line: str) -> m.ConnectAnswer:
+        if not line.startswith("OK,ERRSTAT"):
+            raise ValueError(line)
+        return m.ConnectAnswer(version=1)
+
+    return (
+        LineRow(m.Connect, "ERRSTAT", m.ConnectAnswer, connected),
+        LineRow(m.GetStatus, "BUSYSTAT", m.StatusReport, _busy),
+        LineRow(m.Query, "NUM", m.QueryAnswer, counted),
+        LineRow(m.Trigger, lon, m.ResultContainer, _scanned, word="", also=(m.TriggerAnswer,)),
+        LineRow(m.EndTrigger, "LOFF", None, unread),
+        LineRow(
+            None, "LOFF", m.Notice, lambda line: m.Notice("error", _code(line), line), word="LOFF"
+        ),
+        LineRow(None, "code", m.ResultContainer, _unasked),
+        LineRow(LineCommand, "{line}", LineReply, _reply),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SrDialect(LineDialect):
+    """The lines of an SR reader."""
+
+    def with_parameters(self, parameters: Mapping[str, str]) -> SrDialect:
+        """Return the dialect with the bank of settings that a URL names.
+
+        Raises:
+            ConfigurationError: there is no such bank.
+        """
+        if "bank" not in parameters:
+            return self
+        text = parameters["bank"]
+        if not (text.isascii() and text.isdecimal() and int(text[:4]) <= LAST_BANK):
+            raise ConfigurationError(f"bank: 0 to {LAST_BANK} was expected, got {text!r}")
+        return replace(self, rows=_rows(int(text)))
+
+
+LINES = SrDialect(
+    name="lines",
+    about="lines that end with CR",
+    source="docs/keyence.md, derived",
+    rows=_rows(None),
+    ids=range(LAST_BANK + 1),
+    line_end=LINE_END,
+    max_line=MAX_LINE,
+    encoding=ENCODING,
+    split=_split,
+    at_once=True,
+    codes=CODES,
+    make="Keyence SR",
+)
+
+SR = Protocol(
+    name="sr",
+    schemes={"sr": Transport.TCP},
+    default_port=DEFAULT_PORT,
+    models=("SR-1000", "SR-2000", "SR-5000", "SR-X"),
+    dialects={LINES.name: LINES},
+    machine=LineMachine,
+    parameters={
+        "bank": "bank of settings that a trigger reads with, 0 to 15; default the reader's"
+    },
+    emulator="smartcam.makes._keyence.sr_camera:EmulatedSr",
+    greeting=b"",
+)
+"""The protocol that the scheme ``sr`` names."""

@@ -1,0 +1,123 @@
+"""The emulated Keyence SR reader."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any
+
+from smartcam._arguments import check_flag, check_seconds
+from smartcam.emulator import LineCamera
+from smartcam.makes._keyence.sr import LAST_BANK, LINES, NOTHING_READ, SR
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from smartcam.emulator import LineClient
+
+
+class SrDevice:
+    """The operator of an emulated camera: what is done at the device itself."""
+
+    def __init__(self, camera: EmulatedSr) -> None:
+        self._camera = camera
+
+    def trigger(self) -> None:
+        """Trigger at the input; all clients are told what was read."""
+        self._camera.tell_all()
+
+
+class EmulatedSr(LineCamera):
+    """An emulated SR reader that reads the same codes over and over.
+
+    Args:
+        codes: the code of each reading; None for one that cannot be read.
+        reading_time: seconds from LON until a code is read.
+        answer_time: seconds from the reading's end until it is told.
+        waits_for_end: tell what was read at LOFF only, not when it is read.
+        options: the options of :class:`~smartcam.emulator.LineCamera`.
+
+    Raises:
+        ConfigurationError: something given is wrong.
+    """
+
+    protocol = SR
+
+    def __init__(
+        self,
+        *,
+        codes: Iterable[str | None] = ("4006381333931", "4012345678901"),
+        reading_time: float = 0.02,
+        answer_time: float = 0.0,
+        waits_for_end: bool = False,
+        **options: Any,
+    ) -> None:
+        self.codes: itertools.cycle[str | None] = itertools.cycle(tuple(codes) or (None,))
+        self.reading_time: float = check_seconds(reading_time, "reading_time")
+        self.answer_time: float = check_seconds(answer_time, "answer_time")
+        self.waits_for_end: bool = check_flag(waits_for_end, "waits_for_end")
+        self.read: int = 0
+        self.unread: int = 0
+        self._reading: LineClient | None = None
+        self._code: str | None = None  # read, and to be told at the end
+        self._run = 0
+        self.device: Any = SrDevice(self)
+        super().__init__(**options)
+
+    def hear(self, client: LineClient, line: str) -> None:
+        """Answer a line; what is read is told later, and other lines are heard meanwhile."""
+        call = client.keep()
+        word, _, rest = line.partition(",")
+        bank = rest.isdecimal() and len(rest) == 2 and int(rest) <= LAST_BANK
+        if line == "LON" or (word == "LON" and bank):
+            self._begin(call)
+        elif line == "LOFF":
+            self._end()
+        else:
+            call.answer(self.answer(line))
+
+    def answer(self, line: str) -> str:
+        """Return the answer to a line that neither begins nor ends a reading."""
+        word = line.partition(",")[0]
+        said = {
+            "BUSYSTAT": f"OK,BUSYSTAT,{'NONE' if self._reading is None else 'TRG'}",
+            "ERRSTAT": "OK,ERRSTAT,NONE",
+            "NUM": f"OK,NUM,{self.read},{self.unread}",
+            "BCLR": "OK,BCLR",
+            "RESET": "OK,RESET",
+        }
+        return said.get(line, f"ER,{word},{'02' if word == 'LON' else '00'}")
+
+    def _begin(self, call: LineClient) -> None:
+        if self._reading is not None:
+            call.answer("ER,LON,20")
+            return
+        self._reading, self._code, self._run = call, None, self._run + 1
+        run = self._run
+        self.after(self.reading_time, lambda: self._found(run))
+
+    def _found(self, run: int) -> None:
+        """Read what is there, in the reading that is under way."""
+        if run != self._run or self._reading is None:
+            return
+        self._code = next(self.codes)
+        if self._code is not None and not self.waits_for_end:
+            self._tell()
+
+    def _end(self) -> None:
+        if self._reading is not None:
+            self._tell()
+
+    def _tell(self) -> None:
+        call, code = self._reading, self._code
+        self._reading = self._code = None
+        self.read, self.unread = self.read + (code is not None), self.unread + (code is None)
+        if call is not None:
+            said = NOTHING_READ if code is None else code
+            self.after(self.answer_time, lambda: call.answer(said))
+
+    def tell_all(self) -> None:
+        """Read a code and tell it to all clients."""
+        code = next(self.codes)
+        row = next(number for number, one in enumerate(LINES.rows, 1) if one.line == "code")
+        for client in list(self._clients.values()):
+            client.say_bytes(self.lines.data(NOTHING_READ if code is None else code), row=row)

@@ -1,0 +1,46 @@
+"""The words that all of Keyence's lines have: ``ER,<command>,nn`` and ``OK,<command>``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+LINE_END = b"\r"
+ENCODING = "latin-1"
+"""One byte for each character: what a code holds is not always text."""
+
+MAX_LINE = 8192
+"""Bytes of a line at most: the longest two-dimensional codes have some 7,000 characters."""
+
+READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+
+
+def error_code(line: str) -> int | None:
+    """Return the number of ``ER,<command>,nn``, None for another line.
+
+    Raises:
+        ValueError: it has no number.
+    """
+    word, _, rest = line.partition(",")
+    return int(rest.rpartition(",")[2]) if word == "ER" else None
+
+
+def check_done(line: str) -> int:
+    """Return the code of an answer: 0 unless it is an error."""
+    return error_code(line) or 0
+
+
+def asked_word(line: str, others: Mapping[str, str]) -> str:
+    """Return the command that ``ER,<command>`` or ``OK,<command>`` answers, else the first word.
+
+    Args:
+        line: the answer.
+        others: commands whose answers begin with another word than the command, and that word.
+    """
+    first, _, rest = line.partition(",")
+    word = rest.partition(",")[0] if first in {"OK", "ER"} and rest else first
+    return others.get(word, word)

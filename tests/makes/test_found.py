@@ -1,0 +1,58 @@
+"""The makes are found, probed and examined as every camera is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import smartcam
+from smartcam.doctor import examine
+from smartcam.emulator import LineCamera
+from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
+from tests.cli.commandline import run
+
+MAKES: dict[str, tuple[Callable[[], LineCamera], str]] = {
+    "pcic": (EmulatedIfm, "v3"),
+    "iv3": (EmulatedIv3, "lines"),
+    "sr": (EmulatedSr, "lines"),
+}
+
+
+@pytest.mark.parametrize("name", MAKES)
+@pytest.mark.asyncio
+async def test_search_finds_a_silent_device_and_asks_it_harmlessly(name: str) -> None:
+    make, dialect = MAKES[name]
+    async with make() as emulator:
+        options: dict[str, Any] = {"ports": [emulator.port], "protocols": [name]}
+        (silent,) = await smartcam.find("127.0.0.1", **options)
+        assert (silent.evidence, silent.urls) == ("silent", (emulator.url,))
+        (asked,) = await smartcam.find("127.0.0.1", ask=True, **options)
+        assert asked.urls == (f"{emulator.url}?dialect={dialect}",)
+        assert not any("Trigger" in str(one.message) for one in emulator.log)
+
+
+@pytest.mark.parametrize("name", MAKES)
+@pytest.mark.asyncio
+async def test_doctor_finds_nothing_wrong(name: str) -> None:
+    async with MAKES[name][0]() as emulator:
+        found = [one async for one in examine(emulator.url, trigger=True, count=3, seconds=0.1)]
+    assert not [one for one in found if one.severity in {"error", "warning"}], found
+    assert any("trigger" in one.check for one in found)
+
+
+@pytest.mark.parametrize(("version", "dialect"), [(1, "v1"), (2, "v2"), (3, "v3"), (4, "v4")])
+@pytest.mark.asyncio
+async def test_version_of_the_device_is_found_out(version: int, dialect: str) -> None:
+    async with (
+        EmulatedIfm(version=version) as emulator,
+        smartcam.connect(emulator.url) as camera,
+    ):
+        assert camera.url.endswith(f"?dialect={dialect}")
+        assert (await camera.trigger()).value == b"star;12.5000;-3.0000;0.9700;stop"
+
+
+def test_commands_know_the_makes() -> None:
+    out = run("protocols").done().out
+    assert all(f"{name}://" in out for name in MAKES)

@@ -1,0 +1,251 @@
+"""smartcam's suite for protocols, with bytes from the makes' documents."""
+
+from __future__ import annotations
+
+from smartcam.exceptions import FrameError
+from smartcam.makes import IV3, PCIC, SR
+from smartcam.models import Status
+from smartcam.protocols import LineCommand, LineReply
+from smartcam.protocols import messages as m
+from smartcam.testing import Came, Conversation, Sent, WireSuite
+
+READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+WHO = "IFM ELECTRONIC\tO2D500\tname\tplace\t\t192.168.0.69\t255.255.255.0\t192.168.0.201"
+
+
+def v3(ticket: int | str, content: str) -> bytes:
+    """Return a frame of version 3, made here."""
+    body = f"{ticket}{content}\r\n".encode("latin-1")
+    return f"{ticket}L{len(body):09}\r\n".encode() + body
+
+
+def v4(content: str) -> bytes:
+    """Return a frame of version 4, made here."""
+    return f"L{len(content) + 2:09}\r\n{content}\r\n".encode()
+
+
+def code(line: str) -> m.ResultContainer:
+    """Return what a reader's line is told as."""
+    read = line != "ERROR"
+    cells = (m.CellValue("read", str(int(read))), m.CellValue("code", line if read else ""))
+    return m.ResultContainer(data=line.encode(), cells=cells)
+
+
+V3_SESSION = (
+    Sent(m.Connect(), b"1000L000000008\r\n1000G?\r\n"),
+    Came(v3(1000, WHO), (), b"1001L000000008\r\n1001p7\r\n"),
+    Came(v3(1001, "*"), (m.ConnectAnswer(version=1),)),
+)
+
+
+class TestPcicWire(WireSuite):
+    protocol = PCIC
+    conversations = (
+        Conversation(
+            name="a trigger by its ticket, and what the device says meanwhile",
+            dialect="v3",
+            steps=[
+                *V3_SESSION,
+                Sent(m.GetStatus(), v3(1002, "E?")),
+                Came(v3(1002, "000000000"), (m.StatusReport(status=READY),)),
+                Sent(m.Query(), v3(1003, "A?")),
+                Came(v3(1003, "003\t07\t01\t07\t12"), (m.QueryAnswer(application=7),)),
+                Sent(m.Trigger(), v3(1004, "T?")),
+                Sent(m.Query(), v3(1005, "A?")),
+                Came(v3("0000", "star;old;stop"), (m.ResultContainer(data=b"star;old;stop"),)),
+                Came(v3(1005, "003\t07\t01\t07\t12"), (m.QueryAnswer(application=7),)),
+                Came(
+                    v3("0001", "110001006:Trigger overrun"),
+                    (m.Notice("error", 110001006, "Trigger overrun"),),
+                ),
+                Came(v3("0010", "000500000:{}"), (m.Notice("notification", 500000, "{}"),)),
+                Came(
+                    v3(1004, "star;\r\n\xff;stop"),
+                    (m.TriggerAnswer(), m.ResultContainer(data=b"star;\r\n\xff;stop")),
+                ),
+            ],
+        ),
+        Conversation(
+            name="requests of several questions",
+            dialect="v3",
+            steps=[
+                *V3_SESSION,
+                Sent(m.SwitchApplication(application=12), v3(1002, "a12")),
+                Came(v3(1002, "*"), (), v3(1003, "A?")),
+                Came(v3(1003, "003\t12\t01\t07\t12"), (m.SwitchAnswer(application=12),)),
+                Sent(m.ReadImage(), v3(1004, "I01?")),
+                Came(v3(1004, "!"), (), v3(1005, "I02?")),
+                Came(v3(1005, "!"), (m.Image(code=1, data=b""),)),
+                Sent(m.SetInput(data=b"bolt"), v3(1006, "j00000000004bolt")),
+                Came(v3(1006, "*"), (m.SetInputAnswer(),)),
+                Sent(m.Trigger(), v3(1007, "T?")),
+                Came(v3(1007, "!"), (m.TriggerAnswer(code=4),)),
+                Sent(LineCommand(line="S?"), v3(1008, "S?")),
+                Came(v3(1008, "?"), (LineReply(code=2, data=b"?"),)),
+                Came(v3(1009, "*"), (FrameError,)),
+            ],
+        ),
+        Conversation(
+            name="asynchronous triggers",
+            dialect="v3",
+            parameters={"trigger": "async"},
+            steps=[
+                *V3_SESSION,
+                Sent(m.Trigger(), v3(1002, "t")),
+                Came(v3(1002, "*"), (m.TriggerAnswer(),)),
+                Came(
+                    v3("0001", "110001006:Trigger overrun"),
+                    (
+                        m.Notice("error", 110001006, "Trigger overrun"),
+                        m.StatusReport(status=READY | Status.OVERTRIGGERED),
+                        m.StatusReport(status=READY),
+                    ),
+                ),
+                Came(v3("0000", "star;1;stop"), (m.ResultContainer(data=b"star;1;stop"),)),
+            ],
+        ),
+        Conversation(
+            name="no frame",
+            dialect="v3",
+            steps=[*V3_SESSION, Came(b"1002L00000000x\r\n", (FrameError,))],
+        ),
+        Conversation(
+            name="a length that is not kept",
+            dialect="v3",
+            steps=[*V3_SESSION, Came(b"0000L000000008\r\n0000abcd", (FrameError,))],
+        ),
+        Conversation(
+            name="v4: answers in order, with their length",
+            dialect="v4",
+            steps=[
+                Sent(m.Connect(), b"G?\r\n"),
+                Came(v4(WHO), (), b"p0\r\n"),
+                Came(v4("*"), (m.ConnectAnswer(version=1),)),
+                Sent(m.Trigger(), b"T?\r\n"),
+                Sent(m.Query(), b""),
+                Came(
+                    v4("star;1;stop"),
+                    (m.TriggerAnswer(), m.ResultContainer(data=b"star;1;stop")),
+                    b"A?\r\n",
+                ),
+                Came(v4("001\t01\t01"), (m.QueryAnswer(application=1),)),
+            ],
+        ),
+        Conversation(
+            name="v2: tickets, no length",
+            dialect="v2",
+            steps=[
+                Sent(m.Connect(), b"1000G?\r\n"),
+                Came(f"1000{WHO}\r\n".encode(), (), b"1001p7\r\n"),
+                Came(b"1001*\r\n", (m.ConnectAnswer(version=1),)),
+                Sent(m.Trigger(), b"1002T?\r\n"),
+                Came(b"0000star;old;stop\r\n", (m.ResultContainer(data=b"star;old;stop"),)),
+                Came(b"1002!\r\n", (m.TriggerAnswer(code=4),)),
+            ],
+        ),
+        Conversation(
+            name="v1: neither",
+            dialect="v1",
+            steps=[
+                Sent(m.Connect(), b"G?\r\n"),
+                Came(f"{WHO}\r\n".encode(), (), b"p0\r\n"),
+                Came(b"*\r\n", (m.ConnectAnswer(version=1),)),
+                Sent(m.Query(), b"A?\r\n"),
+                Came(b"!\r\n", (m.QueryAnswer(application=m.UNNAMED_APPLICATION),)),
+            ],
+        ),
+    )
+
+
+class TestIv3Wire(WireSuite):
+    protocol = IV3
+    conversations = (
+        Conversation(
+            name="triggers, programs and errors",
+            dialect="lines",
+            steps=[
+                Sent(m.Connect(), b"RT\r"),
+                Came(b"ER,RT,03\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))),
+                Sent(m.Query(), b"PR\r"),
+                Came(b"PR,099\r", (m.QueryAnswer(application=99),)),
+                Sent(m.Trigger(), b"T2\r"),
+                Sent(m.Query(), b""),
+                Came(b"RT,00003,NG,01,OK,0000095\r", (), b"PR\r"),
+                Came(
+                    b"PR,098\r",
+                    (
+                        m.TriggerAnswer(),
+                        m.ResultContainer(
+                            application=98,
+                            data=b"RT,00003,NG,01,OK,0000095",
+                            cells=(
+                                m.CellValue("count", "00003"),
+                                m.CellValue("judgement", "0"),
+                                m.CellValue("tool 01", "01"),
+                                m.CellValue("tool 01 judgement", "1"),
+                                m.CellValue("tool 01 rate", "0000095"),
+                            ),
+                        ),
+                    ),
+                    b"PR\r",
+                ),
+                Came(b"PR,099\r", (m.QueryAnswer(application=99),)),
+                Sent(m.SwitchApplication(application=7), b"PW,7\r"),
+                Came(b"ER,PW,22\r", (), b"PR\r"),
+                Came(b"PR,099\r", (m.SwitchAnswer(code=22, application=99),)),
+                Sent(m.Trigger(), b"T2\r"),
+                Came(b"ER,T2,03\r", (m.TriggerAnswer(code=3),)),
+                Sent(LineCommand(line="DR,03,0"), b"DR,03,0\r"),
+                Came(b"DR,03,0,0023250\r", (LineReply(data=b"DR,03,0,0023250"),)),
+            ],
+        ),
+        Conversation(
+            name="an answer to something else",
+            dialect="lines",
+            steps=[
+                Sent(m.Connect(), b"RT\r"),
+                Came(b"RT,00000,NG\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))),
+                Sent(m.Query(), b"PR\r"),
+                Came(b"PW\r", (FrameError,)),
+            ],
+        ),
+    )
+
+
+class TestSrWire(WireSuite):
+    protocol = SR
+    conversations = (
+        Conversation(
+            name="readings, with other answers between",
+            dialect="lines",
+            parameters={"bank": "3"},
+            steps=[
+                Sent(m.Connect(), b"ERRSTAT\r"),
+                Came(b"OK,ERRSTAT,NONE\r", (m.ConnectAnswer(version=1),)),
+                Sent(m.GetStatus(), b"BUSYSTAT\r"),
+                Came(b"OK,BUSYSTAT,NONE\r", (m.StatusReport(status=READY),)),
+                Sent(m.Trigger(), b"LON,03\r"),
+                Sent(m.Query(), b"NUM\r"),
+                Came(b"OK,NUM,1,0\r", (m.QueryAnswer(application=3),)),
+                Came(b"4006381333931\r", (m.TriggerAnswer(), code("4006381333931"))),
+                Came(b"4012345678901\r", (code("4012345678901"),)),
+                Sent(m.Trigger(), b"LON,03\r"),
+                Sent(m.EndTrigger(), b"LOFF\r"),
+                Came(b"ERROR\r", (m.TriggerAnswer(), code("ERROR"))),
+                Sent(m.Trigger(), b"LON,03\r"),
+                Came(b"ER,LON,20\r", (m.TriggerAnswer(code=20),)),
+                Came(b"ER,LOFF,20\r", (m.Notice("error", 20, "ER,LOFF,20"),)),
+                Sent(LineCommand(line="BCLR"), b"BCLR\r"),
+                Came(b"ER,BCLR,00\r", (LineReply(code=100, data=b"ER,BCLR,00"),)),
+            ],
+        ),
+        Conversation(
+            name="an error that belongs to nothing",
+            dialect="lines",
+            steps=[
+                Sent(m.Connect(), b"ERRSTAT\r"),
+                Came(b"OK,ERRSTAT,NONE\r", (m.ConnectAnswer(version=1),)),
+                Came(b"ER,XYZ,00\r", (FrameError,)),
+            ],
+        ),
+    )
