@@ -1,0 +1,45 @@
+"""Ways of results out of a cell: brokers, databases, PLCs; nothing is lost while they are away.
+
+:class:`Outlets` runs what a section ``outlets:`` says. Each one has a spool on the disk, and an
+account that balances. :class:`Outlet` is the base of a new kind: a class in the entry-point group
+``smartcam.outlets``. The commands are ``smartcam serve``, ``smartcam outlet`` and
+``smartcam results``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.outlets._entry import EntryRefusedError, OutletAccount, OutletEntry, OutletError
+    from smartcam.outlets._outlet import Column, Outlet, OutletDesk
+    from smartcam.outlets._outlets import Outlets, OutletState
+    from smartcam.outlets._settings import OutletSettings, OutletsFile, Secret
+
+__all__ = [
+    "Column",
+    "EntryRefusedError",
+    "Outlet",
+    "OutletAccount",
+    "OutletDesk",
+    "OutletEntry",
+    "OutletError",
+    "OutletSettings",
+    "OutletState",
+    "Outlets",
+    "OutletsFile",
+    "Secret",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_entry": "OutletEntry EntryRefusedError OutletAccount OutletError",
+            "_outlet": "Column OutletDesk Outlet",
+            "_outlets": "OutletState Outlets",
+            "_settings": "OutletSettings OutletsFile Secret",
+        },
+    )

@@ -1,0 +1,52 @@
+"""Commands that come through outlets, done by a camera."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam._arguments import check_application, check_seconds
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.camera import Camera
+
+MAX_TIMEOUT = 300.0
+"""Seconds that a command may be given."""
+
+_FIELDS = {"trigger": ("timeout",), "switch": ("application", "timeout")}
+_TIMEOUTS = {"trigger": 5.0, "switch": 10.0}
+
+
+async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Do a command and return what is answered.
+
+    Args:
+        camera: camera that is open.
+        verb: ``trigger`` or ``switch``.
+        given: ``timeout`` in seconds; for a switch ``application``.
+
+    Raises:
+        ConfigurationError: a field is wrong or unknown.
+        SmartCamError: the outcome of the command.
+    """
+    known = _FIELDS[verb]
+    for name in given:
+        if name not in known:
+            raise ConfigurationError(
+                f"{verb}: there is no field {name!r:.60}; known are {', '.join(known)}"
+                f"{did_you_mean(name, known)}"
+            )
+    timeout = check_seconds(given.get("timeout", _TIMEOUTS[verb]), "timeout", verb)
+    if timeout > MAX_TIMEOUT:
+        raise ConfigurationError(f"{verb}: timeout: expected {MAX_TIMEOUT:g} s at most")
+    if verb == "trigger":
+        result = await camera.trigger(timeout=timeout)
+        fields = result._asdict()
+        del fields["raw"]
+        return {"result": fields}
+    application = check_application(given.get("application"), "application", verb)
+    await camera.switch_application(application, timeout=timeout)
+    return {"application": application}

@@ -1,0 +1,336 @@
+"""Results, states and commands over MQTT 5."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import ssl
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field
+
+from smartcam._extras import load
+from smartcam._json import object_text
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.outlets._entry import EntryRefusedError, OutletError
+from smartcam.outlets._outlet import Outlet
+from smartcam.outlets._settings import OutletSettings, Secret
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.outlets._entry import OutletEntry
+    from smartcam.outlets._outlet import OutletDesk
+
+MAX_COMMANDS = 32
+"""Commands under way at a time; more are answered with an error."""
+
+MAX_COMMAND_BYTES = 1 << 16
+"""Bytes of a command's message."""
+
+MAX_STATES = 10_000
+"""Cameras whose state is kept."""
+
+_PORTS = {"mqtt": 1883, "mqtts": 8883}
+_VERBS = ("trigger", "switch")
+
+
+def _broker(text: str) -> str:
+    try:
+        parts = urlsplit(text)
+        fits = parts.scheme in _PORTS and parts.hostname and not (parts.path or parts.query)
+        _ = parts.port
+    except ValueError:
+        fits, parts = False, None
+    if not fits or parts is None:
+        raise ValueError("expected mqtt://HOST[:PORT] or mqtts://HOST[:PORT]")
+    if parts.username is not None or parts.password is not None:
+        raise ValueError("expected no user in the address: user: and password: have them")
+    return text
+
+
+def _prefix(text: str) -> str:
+    if any(one in text for one in "+#\0") or text.startswith(("/", "$")) or text.endswith("/"):
+        raise ValueError("expected a topic without + and #, such as plant1/smartcam")
+    return text
+
+
+class MqttSettings(OutletSettings):
+    """The settings of an outlet over MQTT."""
+
+    broker: Annotated[str, AfterValidator(_broker)] = Field(
+        description="mqtt://HOST[:1883], or mqtts://HOST[:8883] for TLS"
+    )
+    user: str | None = Field(None, description="name to log in with")
+    password: Secret | None = Field(
+        None, description="where the password is: {file: PATH} or {variable: NAME}"
+    )
+    ca: str | None = Field(
+        None, min_length=1, description="file of the authority that signs brokers, beside this file"
+    )
+    topic: Annotated[str, AfterValidator(_prefix)] = Field(
+        "smartcam", min_length=1, max_length=200, description="what every topic begins with"
+    )
+    client_id: str | None = Field(
+        None, min_length=1, max_length=100, description="default: smartcam-NAME, of the outlet"
+    )
+    commands: bool = Field(
+        False,
+        description="whoever may publish to TOPIC/command/# may trigger cameras and switch "
+        "applications; see to it that the broker says who that is",
+    )
+    largest: int = Field(
+        10_000_000, ge=1000, le=268_000_000, description="bytes of a message; larger are refused"
+    )
+
+
+class MqttOutlet(Outlet[MqttSettings]):
+    """Publishes entries with QoS 1, states retained, and does commands."""
+
+    settings_class = MqttSettings
+    max_batch: ClassVar[int] = 100
+
+    def __init__(self, name: str, settings: MqttSettings, folder: Path, desk: OutletDesk) -> None:
+        super().__init__(name, settings, folder, desk)
+        self._stack = contextlib.AsyncExitStack()
+        self._client: Any = None
+        self._hearing: asyncio.Task[None] | None = None
+        self._refusal = ""
+        self._states: dict[str, Mapping[str, Any]] = {}
+        self._fresh: set[str] = set()
+        self._changed = asyncio.Event()
+        self._commands: set[asyncio.Task[None]] = set()
+
+    async def open(self) -> None:
+        """Come to the broker.
+
+        Raises:
+            ConfigurationError: a secret or the authority's file is not there.
+            MissingExtraError: aiomqtt is not installed.
+            Exception: the broker is away, or refuses.
+        """
+        aiomqtt = load("aiomqtt")
+        settings, online = self.settings, f"{self.settings.topic}/outlet/{self.name}"
+        parts = urlsplit(settings.broker)
+        password = None if settings.password is None else settings.password.read(self.folder)
+        self._client = client = aiomqtt.Client(
+            parts.hostname,
+            parts.port or _PORTS[parts.scheme],
+            username=settings.user,
+            password=password,
+            identifier=settings.client_id or f"smartcam-{self.name}",
+            protocol=aiomqtt.ProtocolVersion.V5,
+            will=aiomqtt.Will(online, '{"online":false}', qos=1, retain=True),
+            timeout=settings.timeout,
+            keepalive=10,
+            clean_start=True,  # a command from before would be done too late
+            max_queued_incoming_messages=MAX_COMMANDS,
+            tls_context=self._tls() if parts.scheme == "mqtts" else None,
+        )
+        client.pending_calls_threshold = 2 * self.max_batch
+        self._watch_refusals(client)
+        self._refusal = ""
+        stack = contextlib.AsyncExitStack()
+        self._stack = stack
+        await stack.enter_async_context(client)
+        if settings.commands and self.desk.command is not None:
+            for verb in _VERBS:
+                await client.subscribe(f"{settings.topic}/command/{verb}/#", qos=1)
+        await client.publish(online, '{"online":true}', qos=1, retain=True)
+        self._fresh.update(self._states)
+        self._changed.set()
+        self._hearing = asyncio.get_running_loop().create_task(self._hear(client))
+
+    def _tls(self) -> ssl.SSLContext:
+        ca = self.settings.ca
+        try:
+            return ssl.create_default_context(cafile=None if ca is None else self.folder / ca)
+        except OSError as exc:
+            raise ConfigurationError(f"outlet {self.name}: ca: {ca}: {exc}") from exc
+
+    def _watch_refusals(self, client: Any) -> None:
+        """Learn which messages the broker acknowledges with a failure: aiomqtt does not tell."""
+        inner = client._client  # noqa: SLF001
+        told = inner.on_publish
+
+        def on_publish(of: Any, data: Any, number: int, reason: Any, properties: Any) -> None:
+            if reason is not None and reason.is_failure:
+                self._refusal = str(reason)
+            told(of, data, number, reason, properties)
+
+        inner.on_publish = on_publish
+
+    async def deliver(self, entries: Sequence[OutletEntry]) -> None:
+        """Publish entries to TOPIC/KIND/CAMERA; the broker has acknowledged each one then."""
+        messages = [_message(entry) for entry in entries]
+        sizes = [len(one) for one in messages]
+        count, largest = len(messages), self.settings.largest
+        bad = next((place for place, size in enumerate(sizes) if size > largest), None)
+        if bad is not None:
+            count = bad
+        topics = [f"{self.settings.topic}/{one.kind}/{one.camera or 'all'}" for one in entries]
+        await self._while_here(
+            [
+                self._client.publish(topic, message, qos=1)
+                for topic, message in zip(topics[:count], messages[:count], strict=True)
+            ]
+        )
+        if bad is not None:
+            text = f"{sizes[bad]} bytes, {largest} are allowed"
+            raise EntryRefusedError(text, place=bad)
+
+    async def _while_here(self, calls: list[Any]) -> None:
+        """Have messages published side by side, in order, as long as the broker is there."""
+        hearing = self._hearing
+        if hearing is None:
+            for call in calls:
+                call.close()
+            raise OutletError("not connected to the broker")
+        publishing: asyncio.Future[Any] = asyncio.gather(*calls)
+        try:
+            ends: set[asyncio.Future[Any]] = {publishing, hearing}
+            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+            if hearing.done():
+                hearing.result()
+            await publishing
+        finally:
+            publishing.cancel()
+            with contextlib.suppress(asyncio.CancelledError, Exception):
+                await publishing
+        if self._refusal:
+            raise OutletError(f"the broker refused a message: {self._refusal}")
+
+    def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
+        """Have the camera's state published, retained, soon."""
+        if camera in self._states or len(self._states) < MAX_STATES:
+            self._states[camera] = state
+            self._fresh.add(camera)
+            self._changed.set()
+
+    async def watch(self) -> None:
+        """Wait until the broker is gone."""
+        if self._hearing is not None:
+            await asyncio.shield(self._hearing)
+
+    async def close(self) -> None:
+        """Leave the broker."""
+        tasks = [*self._commands, *([self._hearing] if self._hearing is not None else [])]
+        self._hearing = None
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+        client = self._client
+        if client is not None and tasks:
+            online = f"{self.settings.topic}/outlet/{self.name}"
+            with contextlib.suppress(Exception):
+                await client.publish(online, '{"online":false}', qos=1, retain=True, timeout=1)
+        self._client = None
+        await self._stack.aclose()
+
+    # ------------------------------------------------------------------ states and commands
+
+    async def _hear(self, client: Any) -> None:
+        """Publish states and take commands until the broker is gone."""
+        loop = asyncio.get_running_loop()
+        telling = loop.create_task(self._tell_states(client))
+        hearing = loop.create_task(self._take_commands(client))
+        try:
+            await asyncio.wait({telling, hearing}, return_when=asyncio.FIRST_COMPLETED)
+            for task in (telling, hearing):
+                if task.done():
+                    task.result()
+            raise OutletError("the broker is gone")
+        finally:
+            for task in (telling, hearing):
+                task.cancel()
+            await asyncio.wait({telling, hearing})
+
+    async def _tell_states(self, client: Any) -> None:
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            while self._fresh:
+                camera = self._fresh.pop()
+                try:
+                    text = object_text({"camera": camera, **self._states[camera]})
+                    topic = f"{self.settings.topic}/state/{camera}"
+                    await client.publish(topic, text, qos=1, retain=True)
+                except BaseException:
+                    self._fresh.add(camera)
+                    raise
+
+    async def _take_commands(self, client: Any) -> None:
+        async for message in client.messages:
+            if message.retain:
+                continue  # it would be done again with each session
+            task = asyncio.get_running_loop().create_task(self._command(client, message))
+            self._commands.add(task)
+            task.add_done_callback(self._commands.discard)
+
+    async def _command(self, client: Any, message: Any) -> None:
+        verb, _, camera = (
+            str(message.topic).removeprefix(f"{self.settings.topic}/command/").partition("/")
+        )
+        reply = await self._do(verb, camera, message.payload)
+        said = message.properties
+        topic = getattr(said, "ResponseTopic", None)
+        properties = None
+        if not topic or "+" in topic or "#" in topic:
+            topic = f"{self.settings.topic}/reply/{verb}/{camera}"
+        correlation = getattr(said, "CorrelationData", None)
+        if correlation is not None:
+            properties = load("paho.mqtt.properties").Properties(
+                load("paho.mqtt.packettypes").PacketTypes.PUBLISH
+            )
+            properties.CorrelationData = correlation
+        with contextlib.suppress(load("aiomqtt").MqttError):  # who asked sees that none came
+            await client.publish(topic, object_text(reply), qos=1, properties=properties)
+
+    async def _do(self, verb: str, camera: str, payload: object) -> dict[str, Any]:
+        fields: dict[str, Any] = {"camera": camera}
+        try:
+            given = _command_fields(payload)
+            if "id" in given:
+                fields["id"] = given.pop("id")
+            if len(self._commands) > MAX_COMMANDS:
+                raise OutletError(f"{MAX_COMMANDS} commands are under way already")
+            if self.desk.command is None or not self.settings.chooses(camera):
+                raise ConfigurationError(f"there is no camera {camera!r:.120} here")
+            done = await self.desk.command(camera, verb, given)
+        except SmartCamError as exc:
+            return {**fields, "ok": False, "error": str(exc), "kind": type(exc).__name__}
+        return {**fields, "ok": True, **done}
+
+
+def _message(entry: OutletEntry) -> bytes:
+    """Return an entry's JSON with its id in front."""
+    head = (
+        {"id": entry.id, "camera": entry.camera}
+        if '"camera":' not in entry.body
+        else {"id": entry.id}
+    )
+    return f"{object_text(head)[:-1]},{entry.body[1:]}".encode()
+
+
+def _command_fields(payload: object) -> dict[str, Any]:
+    """Return the fields of a command's message; an empty message has none.
+
+    Raises:
+        ConfigurationError: it is too large, or no JSON object.
+    """
+    data = bytes(payload) if isinstance(payload, (bytes, bytearray)) else b"?"
+    if len(data) > MAX_COMMAND_BYTES:
+        raise ConfigurationError(f"{len(data)} bytes, expected {MAX_COMMAND_BYTES} at most")
+    if not data.strip():
+        return {}
+    try:
+        given: object = json.loads(data)
+    except (ValueError, RecursionError):
+        given = None
+    if not isinstance(given, dict):
+        raise ConfigurationError("expected a JSON object, or nothing")
+    return cast("dict[str, Any]", given)

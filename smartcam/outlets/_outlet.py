@@ -1,0 +1,91 @@
+"""The base of outlets: the class that a plug-in derives from."""
+
+from __future__ import annotations
+
+import asyncio
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.outlets._entry import OutletEntry
+    from smartcam.outlets._settings import OutletSettings
+
+SettingsT = TypeVar("SettingsT", bound="OutletSettings")
+
+
+class OutletDesk:
+    """The things that an outlet may ask of the process that has the cameras.
+
+    Args:
+        columns: returns names, types and units of the values of a camera's application, by its
+            layout; empty where they are not known.
+        command: does a command and returns what is answered; None where commands are not allowed.
+    """
+
+    def __init__(
+        self,
+        columns: Callable[[str, int], Sequence[Column]],
+        command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
+    ) -> None:
+        self.columns = columns
+        self.command = command
+
+
+Column = tuple[str, str, str]
+"""Name, type as in a layout, and SI unit ("" for none) of a value."""
+
+
+class Outlet(ABC, Generic[SettingsT]):
+    """A way of results out of a cell; derive from it, and name the class in an entry point.
+
+    An outlet only delivers. What waits, what is counted and what is tried again is the work of who
+    calls it: :meth:`open` first, then :meth:`deliver` for one batch after the other, in order. An
+    exception of any of them means that the far end is away: :meth:`close` follows, and after a
+    delay :meth:`open` again, with the same batch.
+
+    Args:
+        name: name of the outlet.
+        settings: settings of the outlet.
+        folder: folder of relative paths.
+        desk: what it may ask of the process that has the cameras.
+
+    Attributes:
+        settings_class: model of the settings, a class of ``OutletSettings``.
+        max_batch: entries of one batch at most.
+    """
+
+    settings_class: ClassVar[type[Any]]
+    max_batch: ClassVar[int] = 200
+
+    def __init__(self, name: str, settings: SettingsT, folder: Path, desk: OutletDesk) -> None:
+        self.name = name
+        self.settings = settings
+        self.folder = folder
+        self.desk = desk
+
+    async def open(self) -> None:
+        """Come to the far end."""
+
+    @abstractmethod
+    async def deliver(self, entries: Sequence[OutletEntry]) -> None:
+        """Return when the far end has all of these entries for good.
+
+        A batch may come again, where nobody knows whether it arrived: hand on each entry's ``id``.
+
+        Raises:
+            EntryRefusedError: the far end will never take one of them.
+            Exception: the far end is away; the batch comes again.
+        """
+
+    def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
+        """Hear of a camera's state: ``connected``, ``application``, ``reason``; return at once."""
+
+    async def watch(self) -> None:
+        """Wait while nothing is to be delivered; raise when the far end is gone."""
+        await asyncio.Event().wait()
+
+    async def close(self) -> None:
+        """Leave the far end; called after each :meth:`open`, also after one that failed."""

@@ -1,0 +1,229 @@
+"""All outlets of a process: they are offered what cameras bring."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._json import object_text
+from smartcam._server import Server
+from smartcam._user_code import ENDS_PROGRAM, text_of
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.interpreters._inside import LocalizationsInterpreter
+from smartcam.outlets._outlet import Column, OutletDesk
+from smartcam.outlets._pump import Pump
+from smartcam.outlets._settings import mistakes_of, outlet_class
+from smartcam.outlets._spool import Spool, read_account
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from datetime import datetime
+    from pathlib import Path
+
+    from smartcam.interpreters import Interpreter
+    from smartcam.models import Result
+    from smartcam.outlets._entry import OutletAccount
+    from smartcam.outlets._settings import OutletSettings, Section
+
+RESULT_BYTES = 600
+"""Bytes that a result keeps in memory beside its container, about."""
+
+
+class OutletState(NamedTuple):
+    """The state of one outlet.
+
+    Attributes:
+        account: account of all that came.
+        trouble: reason for which nothing is delivered, or spooled, at the time; "" for none.
+    """
+
+    account: OutletAccount
+    trouble: str
+
+
+class Outlets(Server):
+    """The outlets of a section ``outlets:``, to be run by ``async with``.
+
+    Args:
+        section: settings by the outlet's name.
+        folder: folder of relative paths: of spools, secrets, stores.
+        columns: returns names, types and units of an application's values, by its layout.
+        command: does a command for an outlet that takes them.
+        tell: called with an outlet's name and its trouble, and with "" when that is over.
+
+    Raises:
+        ConfigurationError: the section is wrong.
+    """
+
+    def __init__(
+        self,
+        section: Section,
+        folder: Path,
+        *,
+        columns: Callable[[str, int], Sequence[Column]] = lambda _camera, _application: (),
+        command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
+        tell: Callable[[str, str], None] = lambda _name, _why: None,
+    ) -> None:
+        for place, text in mistakes_of(section):
+            raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
+        desk = OutletDesk(columns, command)
+        self._pumps: dict[str, Pump] = {}
+        for name, given in section.items():
+            kind = outlet_class(name, given)
+            settings: OutletSettings = kind.settings_class.model_validate(given)
+            spool = Spool(
+                spool_path(folder, settings, name),
+                int(settings.size),
+                settings.full,
+                durable=settings.durable,
+            )
+            self._pumps[name] = Pump(kind(name, settings, folder, desk), spool, tell)
+        self._chosen: dict[str, list[Pump]] = {}
+        self._started: list[Pump] = []
+
+    async def start(self) -> None:
+        """Open the spools, and begin to deliver; a far end that is away is no error.
+
+        Raises:
+            ConfigurationError: a spool cannot be opened, or another process has it.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._started:
+            return
+        try:
+            for pump in self._pumps.values():
+                try:
+                    await pump.start()
+                except (sqlite3.Error, OSError) as exc:
+                    raise ConfigurationError(
+                        f"outlet {pump.outlet.name}: its spool {pump.spool.path}: {exc}"
+                    ) from exc
+                self._started.append(pump)
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def stop(self) -> None:
+        """End; what is not delivered stays in the spools. Harmless when done twice."""
+        while self._started:
+            await self._started[-1].stop()
+            self._started.pop()
+
+    @property
+    def states(self) -> dict[str, OutletState]:
+        """State of each outlet, by name."""
+        return {
+            name: OutletState(pump.account, pump.disk_trouble or pump.trouble)
+            for name, pump in self._pumps.items()
+        }
+
+    # ------------------------------------------------------------------ what cameras bring
+
+    def offer_result(
+        self, result: Result[Any], read: Callable[[], tuple[Any, int | None]] | None = None
+    ) -> None:
+        """Hand a result to the outlets; returns at once.
+
+        Args:
+            result: the result.
+            read: returns value and sequence number; called in a thread. None: as they are.
+        """
+        made: list[tuple[Any, int | None, str]] = []
+
+        def make() -> tuple[Any, int | None, str]:
+            if not made:  # one outlet makes it for all
+                made.append(_result(result, read))
+            return made[0]
+
+        size = len(result.raw) + RESULT_BYTES
+        for pump in self._of(result.camera):
+            pump.offer(result.camera, result.received_at.timestamp(), size, make)
+
+    def offer_error(
+        self, camera: str, at: datetime, error: str, kind: str, triggered_at: datetime | None = None
+    ) -> None:
+        """Hand an error to the outlets; returns at once."""
+        fields = {"camera": camera, "error": error, "kind": kind, "triggered_at": triggered_at}
+        text = object_text(fields)
+        for pump in self._of(camera):
+            pump.offer(camera, at.timestamp(), len(text), lambda: ("error", None, text))
+
+    def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
+        """Tell the outlets of a camera's state; returns at once."""
+        for pump in self._of(camera):
+            pump.outlet.state_changed(camera, state)
+
+    def _of(self, camera: str) -> list[Pump]:
+        found = self._chosen.get(camera)
+        if found is None:
+            pumps = self._pumps.values()
+            found = [one for one in pumps if one.outlet.settings.chooses(camera)]
+            self._chosen[camera] = found
+        return found
+
+
+def _result(
+    result: Result[Any], read: Callable[[], tuple[Any, int | None]] | None
+) -> tuple[Any, int | None, str]:
+    application = result.application
+    try:
+        if read is not None:
+            value, sequence = read()
+            result = result._replace(value=value, sequence=sequence)
+        fields = result._asdict()
+        del fields["raw"]
+        return "result", application, object_text(fields)
+    except ENDS_PROGRAM:
+        raise
+    except BaseException as exc:  # noqa: BLE001 - an interpreter is a plug-in
+        text = str(exc) if isinstance(exc, SmartCamError) else text_of(exc)
+        kept = {"raw": result.raw, "error": text, "kind": type(exc).__name__}
+        return "error", application, object_text({**result._asdict(), "value": None, **kept})
+
+
+def spool_path(folder: Path, settings: OutletSettings, name: str) -> Path:
+    """Return the file of an outlet's spool."""
+    return folder / settings.spool / f"{name}.spool"
+
+
+def stored_accounts(section: Section, folder: Path) -> dict[str, OutletAccount | None]:
+    """Return the accounts in the spools of a section, by the outlet's name; None: no spool yet."""
+    found: dict[str, OutletAccount | None] = {}
+    for name, given in section.items():
+        settings = outlet_class(name, given).settings_class.model_validate(given)
+        found[name] = None
+        with contextlib.suppress(FileNotFoundError):
+            found[name] = read_account(spool_path(folder, settings, name))
+    return found
+
+
+LOCALIZATION: Sequence[Column] = (
+    ("feature_id", "string", ""),
+    ("quality", "real64", ""),
+    ("photo_index", "int32", ""),
+    ("x", "real64", "m"),
+    ("y", "real64", "m"),
+    ("z", "real64", "m"),
+    ("qx", "real64", ""),
+    ("qy", "real64", ""),
+    ("qz", "real64", ""),
+    ("qw", "real64", ""),
+)
+"""Values of a localization: its pose as a position and a quaternion."""
+
+_SI = {"deg": "rad", "rad": "rad", "px": "px"}
+
+
+def columns_of(interpreter: Interpreter | None) -> Sequence[Column]:
+    """Return names, types and SI units of an interpreter's values; empty where it has no layout."""
+    if isinstance(interpreter, LocalizationsInterpreter):
+        return LOCALIZATION
+    layout = None if interpreter is None else interpreter.layout
+    if layout is None:
+        return ()
+    return [
+        (one.name, "real64" if one.unit else one.type, _SI.get(one.unit, "m") if one.unit else "")
+        for one in (*layout.head, *layout.fields)
+    ]

@@ -1,0 +1,384 @@
+"""Bring what comes into a spool, and from the spool to the far end."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import logging
+import sqlite3
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from smartcam._user_code import ENDS_PROGRAM, text_of
+from smartcam.backoff import Backoff
+from smartcam.outlets._entry import EntryRefusedError, OutletAccount, OutletEntry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.outlets._outlet import Outlet
+    from smartcam.outlets._spool import Spool, SpoolHead
+
+T = TypeVar("T")
+
+logger: logging.Logger = logging.getLogger("smartcam.outlets")
+
+MAX_WAITING = 20_000
+"""Entries that wait in memory for the spool's disk."""
+
+MAX_WAITING_BYTES = 1 << 26
+"""Bytes that these entries keep."""
+
+MAX_WRITTEN_TOGETHER = 500
+"""Entries of one write to the spool."""
+
+DISK_RETRY_SECONDS = 1.0
+"""Seconds until a disk that was full or away is tried again."""
+
+STOP_TIMEOUT = 10.0
+"""Seconds for writing what waits in memory when it ends."""
+
+LINGER = 1.0
+"""Seconds for delivering what is spooled when it ends, where the far end takes it."""
+
+CLOSE_TIMEOUT = 5.0
+"""Seconds that an outlet has for leaving its far end."""
+
+
+class Arrival(NamedTuple):
+    """Something that came, not made into an entry yet.
+
+    Attributes:
+        camera: name of the camera.
+        number: number of the entry.
+        at: time of arrival, seconds since 1970, UTC.
+        size: bytes that it keeps.
+        make: returns kind, application and body of the entry; called in the spool's thread.
+    """
+
+    camera: str
+    number: int
+    at: float
+    size: int
+    make: Callable[[], tuple[Any, int | None, str]]
+
+
+class Pump:
+    """One outlet with its spool.
+
+    Args:
+        outlet: the outlet.
+        spool: spool of the outlet.
+        tell: called with why the far end or the disk does not take anything, and with "" when
+            they do again.
+
+    Attributes:
+        trouble: reason for which nothing is delivered at the time; "" where all is well.
+        disk_trouble: reason for which nothing is spooled at the time; "" where all is well.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet[Any],
+        spool: Spool,
+        tell: Callable[[str, str], None] = lambda _name, _why: None,
+    ) -> None:
+        self.outlet, self.spool, self._tell = outlet, spool, tell
+        self.trouble = self.disk_trouble = ""
+        self._waiting: collections.deque[Arrival] = collections.deque()
+        self._waiting_bytes = 0
+        self._lost: dict[str, tuple[Arrival, int]] = {}  # found no room, and are not told yet
+        self._numbers: dict[str, int] = {}
+        self._came, self._spooled = asyncio.Event(), asyncio.Event()
+        self._account = OutletAccount()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
+        self._open = False
+
+    async def start(self) -> None:
+        """Open the spool, and begin.
+
+        Raises:
+            ConfigurationError: another process has the spool.
+            sqlite3.Error: its file cannot be made.
+        """
+        try:
+            await self._run(self.spool.open)
+        except BaseException:
+            await self._end_thread()
+            raise
+        self._account = self.spool.account
+        self._open = True
+        loop = asyncio.get_running_loop()
+        for work in (self._write(), self._deliver()):
+            self._tasks.append(loop.create_task(work, name=f"smartcam.outlets.{self.outlet.name}"))
+
+    async def stop(self) -> None:
+        """End: what waits in memory goes to the spool, and what is there stays for the next start.
+
+        Cancellation: the spool's thread goes on to the end of what it does.
+        """
+        try:
+            await self._end(self._tasks[:1])
+            if self._open:
+                with contextlib.suppress(TimeoutError, sqlite3.Error):
+                    async with asyncio.timeout(STOP_TIMEOUT):
+                        while self._waiting or self._lost:
+                            await self._keep_some()
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(LINGER):
+                        while (  # noqa: ASYNC110 - for a second at most
+                            self._account.spooled and not (self.trouble or self.disk_trouble)
+                        ):
+                            await asyncio.sleep(0.01)
+        finally:
+            self._open = False
+            await self._end(self._tasks)
+            self._tasks = []
+            await self._end_thread()
+
+    async def _end(self, tasks: list[asyncio.Task[None]]) -> None:
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+
+    async def _end_thread(self) -> None:
+        with contextlib.suppress(RuntimeError, TimeoutError):
+            async with asyncio.timeout(STOP_TIMEOUT):
+                await self._run(self.spool.close)
+        self._thread.shutdown(wait=False)
+
+    def offer(
+        self, camera: str, at: float, size: int, make: Callable[[], tuple[Any, int | None, str]]
+    ) -> None:
+        """Take a result or an error; never waits."""
+        number = self._numbers[camera] = self._numbers.get(camera, 0) + 1
+        came = Arrival(camera, number, at, size, make)
+        if (
+            len(self._waiting) >= MAX_WAITING
+            or self._waiting_bytes + size > MAX_WAITING_BYTES
+            or self._lost  # what comes behind a gap stays behind it
+        ):
+            self._lost[camera] = came, self._lost.get(camera, (came, 0))[1] + 1
+        else:
+            self._waiting.append(came)
+            self._waiting_bytes += size
+        self._came.set()
+
+    @property
+    def account(self) -> OutletAccount:
+        """The account of all that came, with what waits in memory."""
+        kept, waiting = self._account, len(self._waiting)
+        lost = sum(count for _, count in self._lost.values())
+        dropped = dict(kept.dropped)
+        if lost:
+            dropped["memory"] = dropped.get("memory", 0) + lost
+        return OutletAccount(
+            kept.results + waiting + lost, kept.delivered, kept.spooled + waiting, dropped
+        )
+
+    # ------------------------------------------------------------------ into the spool
+
+    async def _write(self) -> None:
+        while True:
+            await self._came.wait()
+            self._came.clear()
+            while self._waiting or self._lost:
+                try:
+                    await self._keep_some()
+                except sqlite3.OperationalError as exc:
+                    self._say_disk(f"the spool {self.spool.path}: {exc}")
+                    await asyncio.sleep(DISK_RETRY_SECONDS)
+                except sqlite3.Error as exc:
+                    self._say_disk(f"the spool {self.spool.path} was damaged: {exc}")
+                    self._account = self.spool.account
+                    await asyncio.sleep(DISK_RETRY_SECONDS)
+                else:
+                    self._say_disk("")
+
+    async def _keep_some(self) -> None:
+        """Write the first entries of those that wait, or the gap behind all of them."""
+        batch = [one for one, _ in zip(self._waiting, range(MAX_WRITTEN_TOGETHER), strict=False)]
+        lost = {} if batch else dict(self._lost)
+        await self._kept(batch, lost)
+
+    async def _kept(self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]]) -> None:
+        epoch = self.spool.epoch
+
+        def work() -> OutletAccount:
+            entries = [
+                OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
+                for one in batch
+                for kind, application, body in [one.make()]
+            ]
+            gaps = [
+                (
+                    OutletEntry(one.camera, epoch, one.number, "gap", None, one.at, ""),
+                    count,
+                    _MEMORY,
+                )
+                for one, count in lost.values()
+            ]
+            self.spool.add(entries, gaps)
+            return self.spool.account
+
+        await self._run(work, lambda account: self._drop_kept(batch, lost, account))
+        self._spooled.set()
+
+    def _drop_kept(
+        self, batch: list[Arrival], lost: dict[str, tuple[Arrival, int]], account: OutletAccount
+    ) -> None:
+        for one in batch:
+            self._waiting.popleft()
+            self._waiting_bytes -= one.size
+        for camera, (_, count) in lost.items():
+            last, now = self._lost.pop(camera)
+            if now > count:
+                self._lost[camera] = last, now - count
+        self._account = account
+
+    async def _run(self, work: Callable[[], T], then: Callable[[T], None] = lambda _: None) -> T:
+        """Have work done in the spool's thread, and what follows, also for a cancelled caller."""
+
+        def guarded() -> T:
+            try:
+                return work()
+            except sqlite3.OperationalError:
+                raise  # the disk is full or away
+            except sqlite3.DatabaseError:
+                self.spool.reopen()
+                raise
+
+        running = asyncio.wrap_future(self._thread.submit(guarded))
+        try:
+            found = await asyncio.shield(running)
+        except asyncio.CancelledError:
+            await asyncio.wait({running}, timeout=STOP_TIMEOUT)  # a disk may hang for ever
+            if running.done() and running.exception() is None:
+                then(running.result())
+            raise
+        then(found)
+        return found
+
+    def _say_disk(self, why: str) -> None:
+        if why != self.disk_trouble:
+            self.disk_trouble = why
+            log = logger.error if why else logger.info
+            log("outlet %s: %s", self.outlet.name, why or "the spool is written again")
+            self._tell(self.outlet.name, why)
+
+    # ------------------------------------------------------------------ to the far end
+
+    async def _deliver(self) -> None:
+        delays = Backoff().delays()
+        while True:
+            try:
+                try:
+                    async with asyncio.timeout(self.outlet.settings.timeout):
+                        await self.outlet.open()
+                    while True:
+                        if await self._deliver_some():
+                            delays = Backoff().delays()
+                finally:
+                    await self._close_outlet()
+            except asyncio.CancelledError:
+                if _cancelled():
+                    raise
+                self._say_far("it cancelled its own work")
+            except ENDS_PROGRAM:
+                raise
+            except BaseException as exc:  # noqa: BLE001 - a plug-in raises what it likes
+                self._say_far(text_of(exc))
+            await asyncio.sleep(next(delays))
+
+    async def _close_outlet(self) -> None:
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await self.outlet.close()
+        except asyncio.CancelledError:
+            raise
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:  # noqa: BLE001 - a plug-in raises what it likes
+            logger.debug("outlet %s: closing: %s", self.outlet.name, text_of(exc))
+
+    async def _deliver_some(self) -> bool:
+        """Deliver a batch, or wait for one; return True if one was taken."""
+        self._spooled.clear()
+        waiting = await self._run(lambda: self.spool.head(self.outlet.max_batch))
+        if not waiting.places:
+            if self.trouble:
+                self._say_far("")
+            await self._idle()
+            return False
+        try:
+            async with asyncio.timeout(self.outlet.settings.timeout):
+                await self.outlet.deliver(waiting.entries)
+        except EntryRefusedError as exc:
+            place = min(max(exc.place, 0), len(waiting.places) - 1)
+            logger.error(  # noqa: TRY400 - the text says it
+                "outlet %s: %s is refused for good: %s",
+                self.outlet.name,
+                waiting.entries[place].id,
+                exc,
+            )
+            await self._forget(waiting, place, str(exc) or "refused")
+        else:
+            await self._forget(waiting, None, "")
+        self._say_far("")
+        return True
+
+    async def _forget(self, waiting: SpoolHead, count: int | None, refused: str) -> None:
+        """Forget what was delivered; a disk that is full is awaited, nothing is delivered twice."""
+
+        def work() -> OutletAccount:
+            self.spool.done(waiting, count, refused)
+            return self.spool.account
+
+        while True:
+            try:
+                await self._run(work, self._set_account)
+            except sqlite3.OperationalError as exc:
+                self._say_disk(f"the spool {self.spool.path}: {exc}")
+                await asyncio.sleep(DISK_RETRY_SECONDS)
+            else:
+                return
+
+    def _set_account(self, account: OutletAccount) -> None:
+        self._account = account
+
+    async def _idle(self) -> None:
+        """Wait until something is spooled.
+
+        Raises:
+            Exception: the far end is gone.
+        """
+        loop = asyncio.get_running_loop()
+        came = loop.create_task(self._spooled.wait())
+        watching = loop.create_task(self.outlet.watch())
+        try:
+            await asyncio.wait({came, watching}, return_when=asyncio.FIRST_COMPLETED)
+            if watching.done():
+                watching.result()
+        finally:
+            for task in (came, watching):
+                task.cancel()
+            await asyncio.wait({came, watching})
+
+    def _say_far(self, why: str) -> None:
+        if why != self.trouble:
+            self.trouble = why
+            log = logger.warning if why else logger.info
+            log("outlet %s: %s", self.outlet.name, why or "delivers again")
+            self._tell(self.outlet.name, why)
+
+
+_MEMORY = "the spool's disk was full, away or too slow"
+
+
+def _cancelled() -> bool:
+    """Return True if this task is to end."""
+    task = asyncio.current_task()
+    return task is None or task.cancelling() > 0

@@ -1,0 +1,158 @@
+"""Settings of outlets, as a section of a fleet file or a file of their own has them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from smartcam._file_values import Patterns, Size, chosen
+from smartcam.exceptions import ConfigurationError, PluginError
+from smartcam.layout._inside import read_model
+from smartcam.outlets._outlet import Outlet
+from smartcam.outlets._spool import Policy
+from smartcam.registry import OUTLETS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+MAX_OUTLETS = 64
+"""Outlets of one process; each has a thread and a file."""
+
+MAX_SECRET_BYTES = 4096
+
+
+class _OutletFields(BaseModel):
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+
+class Secret(_OutletFields):
+    """A secret, which never stands in a settings file itself: where it is instead."""
+
+    file: str | None = Field(None, min_length=1, description="path of a file that holds it alone")
+    variable: str | None = Field(
+        None, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", description="environment variable that holds it"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _not_itself(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            raise ValueError(  # noqa: TRY004 - pydantic tells the place of a ValueError
+                "a secret never stands in the file: expected {file: PATH} or {variable: NAME}"
+            )
+        if len(given) != 1:
+            raise ValueError("expected either file or variable")
+        return given
+
+    def read(self, folder: Path) -> str:
+        """Return the secret.
+
+        Args:
+            folder: folder of a relative path.
+
+        Raises:
+            ConfigurationError: it is not there; says where it was looked for.
+        """
+        if self.variable is not None:
+            found = os.environ.get(self.variable)
+            if found is None:
+                raise ConfigurationError(f"the environment variable {self.variable} is not set")
+            return found
+        path = folder / Path(self.file or "").expanduser()
+        try:
+            with path.open("rb") as stream:
+                return stream.read(MAX_SECRET_BYTES).decode().rstrip("\r\n")
+        except OSError as exc:
+            raise ConfigurationError(f"the secret's file {path}: {exc.strerror}") from exc
+        except UnicodeDecodeError:
+            raise ConfigurationError(f"the secret's file {path} is no text") from None
+
+
+class OutletSettings(_OutletFields):
+    """The settings that every outlet has; each kind adds its own."""
+
+    kind: str | None = Field(None, description="the kind of outlet; default: its name")
+    cameras: Patterns = Field(
+        ("**",), description="which cameras: names, * for one part of them, ** for any number"
+    )
+    spool: str = Field(
+        "outlets", min_length=1, description="folder of the spool, beside this file; made if new"
+    )
+    size: Size = Field(1e9, description="of the entries that wait at most: 1 GB")
+    full: Policy = Field(
+        "drop_oldest",
+        description="beyond it, drop_oldest: the oldest make room; drop_newest: the newest are "
+        "refused. Both are counted, and the far end is told of the gap",
+    )
+    durable: bool = Field(
+        False,
+        description="each write reaches the disk before it counts, so that a loss of power takes "
+        "nothing either; slower",
+    )
+    timeout: float = Field(
+        30.0, gt=0, le=3600, description="seconds within which the far end takes a batch"
+    )
+
+    def chooses(self, camera: str) -> bool:
+        """Return True if a camera of this name is of this outlet."""
+        return chosen(self.cameras, camera)
+
+
+Section = dict[str, dict[str, Any]]
+"""The section ``outlets:`` as it stands in a file: settings by the outlet's name."""
+
+
+class OutletsFile(_OutletFields):
+    """Outlets of one camera in a file of their own."""
+
+    outlets: Section = Field(description="by name; the name says the kind where kind: does not")
+
+    @classmethod
+    def load(cls, path: str | Path) -> OutletsFile:
+        """Read a file.
+
+        Raises:
+            ConfigurationError: it cannot be read, or a field is wrong; told with line and field.
+            MissingExtraError: the extra ``yaml`` is not installed.
+        """
+        return read_model(
+            path, "outlets", cls, "outlets", lambda file: next(mistakes_of(file.outlets), None)
+        )
+
+
+def outlet_class(name: str, given: Mapping[str, Any]) -> type[Outlet[Any]]:
+    """Return the class of an outlet.
+
+    Raises:
+        PluginError: its kind is unknown or cannot be loaded.
+    """
+    kind = given.get("kind") or name
+    found = OUTLETS.load(str(kind))
+    if not (isinstance(found, type) and issubclass(found, Outlet)):
+        raise PluginError(f"smartcam.outlets: {kind} is no class of Outlet", name=str(kind))
+    return found
+
+
+def mistakes_of(section: Section) -> Iterator[tuple[Sequence[int | str], str]]:
+    """Yield the mistakes in a section ``outlets:``, and their places."""
+    if len(section) > MAX_OUTLETS:
+        yield ("outlets",), f"{len(section)} outlets, expected {MAX_OUTLETS} at most"
+        return
+    for name, given in section.items():
+        if not name.replace("-", "").replace("_", "").isalnum() or not name.isascii():
+            yield ("outlets", name), "expected a name of letters, digits, - and _"
+            continue
+        try:
+            outlet_class(name, given).settings_class.model_validate(given)
+        except PluginError as exc:
+            place = ("outlets", name, "kind") if "kind" in given else ("outlets", name)
+            yield place, str(exc)
+        except ValidationError as exc:
+            for item in exc.errors(include_url=False, include_input=False):
+                text = item["msg"].removeprefix("Value error, ")
+                yield ("outlets", name, *item["loc"]), text

@@ -1,0 +1,351 @@
+"""A store of results: a table for each application in a file of SQLite, which any program reads."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import re
+import sqlite3
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, cast
+
+from pydantic import Field
+
+from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
+from smartcam.exceptions import ConfigurationError
+from smartcam.outlets._outlet import Outlet
+from smartcam.outlets._settings import OutletSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.outlets._entry import OutletEntry
+    from smartcam.outlets._outlet import Column, OutletDesk
+
+VERSION = 1
+"""Version of the store's own tables, in the file's ``user_version``."""
+
+MAX_COLUMNS = 500
+"""Columns of an application's table; what has more stays in ``results.value`` alone."""
+
+MAX_COLUMN_CHARACTERS = 100
+
+EXPIRE_SECONDS = 60.0
+"""Seconds between two looks for results that are too old, or too many."""
+
+_TABLES = """
+CREATE TABLE IF NOT EXISTS results(
+    id TEXT PRIMARY KEY, camera TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL,
+    kind TEXT NOT NULL, at TEXT NOT NULL, application INTEGER, sequence INTEGER,
+    triggered_at TEXT, latency REAL, error TEXT, error_kind TEXT, lost INTEGER, value TEXT,
+    records INTEGER, picture TEXT);
+CREATE INDEX IF NOT EXISTS results_at ON results(at);
+CREATE TABLE IF NOT EXISTS fields(
+    application INTEGER NOT NULL, name TEXT NOT NULL, column_name TEXT NOT NULL,
+    type TEXT NOT NULL, unit TEXT NOT NULL, since TEXT NOT NULL,
+    PRIMARY KEY (application, column_name));
+"""
+_TYPES = {"bool": "INTEGER", "string": "TEXT", "real32": "REAL", "real64": "REAL"}
+_OWN = frozenset({"id", "record", "rowid"})
+
+
+class StoreSettings(OutletSettings):
+    """The settings of a store of results."""
+
+    file: str = Field(min_length=1, description="the file, beside this one; made if new")
+    keep: Age | None = Field(None, description="age beyond which results are deleted: 90 d")
+    keep_size: Size | None = Field(
+        None, description="size of the file beyond which the oldest are deleted: 10 GB"
+    )
+    pictures: str | None = Field(
+        None,
+        min_length=1,
+        description="place of a result's picture, beside the file, with {camera}, {application}, "
+        "{number} and {sequence} in it; it is referred to where it is there",
+    )
+
+
+class ResultStore(Outlet[StoreSettings]):
+    """Writes results, errors and gaps to a file of SQLite; what came before is not written twice.
+
+    The table ``results`` has a row for everything, ``app_7`` a row for each record of the results
+    of application 7, ``fields`` the types and units of its columns.
+    """
+
+    settings_class = StoreSettings
+
+    def __init__(self, name: str, settings: StoreSettings, folder: Path, desk: OutletDesk) -> None:
+        super().__init__(name, settings, folder, desk)
+        self.path = folder / settings.file
+        self._thread: ThreadPoolExecutor | None = None
+        self._database: sqlite3.Connection | None = None
+        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # of one batch
+        self._expired = 0.0
+
+    async def open(self) -> None:
+        """Open the file, and bring its tables to this version.
+
+        Raises:
+            ConfigurationError: a newer version of smartcam made it.
+            sqlite3.Error: it cannot be opened.
+        """
+        self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{self.name}.store")
+        await self._run(self._open)
+
+    async def deliver(self, entries: Sequence[OutletEntry]) -> None:
+        """Write entries, all or none."""
+        await self._run(lambda: self._write(entries))
+
+    async def close(self) -> None:
+        """Close the file."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            closing = asyncio.wrap_future(thread.submit(self._close))
+            thread.shutdown(wait=False)
+            await asyncio.shield(closing)
+
+    async def _run(self, work: Callable[[], None]) -> None:
+        if self._thread is None:
+            raise sqlite3.OperationalError("the store is closed")
+        await asyncio.shield(asyncio.wrap_future(self._thread.submit(work)))
+
+    # ------------------------------------------------------------------ in the thread
+
+    def _open(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._database = database = sqlite3.connect(
+            self.path, timeout=10.0, isolation_level=None, check_same_thread=False
+        )
+        (version,) = database.execute("PRAGMA user_version").fetchone()
+        if version > VERSION:
+            raise ConfigurationError(
+                f"the store {self.path} is of a newer smartcam: its version is {version}, this one "
+                f"knows {VERSION}"
+            )
+        if not version:
+            database.execute("PRAGMA auto_vacuum = INCREMENTAL")
+        database.execute("PRAGMA journal_mode = WAL")
+        database.execute("PRAGMA synchronous = FULL")  # the spool forgets what is written here
+        with _transaction(database):
+            for statement in filter(str.strip, _TABLES.split(";")):
+                database.execute(statement)
+            database.execute(f"PRAGMA user_version = {VERSION}")
+        self._expired = 0.0
+
+    def _close(self) -> None:
+        database, self._database = self._database, None
+        if database is not None:
+            database.close()
+
+    def _write(self, entries: Sequence[OutletEntry]) -> None:
+        database = self._database
+        if database is None:
+            raise sqlite3.OperationalError("the store is closed")
+        self._columns.clear()  # a layout may have changed, and a transaction been undone
+        with _transaction(database):
+            for entry in entries:
+                self._write_one(database, entry)
+        if time.monotonic() - self._expired > EXPIRE_SECONDS or not self._expired:
+            self._expire(database)
+            self._expired = time.monotonic()
+
+    def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
+        said: dict[str, Any] = json.loads(entry.body)
+        value = said.get("value")
+        records = _records(value)
+        row = (
+            entry.id,
+            *entry[:4],
+            said.get("received_at") or _time(entry.at),
+            said.get("application"),
+            said.get("sequence"),
+            said.get("triggered_at"),
+            said.get("latency"),
+            said.get("error"),
+            said.get("kind"),
+            said.get("lost"),
+            None if value is None else json.dumps(value, separators=(",", ":")),
+            None if records is None else len(records),
+            self._picture(entry, said),
+        )
+        marks = ", ".join("?" * len(row))
+        written = database.execute(f"INSERT OR IGNORE INTO results VALUES ({marks})", row).rowcount  # noqa: S608
+        if not written or entry.application is None or records is None:
+            return
+        columns = self._table(database, entry.camera, entry.application, records)
+        names = [*columns]
+        cells = ", ".join(f'"{columns[name]}"' for name in names)
+        marks = ", ".join("?" * (len(names) + 2))
+        database.executemany(
+            f"INSERT OR IGNORE INTO app_{entry.application}"  # noqa: S608
+            f"(id, record{', ' if names else ''}{cells}) VALUES ({marks})",
+            [
+                (entry.id, place, *(_cell(record.get(name)) for name in names))
+                for place, record in enumerate(records)
+            ],
+        )
+
+    def _table(
+        self,
+        database: sqlite3.Connection,
+        camera: str,
+        application: int,
+        records: Sequence[Mapping[str, Any]],
+    ) -> dict[str, str]:
+        """Return an application's columns by the values' names; make new ones.
+
+        A value that the layout has no more keeps its column. One whose type or unit has changed
+        gets a new column, and so has one of a camera with another layout.
+        """
+        known = self._columns.get((camera, application))
+        if known is None:
+            database.execute(
+                f"CREATE TABLE IF NOT EXISTS app_{application}(id TEXT NOT NULL "
+                "REFERENCES results(id), record INTEGER NOT NULL, PRIMARY KEY (id, record))"
+            )
+            known = self._columns[camera, application] = {}
+            for name, kind, unit in self.desk.columns(camera, application):
+                self._column(database, application, known, (name, kind, unit))
+        for record in records:
+            for name, value in record.items():
+                if name not in known and value is not None:
+                    self._column(database, application, known, (name, _kind(value), ""))
+        return known
+
+    def _column(
+        self,
+        database: sqlite3.Connection,
+        application: int,
+        known: dict[str, str],
+        wanted: Column,
+    ) -> None:
+        """Add the column of a value to those that are known, made if need be."""
+        name, kind, unit = wanted
+        there = database.execute(
+            "SELECT name, column_name, type, unit FROM fields WHERE application = ?", (application,)
+        ).fetchall()
+        for of, column, its_kind, its_unit in there:
+            if (of, _affinity(its_kind), its_unit) == (name, _affinity(kind), unit):
+                known[name] = column
+                return
+        if len(there) >= MAX_COLUMNS:
+            return
+        taken = {column.lower() for _, column, _, _ in there} | _OWN
+        column = base = re.sub(r"\W", "_", name)[:MAX_COLUMN_CHARACTERS] or "value"
+        if column.lower() in taken:
+            column = base = f"{base}_{unit or kind}"
+        n = 2
+        while column.lower() in taken:
+            column, n = f"{base}_{n}", n + 1
+        database.execute(f'ALTER TABLE app_{application} ADD COLUMN "{column}" {_affinity(kind)}')
+        database.execute(
+            "INSERT INTO fields VALUES (?, ?, ?, ?, ?, ?)",
+            (application, name, column, kind, unit, _time(time.time())),
+        )
+        known[name] = column
+
+    def _picture(self, entry: OutletEntry, said: Mapping[str, Any]) -> str | None:
+        pattern = self.settings.pictures
+        if pattern is None or entry.kind == "gap":
+            return None
+        for name in ("camera", "application", "number", "sequence"):
+            pattern = pattern.replace(f"{{{name}}}", str(said.get(name, "")))
+        path = self.path.parent / pattern
+        return pattern if path.is_file() and path.is_relative_to(self.path.parent) else None
+
+    def _expire(self, database: sqlite3.Connection) -> None:
+        """Delete what is too old, or too much; a part at a time."""
+        if self.settings.keep is not None:
+            limit = _time(time.time() - self.settings.keep)
+            while self._delete(database, "WHERE at < ?", (limit,)):
+                pass
+        size = self.settings.keep_size
+        while size is not None and _used_bytes(database) > size:
+            if not self._delete(database, "", ()):
+                break
+        database.execute("PRAGMA incremental_vacuum").fetchall()
+
+    def _delete(self, database: sqlite3.Connection, which: str, values: Iterable[Any]) -> int:
+        chosen = f"SELECT id FROM results {which} ORDER BY at LIMIT 100"  # noqa: S608
+        ids = database.execute(chosen, (*values,)).fetchall()
+        with _transaction(database):
+            for (application,) in database.execute(
+                "SELECT DISTINCT application FROM fields"
+            ).fetchall():
+                database.executemany(f"DELETE FROM app_{application} WHERE id = ?", ids)  # noqa: S608
+            database.executemany("DELETE FROM results WHERE id = ?", ids)
+        return len(ids)
+
+
+def _used_bytes(database: sqlite3.Connection) -> int:
+    pages, free, size = (
+        database.execute(f"PRAGMA {name}").fetchone()[0]
+        for name in ("page_count", "freelist_count", "page_size")
+    )
+    return int((pages - free) * size)
+
+
+def _records(value: Any) -> list[dict[str, Any]] | None:
+    """Return the records of a value, a mapping of plain values each; None where it has none."""
+    if isinstance(value, dict):
+        fields = cast("dict[str, Any]", value)
+        lists = [name for name, one in fields.items() if isinstance(one, list)]
+        if len(lists) == 1 and all(isinstance(one, dict) for one in fields[lists[0]]):
+            head = {name: one for name, one in fields.items() if name != lists[0]}
+            return [_flat({**head, **one}) for one in fields[lists[0]]] or [_flat(head)]
+        return [_flat(fields)]
+    if isinstance(value, list) and all(isinstance(one, dict) for one in value):
+        return [_flat(one) for one in cast("list[dict[str, Any]]", value)]
+    return None
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record with the pose of a localization as plain values."""
+    pose = record.get("pose")
+    if not isinstance(pose, dict) or "orientation" not in pose:
+        return record
+    told = cast("dict[str, dict[str, Any]]", pose)
+    turned = {f"q{axis}": value for axis, value in told["orientation"].items()}
+    rest = {name: one for name, one in record.items() if name != "pose"}
+    return {**rest, **told["position"], **turned}
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, bool):
+        return "bool"
+    if isinstance(value, int):
+        return "int64"
+    return "real64" if isinstance(value, float) or value is None else "string"
+
+
+def _affinity(kind: str) -> str:
+    return _TYPES.get(kind, "INTEGER")
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+        return str(value)  # a uint64 that SQLite has no integer for
+    if value is None or isinstance(value, (int, float, str)):
+        return value
+    return json.dumps(value, separators=(",", ":"))
+
+
+def _time(at: float) -> str:
+    from datetime import UTC, datetime
+
+    return datetime.fromtimestamp(at, UTC).isoformat(timespec="microseconds")
+
+
+@contextlib.contextmanager
+def _transaction(database: sqlite3.Connection) -> Any:
+    database.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        database.execute("COMMIT")
+    except BaseException:
+        with contextlib.suppress(sqlite3.Error):
+            database.execute("ROLLBACK")
+        raise

@@ -1,0 +1,235 @@
+"""The spool: what is in it survives, and what is not is counted."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.outlets._entry import OutletAccount, OutletEntry
+from smartcam.outlets._spool import ROW_BYTES, Spool, read_account
+
+
+def entry(number: int, spool: Spool, camera: str = "cam", body: str = "{}") -> OutletEntry:
+    return OutletEntry(camera, spool.epoch, number, "result", 1, 1e9 + number, body)
+
+
+def opened(path: Path, size: int = 1 << 20, policy: str = "drop_oldest") -> Spool:
+    spool = Spool(path / "a.spool", size, policy)  # type: ignore[arg-type]
+    spool.open()
+    return spool
+
+
+def gaps(spool: Spool) -> list[tuple[str, int, int]]:
+    found = spool.head(100_000).entries
+    return [(e.camera, e.number, json.loads(e.body)["lost"]) for e in found if e.kind == "gap"]
+
+
+def test_what_is_added_is_there_in_order_after_a_restart(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool) for n in range(1, 11)])
+    spool.done(spool.head(3))
+    first = spool.epoch
+    spool.close()
+    again = opened(tmp_path)
+    assert [one.number for one in again.head(100).entries] == [4, 5, 6, 7, 8, 9, 10]
+    assert again.account == OutletAccount(10, 3, 7, {})
+    assert again.epoch > first
+    again.close()
+
+
+def test_the_epoch_grows_where_the_clock_is_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spool = opened(tmp_path)
+    first = spool.epoch
+    spool.close()
+    monkeypatch.setattr(time, "time_ns", lambda: 1_000_000)
+    again = opened(tmp_path)
+    assert again.epoch > first
+    again.close()
+
+
+def test_beyond_the_bound_the_oldest_make_room_and_a_gap_stands_in_front(tmp_path: Path) -> None:
+    spool = opened(tmp_path, 10 * (ROW_BYTES + 2))
+    for n in range(1, 31):
+        spool.add([entry(n, spool)])
+    assert spool.account == OutletAccount(30, 0, 10, {"full": 20})
+    found = spool.head(100).entries
+    assert [(one.kind, one.number) for one in found[:2]] == [("gap", 20), ("result", 21)]
+    assert gaps(spool) == [("cam", 20, 20)]
+    spool.close()
+
+
+def test_beyond_the_bound_the_newest_are_refused_where_the_policy_says_so(tmp_path: Path) -> None:
+    spool = opened(tmp_path, 10 * (ROW_BYTES + 2), "drop_newest")
+    for n in range(1, 31):
+        spool.add([entry(n, spool)])
+    assert spool.account == OutletAccount(30, 0, 10, {"full": 20})
+    assert [one.number for one in spool.head(10).entries] == [*range(1, 11)]
+    assert gaps(spool) == [("cam", 30, 20)]
+    spool.close()
+
+
+def test_what_is_being_delivered_is_not_dropped(tmp_path: Path) -> None:
+    spool = opened(tmp_path, 10 * (ROW_BYTES + 2))
+    spool.add([entry(n, spool) for n in range(1, 11)])
+    waiting = spool.head(5)
+    spool.add([entry(n, spool) for n in range(11, 21)])
+    spool.done(waiting)
+    account = spool.account
+    assert account.balanced
+    assert account.delivered == 5
+    spool.close()
+
+
+def test_a_second_process_is_refused(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    with pytest.raises(ConfigurationError, match="another process has it"):
+        opened(tmp_path)
+    spool.close()
+
+
+def test_the_account_can_be_read_while_a_process_has_the_spool(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(1, spool), entry(2, spool)])
+    assert read_account(tmp_path / "a.spool") == OutletAccount(2, 0, 2, {})
+    spool.close()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_account_balances_whatever_is_done(tmp_path: Path, seed: int) -> None:
+    dice = random.Random(seed)  # noqa: S311
+    policy = dice.choice(["drop_oldest", "drop_newest"])
+    spool, number, waiting = opened(tmp_path, 4000, policy), 0, None
+    for _ in range(200):
+        what = dice.randrange(6)
+        if what < 3:
+            many = dice.randrange(1, 8)
+            new = [
+                entry(number + n, spool, dice.choice("abc"), "x" * dice.randrange(300))
+                for n in range(1, many + 1)
+            ]
+            number += many
+            spool.add(new)
+        elif what == 3:
+            waiting = spool.head(dice.randrange(1, 10))
+        elif what == 4 and waiting is not None and waiting.places:
+            refused = "no" if dice.random() < 0.3 else ""
+            spool.done(waiting, dice.randrange(len(waiting.places)), refused)
+            waiting = None
+        elif what == 5:
+            spool.close()
+            spool, waiting = opened(tmp_path, 4000, policy), None
+        assert spool.account.balanced, spool.account
+        assert spool.account == read_account(tmp_path / "a.spool")
+        there = spool._there.execute("SELECT SUM(bytes) FROM entries").fetchone()[0] or 0
+        assert spool.bytes == there
+    assert spool.account.results == number
+    told = sum(lost for _, _, lost in gaps(spool))
+    assert told <= spool.account.dropped.get("full", 0)
+    spool.close()
+
+
+def test_a_full_disk_keeps_nothing_of_a_write_and_counts_nothing(tmp_path: Path) -> None:
+    import sqlite3
+
+    spool = opened(tmp_path)
+    spool.add([entry(1, spool)])
+    pages = spool._there.execute("PRAGMA page_count").fetchone()[0]
+    spool._there.execute(f"PRAGMA max_page_count = {pages}")
+    with pytest.raises(sqlite3.OperationalError, match="full"):
+        spool.add([entry(n, spool, body="x" * 2000) for n in range(2, 200)])
+    assert spool.account == OutletAccount(1, 0, 1, {})
+    spool._there.execute("PRAGMA max_page_count = 100000")
+    spool.add([entry(n, spool, body="x" * 2000) for n in range(2, 200)])
+    assert spool.account == OutletAccount(199, 0, 199, {})
+    spool.close()
+
+
+_WRITER = """
+import sys
+from pathlib import Path
+from smartcam.outlets._entry import OutletEntry
+from smartcam.outlets._spool import Spool
+spool = Spool(Path(sys.argv[1]) / "a.spool", 1 << 30)
+spool.open()
+for n in range(1, 10_000_000):
+    spool.add([OutletEntry("cam", spool.epoch, n, "result", 1, 0.0, "{}")])
+    print(n, flush=True)
+    if n % 7 == 0:
+        waiting = spool.head(3)
+        spool.done(waiting)
+"""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_killed_process_loses_nothing_that_was_spooled_and_a_gap_tells_of_the_rest(
+    tmp_path: Path, seed: int
+) -> None:
+    dice, said = random.Random(seed), 0  # noqa: S311
+    for _round in range(2):
+        process = subprocess.Popen(  # noqa: S603
+            [sys.executable, "-c", _WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        )
+        assert process.stdout is not None
+        last = 0
+        for _ in range(dice.randrange(20, 200)):
+            last = int(process.stdout.readline())
+        os.kill(process.pid, signal.SIGKILL)
+        rest = process.stdout.read().split("\n")
+        last = max([last, *(int(one) for one in rest[:-1] if one)])
+        process.wait()
+        process.stdout.close()
+        spool = opened(tmp_path)
+        account = spool.account
+        assert account.balanced
+        assert account.results - said in (last, last + 1)  # one may be written and not said
+        said = account.results
+        head = spool.head(100_000).entries
+        ids = [one.id for one in head]
+        assert len(set(ids)) == len(ids)
+        assert head[-1].kind == "gap"
+        assert json.loads(head[-1].body)["at_least"]
+        spool.close()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_damaged_spool_is_put_aside_and_a_gap_tells_of_it(tmp_path: Path, seed: int) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool, body="x" * 500) for n in range(1, 101)])
+    spool.done(spool.head(20))
+    before = spool.epoch
+    spool.close()
+    path, dice = tmp_path / "a.spool", random.Random(seed)  # noqa: S311
+    data = bytearray(path.read_bytes())
+    if seed % 3 == 0:
+        begin = dice.randrange(0, len(data) - 4096)
+        data[begin : begin + 4096] = dice.randbytes(4096)
+    elif seed % 3 == 1:
+        del data[dice.randrange(100, len(data)) :]
+    else:
+        data[:] = dice.randbytes(len(data))
+    path.write_bytes(data)
+    again = opened(tmp_path)
+    assert again.account.balanced
+    head = again.head(1000).entries
+    kept = [one.number for one in head if one.kind == "result"]
+    assert set(kept) <= {*range(1, 101)}
+    if kept:  # else nothing in the file says what was
+        assert again.epoch > before
+    told = [one for one in head if one.kind == "gap"]
+    if len(kept) < 80:
+        assert told
+        assert [*tmp_path.glob("a.spool.damaged-*")]
+    again.add([entry(1, again)])
+    assert again.account.balanced
+    again.close()
