@@ -1,0 +1,40 @@
+"""The account of a gateway: what became of each request and of each part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(slots=True)
+class GatewayAccount:
+    """The counts of a gateway's requests and answers.
+
+    ``requests == answered + errors + abandoned + open``, and
+    ``parts == delivered + forgotten + waiting``, at any time.
+
+    Attributes:
+        robots: connections that were taken.
+        refused: connections that were refused, since as many as may be were open.
+        requests: requests that came.
+        answered: requests that were answered with a part, or with what was asked.
+        errors: requests that were answered with an error.
+        abandoned: requests whose robot was gone before the answer.
+        open: requests under way.
+        parts: parts in all results that robots' requests brought.
+        delivered: parts that were sent to a robot.
+        forgotten: parts that nobody asked for before a newer result came, the robot left, or they
+            became too old.
+        waiting: parts that may be asked for.
+    """
+
+    robots: int = 0
+    refused: int = 0
+    requests: int = 0
+    answered: int = 0
+    errors: int = 0
+    abandoned: int = 0
+    open: int = 0
+    parts: int = 0
+    delivered: int = 0
+    forgotten: int = 0
+    waiting: int = 0

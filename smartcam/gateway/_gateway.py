@@ -1,0 +1,114 @@
+"""The gateway: a camera, a port, and the robots that ask."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from typing import TYPE_CHECKING
+
+from smartcam._accepting import Acceptor, Places, listening
+from smartcam._server import Server
+from smartcam.exceptions import ConfigurationError
+from smartcam.gateway._account import GatewayAccount
+from smartcam.gateway._desk import SharedDesk
+from smartcam.gateway._lines import AnswerWriter
+from smartcam.gateway._link import RobotLink
+from smartcam.gateway._parts import Parts
+from smartcam.gateway._settings import GatewaySettings
+
+if TYPE_CHECKING:
+    import socket
+
+    from smartcam.camera import Camera
+
+_log = logging.getLogger("smartcam.gateway")
+
+
+class Gateway(Server):
+    """Answers controllers that ask for parts, line by line.
+
+    ::
+
+        async with smartcam.connect(url, interpret_as="localizations") as camera:
+            async with Gateway(camera, GatewaySettings(robot="ur")) as gateway:
+                print(gateway.address)
+
+    Nobody is asked for a password: whoever reaches the port may trigger.
+
+    Args:
+        camera: the camera; whoever made it opens and closes it. While it has no session, requests
+            are answered with the reason.
+        settings: where it listens and how it writes.
+
+    Raises:
+        ConfigurationError: ``interpret_as`` of the camera is none.
+    """
+
+    def __init__(self, camera: Camera, settings: GatewaySettings | None = None) -> None:
+        self.settings: GatewaySettings = settings or GatewaySettings()
+        parts = Parts(self.settings, camera.settings.interpret_as)
+        self._account = GatewayAccount()
+        self._shared = SharedDesk(camera, self.settings, parts, self._account)
+        self._writer = AnswerWriter(self.settings.style, parts.names)
+        places: Places[RobotLink] = Places(
+            self.settings.clients, within=self.settings.idle, what="no request", own="a robot"
+        )
+        self._acceptor: Acceptor[RobotLink] = Acceptor(
+            self._make, places, _log, name="smartcam.gateway"
+        )
+        self._socket: socket.socket | None = None
+        self._port = self.settings.place[1]
+
+    def _make(self) -> RobotLink:
+        return RobotLink(self._shared, self._writer, self._acceptor)
+
+    @property
+    def address(self) -> str:
+        """Address to which robots connect, tcp/HOST:PORT."""
+        host = self.settings.place[0]
+        return f"tcp/{f'[{host}]' if ':' in host else host}:{self._port}"
+
+    @property
+    def account(self) -> GatewayAccount:
+        """Counts of the requests and answers so far."""
+        return dataclasses.replace(self._account)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera; one that could not be opened may be replaced by another object."""
+        return self._shared.camera
+
+    @camera.setter
+    def camera(self, camera: Camera) -> None:
+        self._shared.camera = camera
+
+    async def start(self) -> None:
+        """Open the port; does nothing if it is open.
+
+        Raises:
+            ConfigurationError: it cannot listen there.
+
+        Cancellation: leaves it closed.
+        """
+        if self._socket is not None:
+            return
+        host, port = self.settings.place
+        try:
+            self._socket = await listening(host, port)
+        except (OSError, ValueError, OverflowError) as exc:
+            raise ConfigurationError(
+                f"gateway: cannot listen on {host} port {port}: {exc}"
+            ) from exc
+        self._port = self._socket.getsockname()[1]
+        self._acceptor.open(self._socket)
+
+    async def stop(self) -> None:
+        """Close the port and all connections; what is under way ends without an answer."""
+        listener, self._socket = self._socket, None
+        if listener is None:
+            return
+        self._acceptor.close()
+        listener.close()
+        await self._acceptor.wait_closed()
+        for link in self._acceptor.places:
+            await link.finish()

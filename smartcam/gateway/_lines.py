@@ -1,0 +1,242 @@
+"""Take a robot's requests apart, and put the gateway's answers together."""
+
+from __future__ import annotations
+
+import enum
+import re
+from typing import TYPE_CHECKING, Final, NamedTuple
+from xml.sax.saxutils import escape, quoteattr
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.gateway._settings import Style
+
+MAX_LINE_BYTES: Final = 256
+"""Bytes of a request; a longer one ends the connection."""
+
+MAX_BRACKETED_NUMBERS: Final = 30
+"""Numbers that ``socket_read_ascii_float`` reads at once (Script Manual, module interfaces)."""
+
+MAX_NUMBER: Final = 1e9
+"""Largest number that is written; controllers read 32-bit floats."""
+
+_REQUEST = re.compile(rb"(?:(\d{1,9}) +)?([A-Za-z]{1,16})(?: +(\d{1,10}))?", re.ASCII)
+_XML = re.compile(
+    rb"<(?P<root>\w{1,30})>\s*(?:<Id>\s*(?P<id>\d{1,9})\s*</Id>\s*)?"
+    rb"<Request>\s*(?P<word>[A-Za-z]{1,16})\s*</Request>\s*"
+    rb"(?:<Application>\s*(?P<number>\d{0,10})\s*</Application>\s*)?</(?P=root)>",
+    re.ASCII,
+)
+_XML_BEGIN = re.compile(rb"<(\w{1,30})>", re.ASCII)
+_BLANK_RUN = re.compile(rb"[ \t\r\n\0]*")
+_LINE_END = re.compile(rb"[\r\n]")
+_BLANKS = b" \t\r\n\0"
+
+
+class AnswerCode(enum.IntEnum):
+    """The code with which an answer begins; 0 and 1 are none of the errors."""
+
+    PART = 0
+    NONE = 1
+    BAD_REQUEST = 10
+    TOO_LONG = 11
+    BUSY = 20
+    TIMEOUT = 21
+    NOT_CONNECTED = 22
+    NOT_RUNNING = 23
+    REFUSED = 24
+    UNREADABLE = 25
+    NO_RESULT = 26
+    FAULT = 27
+    FULL = 30
+
+    @property
+    def is_error(self) -> bool:
+        """True if the request was not done."""
+        return self > AnswerCode.NONE
+
+
+class RobotRequest(NamedTuple):
+    """A request of a robot.
+
+    Attributes:
+        word: the word, in capitals; "" for what is none.
+        application: number behind the word, None without one.
+        tag: number before the word, which the answer repeats; None without one.
+        given: what came, for the error.
+    """
+
+    word: str
+    application: int | None = None
+    tag: int | None = None
+    given: str = ""
+
+
+class RobotAnswer(NamedTuple):
+    """An answer to a robot.
+
+    Attributes:
+        code: how it went.
+        left: parts of the result that are left after this one.
+        values: values of the part, or of the camera's state.
+        words: the reason, for people.
+    """
+
+    code: AnswerCode
+    left: int = 0
+    values: Sequence[float | str] = ()
+    words: str = ""
+
+
+class NotWritableError(ValueError):
+    """A part that an answer has no room for, or that is no number for a controller."""
+
+
+def _behind_blanks(data: bytes, at: int) -> int:
+    """Return the place of the first byte from a place on that is no blank and ends no line."""
+    found = _BLANK_RUN.match(data, at)
+    return found.end() if found else at
+
+
+class RequestReader:
+    """Cuts what comes of a connection into requests.
+
+    A line ends with CR, LF or both; blanks and zeros around it do not count, since some controllers
+    send arrays of a fixed length. XML ends with the closing tag of what it began with.
+
+    Args:
+        form: form of the lines, as a :class:`Style` names it.
+    """
+
+    def __init__(self, form: str) -> None:
+        self._xml = form == "xml"
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[RobotRequest]:
+        """Return the requests that are whole now.
+
+        Raises:
+            NotWritableError: one is longer than :data:`MAX_LINE_BYTES`.
+        """
+        data, found = self._rest + data, []
+        at = _behind_blanks(data, 0)
+        while (end := self._end(data, at)) > 0 and end - at <= MAX_LINE_BYTES:
+            line = data[at:end].strip(_BLANKS)
+            if line:
+                found.append(self._read(line))
+            at = _behind_blanks(data, end)
+        self._rest = data[at:].lstrip(_BLANKS)
+        if len(self._rest) > MAX_LINE_BYTES:
+            raise NotWritableError(f"a request has more than {MAX_LINE_BYTES} bytes")
+        return found
+
+    def _end(self, data: bytes, at: int) -> int:
+        """Return the place behind the request that begins at one; 0 if it is not whole."""
+        begin = _XML_BEGIN.match(data, at) if self._xml else None
+        if begin is None:  # a line; whatever it is instead of XML, it is one request
+            mark = _LINE_END.search(data, at)
+            return mark.end() if mark else 0
+        closing = b"</" + begin[1] + b">"
+        found = data.find(closing, at)
+        return 0 if found < 0 else found + len(closing)
+
+    def _read(self, line: bytes) -> RobotRequest:
+        given = line.decode("ascii", "backslashreplace")[:40]
+        if self._xml:
+            xml = _XML.fullmatch(line)
+            if xml is None:
+                return RobotRequest("", given=given)
+            tag, word, number = xml["id"], xml["word"], xml["number"] or None
+        else:
+            text = _REQUEST.fullmatch(line)
+            if text is None:
+                return RobotRequest("", given=given)
+            tag, word, number = text.groups()
+        return RobotRequest(
+            word.decode().upper(),
+            None if number is None else int(number),
+            None if tag is None else int(tag),
+            given,
+        )
+
+
+class AnswerWriter:
+    """Writes answers as a robot takes them.
+
+    Args:
+        style: the form, units and bounds.
+        names: names of a part's values.
+    """
+
+    def __init__(self, style: Style, names: Sequence[str]) -> None:
+        self._style, self.names = style, tuple(names)
+
+    def write(self, answer: RobotAnswer, tag: int | None) -> bytes:
+        """Return the bytes of an answer.
+
+        Raises:
+            NotWritableError: it has no room for the values.
+        """
+        style = self._style
+        values = [self._value(one) for one in answer.values]
+        line = getattr(self, f"_{style.form}")(answer, values, tag)
+        data: bytes = line.encode("ascii", "replace")
+        end = style.line_end.encode()
+        if style.width:
+            data = data.ljust(style.width - len(end))
+        return data + end
+
+    def _value(self, value: float | str) -> str:
+        if isinstance(value, str):
+            return "".join(" " if one == self._style.separator else one for one in plain(value))
+        if not abs(value) < MAX_NUMBER:
+            raise NotWritableError(f"{value} is no number that a controller reads")
+        if isinstance(value, int):
+            return str(int(value))
+        return f"{round(value, self._style.decimals) + 0.0:.{self._style.decimals}f}"
+
+    def _text(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
+        style = self._style
+        head = [str(one) for one in (tag, int(answer.code), answer.left) if one is not None]
+        line = style.separator.join([*head, *values])
+        room = style.longest - len(style.line_end)
+        if len(line) > room:
+            raise NotWritableError(f"a part has {len(line)} characters, {room} are allowed")
+        if answer.words:
+            line = f"{line}{style.separator}{self._words(answer)}"[:room]
+        return line
+
+    def _brackets(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
+        if answer.words and not answer.code.is_error:
+            return plain(answer.words)[: self._style.longest]  # what WHY asked for
+        filled = values + ["0"] * (len(self.names) - len(values))
+        head = [str(one) for one in (tag, int(answer.code), answer.left) if one is not None]
+        if len(head) + len(filled) > MAX_BRACKETED_NUMBERS:
+            raise NotWritableError(
+                f"a part has {len(head) + len(filled)} numbers, {MAX_BRACKETED_NUMBERS} are read"
+            )
+        return f"({','.join([*head, *filled])})"
+
+    def _xml(self, answer: RobotAnswer, values: list[str], tag: int | None) -> str:
+        # every element each time: EthernetKRL has a queue for each, which would get out of step
+        filled = values + ["0"] * (len(self.names) - len(values))
+        part = " ".join(
+            f"{name.upper()}={quoteattr(value)}"
+            for name, value in zip(self.names, filled, strict=False)
+        )
+        words = escape(self._words(answer)[:80]) if answer.words else ""
+        return (
+            f"<Gateway><Id>{tag or 0}</Id><Code>{int(answer.code)}</Code>"
+            f"<Left>{answer.left}</Left><Part {part}/><Words>{words}</Words></Gateway>"
+        )
+
+    @staticmethod
+    def _words(answer: RobotAnswer) -> str:
+        name = f"{answer.code.name} " if answer.code.is_error else ""
+        return name + plain(answer.words)
+
+
+def plain(words: str) -> str:
+    """Return a text on one line, of printable characters."""
+    return " ".join("".join(one if one.isprintable() else " " for one in words).split())

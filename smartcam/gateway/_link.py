@@ -1,0 +1,212 @@
+"""A robot's connection: its requests are answered one by one, and it leaves nothing behind."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections import deque
+from typing import TYPE_CHECKING, Final, cast
+
+from smartcam.gateway._desk import ASKING_FOR_PARTS, Desk
+from smartcam.gateway._lines import AnswerCode, NotWritableError, RequestReader, RobotAnswer
+
+if TYPE_CHECKING:
+    from smartcam._accepting import Acceptor
+    from smartcam.gateway._desk import SharedDesk
+    from smartcam.gateway._lines import AnswerWriter, RobotRequest
+
+MAX_WAITING_REQUESTS: Final = 8
+"""RequestReader with a number that may wait while another one is under way."""
+
+MAX_UNSENT_BYTES: Final = 1 << 16
+"""Bytes that a robot which reads nothing may leave unsent."""
+
+_KEEPALIVE_PERIOD = (("TCP_KEEPIDLE", 30), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 3))
+"""Seconds without a byte until the system asks whether the robot is there, and how often."""
+
+_log = logging.getLogger("smartcam.gateway")
+
+
+class RobotLink(asyncio.Protocol):
+    """One connection.
+
+    Args:
+        shared: what robots share, the camera among it.
+        writer: how answers are written.
+        acceptor: gives it a place.
+
+    Attributes:
+        settled: whether it has asked for a part: then it keeps its place, which one that said
+            nothing, or anything else, has to leave for a newcomer.
+    """
+
+    _transport: asyncio.Transport
+
+    def __init__(
+        self, shared: SharedDesk, writer: AnswerWriter, acceptor: Acceptor[RobotLink]
+    ) -> None:
+        self.settled: bool = False
+        self._shared, self._writer, self._acceptor = shared, writer, acceptor
+        self._account = shared.account
+        self._desk = Desk(shared)
+        self._requests = RequestReader(shared.settings.style.form)
+        self._waiting: deque[tuple[RobotRequest, float]] = deque()
+        self._task: asyncio.Task[None] | None = None
+        self._idle: asyncio.TimerHandle | None = None
+        self._peer = "?"
+        self._closed = True
+
+    # ------------------------------------------------------------------ from the transport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take a place, or say that there is none."""
+        self._transport = cast("asyncio.Transport", transport)
+        address = transport.get_extra_info("peername")
+        self._peer = f"{address[0]}:{address[1]}" if address else "?"
+        refusal = self._acceptor.enter(self, address)
+        if refusal:
+            self._account.refused += 1
+            _log.warning("%s: refused: %s", self._peer, refusal)
+            self._write(RobotAnswer(AnswerCode.FULL, words=refusal), None)
+            self._transport.close()
+            return
+        self._closed = False
+        self._account.robots += 1
+        _keep_alive(transport.get_extra_info("socket"))
+        self._acceptor.expect(self, self._shared.settings.idle, "no request")
+        self._set_idle()
+
+    def data_received(self, data: bytes) -> None:
+        """Take requests."""
+        if self._closed:
+            return
+        self._set_idle()
+        try:
+            requests = self._requests.feed(data)
+        except NotWritableError as exc:
+            self._count_error(RobotAnswer(AnswerCode.TOO_LONG, words=str(exc)), None)
+            self._close("a request is too long")
+            return
+        for request in requests:
+            if not self._closed:
+                self._take(request)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """End what is under way; parts that nobody asked for are forgotten."""
+        self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
+
+    def turn_away(self, why: str) -> None:
+        """End it at once, for another connection."""
+        self._close(why, abort=True)
+
+    # ------------------------------------------------------------------ requests
+
+    def _take(self, request: RobotRequest) -> None:
+        self.settled = self.settled or request.word in ASKING_FOR_PARTS
+        self._account.requests += 1
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self._shared.settings.timeout
+        if self._task is None:
+            self._account.open += 1
+            self._task = loop.create_task(self._serve(request, deadline), name="smartcam.gateway")
+        elif request.tag is None:
+            # it has given up waiting, and would take the answer under way for that to this one
+            self._account.abandoned += 1
+            self._close("a request without a number came before the answer to the one before")
+        elif len(self._waiting) >= MAX_WAITING_REQUESTS:
+            self._account.errors += 1
+            words = f"{MAX_WAITING_REQUESTS} requests are waiting already"
+            self._write(RobotAnswer(AnswerCode.BUSY, words=words), request.tag)
+        else:
+            self._account.open += 1
+            self._waiting.append((request, deadline))
+
+    async def _serve(self, request: RobotRequest, deadline: float) -> None:
+        """Answer a request, and those that came meanwhile."""
+        while True:
+            answer = await self._desk.answer(request, deadline)
+            self._account.open -= 1
+            if self._write(answer, request.tag):
+                self._account.errors += 1
+            else:
+                self._account.answered += 1
+            if self._transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
+                self._close("the robot reads nothing", abort=True)
+                return
+            if not self._waiting:
+                break
+            request, deadline = self._waiting.popleft()
+        self._task = None
+
+    def _write(self, answer: RobotAnswer, tag: int | None) -> bool:
+        """Write an answer, or why it cannot be written; return whether that is an error."""
+        try:
+            data = self._writer.write(answer, tag)
+        except NotWritableError as exc:
+            answer = self._desk.failed(str(exc))
+            data = self._writer.write(answer, tag)
+        self._transport.write(data)
+        self._desk.sent()
+        if answer.code.is_error:
+            _log.warning("%s: %s: %s", self._peer, answer.code.name, answer.words)
+        return answer.code.is_error
+
+    def _count_error(self, answer: RobotAnswer, tag: int | None) -> None:
+        self._account.requests += 1
+        if self._task is not None:
+            self._account.abandoned += 1  # its answer would be taken for that to another one
+            return
+        self._account.errors += 1
+        self._write(answer, tag)
+
+    # ------------------------------------------------------------------ the end
+
+    def _set_idle(self) -> None:
+        if self._idle is not None:
+            self._idle.cancel()
+        idle = self._shared.settings.idle
+        why = f"no request within {idle:g} s"
+        self._idle = asyncio.get_running_loop().call_later(idle, self._close, why)
+
+    def _close(self, why: str, abort: bool = False) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        _log.info("%s: closed: %s", self._peer, why)
+        if self._idle is not None:
+            self._idle.cancel()
+        self._acceptor.leave(self)
+        abandoned = len(self._waiting)
+        self._waiting.clear()
+        task, self._task = self._task, None
+        if task is not None and task is not asyncio.current_task():
+            task.cancel()
+            abandoned += 1
+        self._account.open -= abandoned
+        self._account.abandoned += abandoned
+        self._desk.forget()
+        if abort:
+            self._transport.abort()
+        else:
+            self._transport.close()
+
+    async def finish(self) -> None:
+        """Close it, and wait until what was under way has ended."""
+        task = self._task
+        self._close("the gateway is closed")
+        if task is not None:
+            await asyncio.wait({task})
+
+
+def _keep_alive(sock: socket.socket | None) -> None:
+    """Have the system find out that a robot is gone which was switched off."""
+    if sock is None:
+        return
+    with contextlib.suppress(OSError):
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for name, value in _KEEPALIVE_PERIOD:
+            if hasattr(socket, name):
+                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -1,0 +1,129 @@
+"""Make rows of a result for a robot: the values of each part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from smartcam.calibration.formats import ROBOTS, pose_to
+from smartcam.exceptions import InterpretationError
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import matrix_from_quaternion
+from smartcam.interpreters import Interpreter, resolve
+from smartcam.layout._inside import UNITS
+from smartcam.models import Localization
+
+if TYPE_CHECKING:
+    from smartcam.gateway._settings import GatewaySettings
+    from smartcam.layout import Field, Layout
+
+Row = list[float | str]
+
+
+class Parts:
+    """Makes rows of values: poses in a robot's convention, records in its units.
+
+    Args:
+        settings: the convention, the units, and what stands behind a pose.
+        spec: what ``interpret_as`` is of the camera: its layout says which values are lengths.
+    """
+
+    def __init__(self, settings: GatewaySettings, spec: object) -> None:
+        self._settings, self._style = settings, settings.style
+        self._convention = ROBOTS[self._style.pose]
+        self._layouts = _layouts(spec)
+        self._lengths = {"m": 1.0, "mm": 1000.0}[self._style.length]
+        self._angles = {"rad": 1.0, "deg": 180.0 / math.pi}[self._style.angle]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the values of a part; those of a record where the layout is known."""
+        layout = next(iter(self._layouts.values()), None)
+        if layout is None or {"x", "y"} <= {field.name for field in layout.fields}:
+            return (*self._convention.numbers, *self._settings.also)
+        return tuple(field.name for field in layout.fields)
+
+    def rows(self, value: object, application: int) -> list[Row]:
+        """Return a row for each part of a result.
+
+        Raises:
+            InterpretationError: the value has no parts.
+        """
+        if type(value).__module__ == "numpy":
+            value = _records_of(value)
+        one = isinstance(value, (Localization, Mapping)) or hasattr(value, "_asdict")
+        items = [value] if one else value
+        if not isinstance(items, Sequence) or isinstance(items, (str, bytes, bytearray)):
+            raise InterpretationError(
+                f"the result is {type(value).__name__}, which has no parts: expected localizations "
+                "or records; interpret_as says how results are read"
+            )
+        layout = self._layouts.get(application) or self._layouts.get(None)
+        fields = {field.name: field for field in layout.fields} if layout else {}
+        return [self._row(item, fields) for item in cast("Sequence[object]", items)]
+
+    def _row(self, item: object, fields: Mapping[str, Field]) -> Row:
+        if isinstance(item, Localization):
+            return self._pose(item)
+        if hasattr(item, "_asdict"):
+            item = cast("Any", item)._asdict()
+        if not isinstance(item, Mapping):
+            raise InterpretationError(
+                f"a part is {type(item).__name__}: expected a localization or a record"
+            )
+        record = cast("Mapping[str, object]", item)
+        return [self._scaled(value, fields.get(name)) for name, value in record.items()]
+
+    def _pose(self, part: Localization) -> Row:
+        x, y, z, w = part.pose.orientation
+        if self._settings.tool_flip:
+            x, y, z, w = w, z, -y, -x  # times (1, 0, 0, 0): half a turn about x
+        pose = Transform(
+            "robot",
+            "part",
+            matrix_from_quaternion([x, y, z, w]),
+            np.array(part.pose.position, dtype=np.float64),
+        )
+        numbers = pose_to(self._style.pose, pose)
+        position = [self._lengths * one / self._convention.metre for one in numbers[:3]]
+        turned = [one * self._angle_factor for one in numbers[3:]]
+        return [*position, *turned, *(getattr(part, name) for name in self._settings.also)]
+
+    @property
+    def _angle_factor(self) -> float:
+        """Factor for the convention's own angles; 1 for quaternions."""
+        if "q1" in self._convention.numbers:
+            return 1.0
+        own = 1.0 if self._style.pose == "ur" else 180.0 / math.pi
+        return self._angles / own
+
+    def _scaled(self, value: object, field: Field | None) -> float | str:
+        quantity = UNITS[field.unit].quantity if field is not None and field.unit else ""
+        factor = {"length": self._lengths, "angle": self._angles}.get(quantity)
+        if isinstance(value, (bool, int, float)):
+            return value * factor if factor is not None else value
+        return str(value)
+
+
+def _layouts(spec: object) -> dict[int | None, Layout]:
+    """Return the layouts of what ``interpret_as`` says, by application; None: of any."""
+    if spec is None:
+        return {}
+    one = spec if isinstance(spec, Mapping) else {None: spec}
+    found: dict[int | None, Layout] = {}
+    for application, each in cast("Mapping[int | None, Any]", one).items():
+        interpreter = resolve(each)
+        if isinstance(interpreter, Interpreter) and interpreter.layout is not None:
+            found[application] = interpreter.layout
+    return found
+
+
+def _records_of(table: Any) -> object:
+    """Return the rows of a table of numpy's as mappings; anything else as it is."""
+    names = getattr(table.dtype, "names", None)
+    if not names:
+        return cast("object", table)
+    return [dict(zip(names, row, strict=True)) for row in table.reshape(-1).tolist()]
