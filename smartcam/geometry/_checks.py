@@ -1,0 +1,31 @@
+"""Check the arguments that several of these types take: words, and sizes of images."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam._arguments import plain, shown
+from smartcam.geometry._codes import Code
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def check_choice(value: object, among: Sequence[str], what: str) -> None:
+    """Raise (SHAPE) where an option is none of those that there are."""
+    word = plain(value)  # a class of somebody's may hash and compare as it likes
+    if not isinstance(word, str) or word not in among:
+        known = list(among)
+        text = f"{what}: expected one of {known}, got {shown(value)}"
+        raise Code.SHAPE.refusal(text, known, value)
+
+
+def check_size(values: Any, called: str) -> None:
+    """Raise (SHAPE) where something is no size of an image: width and height, pixels."""
+    whole = (int, np.integer)
+    plain = isinstance(values, tuple | list) and len(values) == 2
+    if not plain or not all(isinstance(one, whole) and one > 0 for one in values):
+        expected = f"{called}: size: expected width and height in pixels"
+        raise Code.SHAPE.unexpected(expected, "(width, height)", values)

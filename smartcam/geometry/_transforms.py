@@ -1,0 +1,359 @@
+"""Frames: how coordinate systems lie against each other, and when they did so.
+
+A :class:`Transform` knows which way it goes: from ``source`` coordinates into ``target``
+coordinates. Two of them can be put one behind the other only where the frame between them is the
+same, so one that is taken the wrong way round does not pass. A :class:`PoseHistory` keeps those of
+a frame that moves, and gives the one at a moment.
+
+Right-handed, metres, Hamilton quaternions ``x, y, z, w``.
+"""
+
+from __future__ import annotations
+
+import bisect
+import dataclasses
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from smartcam._argument_checks import takes
+from smartcam._arguments import check_seconds
+from smartcam.geometry._codes import Code
+from smartcam.geometry._rigid import Rigid, exp_rotation, log_rotation
+from smartcam.geometry._rotations import (
+    MAX_COORDINATE,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    quaternion_multiply,
+)
+from smartcam.models import Header, Pose, Position, Quaternion
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from smartcam.geometry._rotations import Array
+
+_ORTHONORMAL: Final = 1e-6
+"""Largest difference of ``R R^T`` from one: at a metre this is a micrometre."""
+
+_UNIT: Final = 0.01
+"""Largest difference of a quaternion's length from one; it is made one. Robots print few digits;
+what is farther off is no quaternion, or is in another order."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transform:
+    """A rigid motion ``T_target_source``: ``p_target = rotation @ p_source + translation``.
+
+    Attributes:
+        target: the frame that it leads to.
+        source: the frame that it comes from.
+        rotation: (3, 3), determinant +1. Read-only.
+        translation: (3,), metres: the source's origin in the target. Read-only.
+        at: when it was so; None for one that does not change.
+
+    Raises:
+        CalibrationError: no rotation (``NOT_RIGID``: a reflection and a scale, too), not finite,
+            or a time without a time zone (``BAD_TIME``).
+    """
+
+    target: str
+    source: str
+    rotation: Array
+    translation: Array
+    at: datetime | None = None
+
+    def __post_init__(self) -> None:
+        """Take read-only copies, and check them."""
+        for name in (self.target, self.source):
+            if not isinstance(name, str):
+                raise Code.SHAPE.refusal(
+                    "transform: expected names of two frames, then a rotation and a translation, "
+                    f"got {type(name).__name__} in place of a name",
+                    "names of frames",
+                    type(name).__name__,
+                )
+        rotation = _numbers(self.rotation, f"{self.label}: rotation")
+        translation = _numbers(self.translation, f"{self.label}: translation")
+        if rotation.shape != (3, 3) or translation.shape != (3,):
+            raise Code.NOT_RIGID.refusal(
+                f"{self.label}: expected a (3, 3) rotation and a (3,) translation, got "
+                f"{rotation.shape} and {translation.shape}",
+                ((3, 3), (3,)),
+                (rotation.shape, translation.shape),
+            )
+        with np.errstate(all="ignore"):
+            off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+            turn = float(np.linalg.det(rotation))
+        far = not np.abs(translation).max() <= MAX_COORDINATE
+        if not (off < _ORTHONORMAL and turn > 0) or far:
+            mirror = " (a reflection: one of the frames is left-handed)" if turn < 0 else ""
+            raise Code.NOT_RIGID.refusal(
+                f"{self.label}: expected a rotation and a finite translation, got a matrix of "
+                f"determinant {turn:.6g}{mirror}, off by {off:.3g}, and {translation.tolist()}",
+                "a rotation, determinant 1",
+                turn,
+            )
+        if self.at is not None and getattr(self.at, "tzinfo", None) is None:
+            raise Code.BAD_TIME.unexpected(
+                f"{self.label}: expected a time with its time zone", "a time zone", self.at
+            )
+        rotation.flags.writeable = translation.flags.writeable = False
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", translation)
+
+    @classmethod
+    def from_quaternion(
+        cls,
+        target: str,
+        source: str,
+        translation: ArrayLike,
+        quaternion: ArrayLike,
+        at: datetime | None = None,
+    ) -> Transform:
+        """Return the transform of a position and an orientation.
+
+        Args:
+            target: the frame in which both are given.
+            source: the frame whose pose they are.
+            translation: (3,), metres.
+            quaternion: (4,), ``x, y, z, w``. Its length is made one.
+            at: when it was so.
+
+        Raises:
+            CalibrationError: ``NOT_RIGID``: the quaternion's length is more than 1 % off.
+        """
+        values = _numbers(quaternion, f"T_{target}_{source}: quaternion")
+        with np.errstate(all="ignore"):
+            length = float(np.linalg.norm(values))
+        if values.shape != (4,) or not abs(length - 1.0) < _UNIT:
+            raise Code.NOT_RIGID.refusal(
+                f"T_{target}_{source}: expected a quaternion x, y, z, w of length 1, got "
+                f"{values.tolist()} of length {length:.6g}",
+                1.0,
+                length,
+            )
+        rotation = matrix_from_quaternion(values / length)
+        return cls(target, source, rotation, _numbers(translation, "translation"), at)
+
+    @classmethod
+    def from_pose(cls, pose: Pose, source: str) -> Transform:
+        """Return the transform of a pose in the frame that its header names, with its stamp.
+
+        Raises:
+            CalibrationError: ``NOT_RIGID``, ``BAD_TIME``.
+        """
+        if not isinstance(pose, Pose):
+            raise Code.SHAPE.unexpected("from_pose: expected a Pose", "Pose", type(pose).__name__)
+        header = pose.header
+        return cls.from_quaternion(
+            header.frame_id, source, pose.position, pose.orientation, header.stamp
+        )
+
+    @property
+    def label(self) -> str:
+        """Its name as it is written in formulas: ``T_target_source``."""
+        return f"T_{self.target}_{self.source}"
+
+    @property
+    def rigid(self) -> Rigid:
+        """The motion without the frames' names."""
+        return Rigid(self.rotation, self.translation)
+
+    @property
+    def quaternion(self) -> Array:
+        """(4,), ``x, y, z, w``, whose largest element is positive."""
+        return quaternion_from_matrix(self.rotation)
+
+    def pose(self, seq: int = 0) -> Pose:
+        """Return the source's pose in the target.
+
+        Raises:
+            CalibrationError: ``BAD_TIME``: it has no time, and a pose must have one.
+        """
+        if self.at is None:
+            raise Code.BAD_TIME.refusal(
+                f"{self.label}: expected a time for the pose's header, got none", "a time"
+            )
+        position = Position(*self.translation.tolist())
+        orientation = Quaternion(*self.quaternion.tolist())
+        return Pose(Header(seq, self.at, self.target), position, orientation)
+
+    def inverse(self) -> Transform:
+        """Return ``T_source_target``."""
+        return Transform(self.source, self.target, *self.rigid.inverse(), self.at)
+
+    def undated(self) -> Transform:
+        """Return the transform without its time, to compare transforms of different times."""
+        return dataclasses.replace(self, at=None)
+
+    def __matmul__(self, other: Transform) -> Transform:
+        """Return ``T_a_b @ T_b_c = T_a_c``.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: the frames between them differ; ``NOT_SIMULTANEOUS``:
+                their times do.
+        """
+        as_motion(other, f"{self.label} @", self.source, "source")
+        if self.source != other.target:
+            raise Code.WRONG_FRAME.refusal(
+                f"{self.label} @ {other.label}: expected a transform into {self.source!r}, got one "
+                f"into {other.target!r}",
+                self.source,
+                other.target,
+            )
+        if self.at is not None and other.at is not None and self.at != other.at:
+            raise Code.NOT_SIMULTANEOUS.refusal(
+                f"{self.label} @ {other.label}: expected both at one time, got {self.at} and "
+                f"{other.at}",
+                self.at,
+                other.at,
+            )
+        at = other.at if self.at is None else self.at
+        return Transform(self.target, other.source, *(self.rigid @ other.rigid), at)
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Return points of the source, (..., 3) in metres, in the target; else SHAPE."""
+        return _rows(points, 3, f"{self.label}: points") @ self.rotation.T + self.translation
+
+    def turn(self, quaternions: ArrayLike) -> Array:
+        """Return orientations in the source, (..., 4), as those in the target; else SHAPE."""
+        return quaternion_multiply(self.quaternion, _rows(quaternions, 4, "orientations"))
+
+    def between(self, later: Transform, at: datetime) -> Transform:
+        """Return the transform at a moment between this one and a later one of the same frames.
+
+        The position moves on a straight line, the orientation turns about one axis at one speed.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``; ``BAD_TIME``: the moment is not between the two.
+        """
+        if (self.target, self.source) != (later.target, later.source):
+            raise Code.WRONG_FRAME.unexpected(
+                f"between: expected two of {self.label}", self.label, later.label
+            )
+        if self.at is None or later.at is None or not self.at <= at <= later.at:
+            raise Code.BAD_TIME.unexpected(
+                f"{self.label}: expected a time between {self.at} and {later.at}",
+                (self.at, later.at),
+                at,
+            )
+        if later.at == self.at:
+            return self
+        part = (at - self.at) / (later.at - self.at)
+        # R1 exp(s log(R1^T R2)) goes the shortest way from R1 to R2 at one speed: slerp.
+        # Source: Shoemake, Animating Rotation with Quaternion Curves (1985).
+        step = exp_rotation(part * log_rotation(self.rotation.T @ later.rotation))
+        translation = self.translation + part * (later.translation - self.translation)
+        return Transform(self.target, self.source, self.rotation @ step, translation, at)
+
+
+def _numbers(values: ArrayLike, what: str) -> Array:
+    """Return a copy as float64; else NOT_RIGID."""
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex ones came")
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, ArithmeticError) as exc:
+        raise Code.NOT_RIGID.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
+
+
+def _rows(values: ArrayLike, count: int, what: str) -> Array:
+    """Return numbers (..., ``count``); else SHAPE. NaN may be among them."""
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError("complex ones came")
+        rows = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError, ArithmeticError) as exc:
+        raise Code.SHAPE.refusal(f"{what}: expected numbers: {exc!s:.200}", "numbers") from exc
+    if rows.shape[-1:] != (count,):
+        raise Code.SHAPE.unexpected(
+            f"{what}: expected shape (..., {count})", f"(..., {count})", rows.shape
+        )
+    return rows
+
+
+def as_motion(value: object, what: str, target: str, source: str) -> Transform:
+    """Return the value if it is a :class:`Transform`, else raise an error of the code SHAPE."""
+    if isinstance(value, Transform):
+        return value
+    shape = np.shape(value) if isinstance(value, np.ndarray) else ()
+    kind = "None" if value is None else type(value).__name__
+    raise Code.SHAPE.refusal(
+        f"{what}: expected a Transform, which knows its frames, got {kind}{shape or ''}: of a "
+        f'matrix M (4, 4) it is Transform("{target}", "{source}", M[:3, :3], M[:3, 3])',
+        "Transform",
+        kind,
+    )
+
+
+class PoseHistory:
+    """Poses of a frame that moves in another one, by their times.
+
+    Args:
+        size: how many moments are kept; the oldest goes first.
+        max_gap: seconds between two moments at most, to take one in between. A robot that
+            accelerates with ``a`` leaves the straight line between them by ``a * max_gap^2 / 8``:
+            a tenth of a second and 1 m/s^2 are 1.25 mm.
+    """
+
+    @takes(max_gap=check_seconds)
+    def __init__(self, *, size: int = 1000, max_gap: float = 0.1) -> None:
+        self._transforms: list[Transform] = []
+        self._times: list[datetime] = []
+        self._size = size
+        self._max_gap = timedelta(seconds=max_gap)
+
+    def add(self, transform: Transform) -> None:
+        """Put in where the frame was at a moment; one more of the same moment takes its place.
+
+        They may come in any order.
+
+        Raises:
+            CalibrationError: ``BAD_TIME``: without a time; ``WRONG_FRAME``: of other frames than
+                those before.
+        """
+        if transform.at is None:
+            raise Code.BAD_TIME.refusal(f"{transform.label}: expected a time, got none", got=None)
+        if self._transforms and transform.label != self._transforms[0].label:
+            wanted = self._transforms[0].label
+            raise Code.WRONG_FRAME.unexpected(
+                f"pose history: expected {wanted} as before", wanted, transform.label
+            )
+        place = bisect.bisect_left(self._times, transform.at)
+        same = transform.at in self._times[place : place + 1]
+        self._times[place : place + same] = [transform.at]
+        self._transforms[place : place + same] = [transform]
+        del self._times[: -self._size], self._transforms[: -self._size]
+
+    def at(self, moment: datetime) -> Transform:
+        """Return the pose at a moment, interpolated between those before and after.
+
+        Raises:
+            CalibrationError: ``BAD_TIME``: before the first or after the last known moment (nothing
+                is extrapolated), or in a gap longer than ``max_gap``.
+        """
+        place = bisect.bisect_left(self._times, moment)
+        if moment in self._times[place : place + 1]:
+            return self._transforms[place]
+        if place in (0, len(self._times)):
+            known = (
+                f"from {self._times[0]} to {self._times[-1]}" if self._times else "that is known"
+            )
+            raise Code.BAD_TIME.refusal(
+                f"pose history: expected a time {known}, got {moment}: nothing is extrapolated",
+                known,
+                moment,
+            )
+        before, after = self._transforms[place - 1 : place + 1]
+        gap = self._times[place] - self._times[place - 1]
+        if gap > self._max_gap:
+            raise Code.BAD_TIME.refusal(
+                f"{before.label}: expected two poses at most {self._max_gap.total_seconds():g} s "
+                f"apart around {moment}, got {gap.total_seconds():g} s",
+                self._max_gap,
+                gap,
+            )
+        return before.between(after, moment)
