@@ -26,29 +26,20 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.calibration._codes import Code, Remark
     from smartcam.calibration._detection.find import find_target
     from smartcam.calibration._drawing.draw import draw_scene, draw_uncertainty, draw_views
     from smartcam.calibration._files.directory import Folder
     from smartcam.calibration._files.load import load_calibration
-    from smartcam.calibration._geometry.frames import PoseHistory, Transform
-    from smartcam.calibration._geometry.solvers import (
-        Chain,
-        Height,
-        PlaneProjection,
-        ToolOffset,
-        chain_of,
-    )
     from smartcam.calibration._hand_eye.calibration import (
         calibrate_hand_eye,
         calibrate_hand_eye_from_poses,
     )
     from smartcam.calibration._hand_eye.equations import RobotSigmas
     from smartcam.calibration._hand_eye.result import HandEyeCalibration
+    from smartcam.calibration._hand_eye.time_offset import TimeOffset, estimate_time_offset
     from smartcam.calibration._lens.comparison import LensComparison, compare
     from smartcam.calibration._lens.guide import NextView, suggest_views
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._lens.poses import TargetPose, locate
     from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
     from smartcam.calibration._plane.calibration import Drift, PlaneCalibration, fit_plane
@@ -61,17 +52,22 @@ if TYPE_CHECKING:
         calibrate_sheet,
         fit_corners,
     )
+    from smartcam.calibration._solvers import Chain, Height, PlaneProjection, ToolOffset, chain_of
     from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
     from smartcam.calibration._targets import (
         Charuco,
         Checkerboard,
         CircleGrid,
+        MarkerGrid,
         target_from_data,
         target_to_data,
     )
+    from smartcam.calibration._verdict import CalibrationVerdict
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry import CameraModel, Code, PoseHistory, Remark, Transform
 
 __all__ = [
+    "CalibrationVerdict",
     "CameraModel",
     "Chain",
     "Charuco",
@@ -84,6 +80,7 @@ __all__ = [
     "Height",
     "IntrinsicCalibration",
     "LensComparison",
+    "MarkerGrid",
     "MovingCamera",
     "NextView",
     "PlaneCalibration",
@@ -97,6 +94,7 @@ __all__ = [
     "StereoCalibration",
     "TargetPose",
     "TargetView",
+    "TimeOffset",
     "ToolOffset",
     "Transform",
     "calibrate_hand_eye",
@@ -109,6 +107,7 @@ __all__ = [
     "draw_scene",
     "draw_uncertainty",
     "draw_views",
+    "estimate_time_offset",
     "find_target",
     "fit_corners",
     "fit_plane",
@@ -127,20 +126,17 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_codes": "Code Remark",
             "_detection.find": "find_target",
             "_drawing.draw": "draw_scene draw_uncertainty draw_views",
             "_files.directory": "Folder",
             "_files.load": "load_calibration",
-            "_geometry.frames": "PoseHistory Transform",
-            "_geometry.solvers": "Chain Height PlaneProjection ToolOffset chain_of",
             "_hand_eye.calibration": "calibrate_hand_eye calibrate_hand_eye_from_poses",
             "_hand_eye.equations": "RobotSigmas",
             "_hand_eye.result": "HandEyeCalibration",
+            "_hand_eye.time_offset": "TimeOffset estimate_time_offset",
             "_lens.comparison": "LensComparison compare",
             "_lens.guide": "NextView suggest_views",
             "_lens.intrinsics": "IntrinsicCalibration calibrate_intrinsics",
-            "_lens.model": "CameraModel",
             "_lens.poses": "TargetPose locate",
             "_lens.uncertainty": "ProjectionUncertainty",
             "_plane.calibration": "Drift PlaneCalibration fit_plane",
@@ -149,8 +145,12 @@ if not TYPE_CHECKING:
             "_plane.touches": "fit_touches",
             "_printing.sheets": "Sheet make_sheet scaled",
             "_sheet.calibration": "SheetCalibration calibrate_sheet fit_corners",
+            "_solvers": "Chain Height PlaneProjection ToolOffset chain_of",
             "_stereo.calibration": "StereoCalibration calibrate_stereo",
-            "_targets": "Charuco Checkerboard CircleGrid target_from_data target_to_data",
+            "_targets": "Charuco Checkerboard CircleGrid MarkerGrid target_from_data "
+            "target_to_data",
+            "_verdict": "CalibrationVerdict",
             "_views": "TargetView",
+            "smartcam.geometry": "CameraModel Code PoseHistory Remark Transform",
         },
     )

@@ -23,18 +23,18 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 T = TypeVar("T")
 
-MOST_STEPS = 100
-"""Of a fit; from a linear solution it takes about ten."""
+MAX_STEPS = 100
+"""A fit takes at most this many steps; from a linear solution it takes about ten."""
 
-LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e12
+MIN_DAMPING, MAX_DAMPING = 1e-9, 1e12
 """Part of the diagonal that is added to it; with the most of it no step is large enough to gain."""
 
 RANK = 1e-14
-"""Of a matrix with ones on its diagonal: singular values that are smaller are rounding errors."""
+"""Singular values of a matrix with a unit diagonal are rounding below this part of the largest."""
 
 
 LARGE = 60
@@ -92,7 +92,7 @@ class Normal(NamedTuple):
         return shared, alone - by_shared @ shared
 
     def covariance(self) -> tuple[Array, Array]:
-        """Return those of the shared unknowns (S, S) and of each pose (P, K, K).
+        """Return the covariances of the shared unknowns (S, S) and of each pose (P, K, K).
 
         They are NaN where ``cost`` is infinite.
         """
@@ -129,7 +129,7 @@ def minimize(
     from the beginning.
     """
     normal = evaluate(at)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         if not math.isfinite(normal.cost):
             break
         try:
@@ -139,12 +139,12 @@ def minimize(
             tried, after = at, normal._replace(cost=math.inf)
         gained, least = normal.cost - after.cost, gain * (normal.cost + noise)
         if gained < 0:
-            if damping >= MOST_DAMPING or -gained <= least:
+            if damping >= MAX_DAMPING or -gained <= least:
                 break
             damping = max(10.0 * damping, 1e-6)
             continue
         at, normal = tried, after
-        damping = max(damping / 10.0, LEAST_DAMPING)
+        damping = max(damping / 10.0, MIN_DAMPING)
         if gained <= least:
             break
     return at, normal

@@ -1,22 +1,22 @@
-"""How likely a sum of squares is, where nothing but the touches' noise is at work."""
+"""Compute the probability of a sum of squares where only the touches' noise is at work."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 
 class Noise(NamedTuple):
-    """What is known of the touches' noise."""
+    """The variance of the touches' noise, and how well it is known."""
 
     variance: float  # of one coordinate, m^2
     freedom: int | None = None  # of the estimate that it comes from; None where it was given
 
-    def chance(self, squares: float, count: int) -> float:
+    def chance(self, squares: float, count: float) -> float:
         """Return the probability that noise alone gives ``squares`` (m^2, of ``count``) or more.
 
         Of a chi-square test where the variance was given, of an F-test where it is an estimate from

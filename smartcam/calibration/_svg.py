@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
     Place = Array | Sequence[float]
 
@@ -23,6 +23,7 @@ text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px } .small { f
 .camera { fill: #d55e00; fill-opacity: 0.15; stroke: #d55e00; stroke-width: 1.2 }
 .halo { paint-order: stroke; stroke: #fff; stroke-width: 3 }
 .on-map { fill: #fff; paint-order: stroke; stroke: #222; stroke-width: 3 }
+.seen { stroke: #fff; stroke-width: 2; stroke-linecap: round; stroke-opacity: 0.7 }
 .mark { fill: none; stroke: #fff; stroke-width: 2 } .mark-rim { fill: none; stroke: #222; \
 stroke-width: 4 }
 @media (prefers-color-scheme: dark) {
@@ -30,8 +31,8 @@ text { fill: #ddd } .paper { fill: #181818 } .first { fill: #56b4e9 } .second { 
 .off { fill: #777 } .axis { stroke: #999 } .first-line { stroke: #56b4e9 }
 .second-line { stroke: #f0a040 } .board { fill: #56b4e9; stroke: #56b4e9 }
 .camera { fill: #f0a040; stroke: #f0a040 } .halo { stroke: #181818 } .on-map { fill: #fff } }"""
-"""Of pictures that follow a page that is light or dark; colours that colour-blind people tell
-apart.
+"""Style sheet of pictures that follow a page that is light or dark, in colours that colour-blind
+people tell apart.
 
 Source of the colours: Okabe and Ito, Color Universal Design (2008).
 """
@@ -64,6 +65,11 @@ def text(place: Place, said: str, kind: str = "", more: str = "") -> str:
     """Return a text that begins at a place; ``more``: further attributes, a space before them."""
     of_kind = f' class="{kind}"' if kind else ""
     return f'<text x="{place[0]:.2f}" y="{place[1]:.2f}"{of_kind}{more}>{escape(said)}</text>'
+
+
+def circle(place: Place, radius: float, kind: str) -> str:
+    """Return a circle about a place."""
+    return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius:g}" class="{kind}"/>'
 
 
 def polygon(corners: Array, kind: str, title: str = "") -> str:

@@ -14,23 +14,31 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.exceptions import CalibrationError
+from smartcam._argument_checks import a_target, takes
+from smartcam._arguments import shown
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.calibration._geometry.rotations import Array
+    from _typeshed import DataclassInstance
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
 
 MAX_POINTS = 10_000
-"""Of one target."""
+"""A target has at most this many points."""
+
+MAX_LENGTH_M = 1.0
+"""Side of a square, of a marker and distance of dots at most, metres: those of a printed sheet are
+some millimetres to a few hundred, and a number beyond is one of millimetres."""
 
 AREA_DISTANCE = 0.3
 """Sides of a square from an outer corner of a checkerboard, along x and along y, to the middle of
 the round area outside of it."""
 
 AREA_DIAMETER = 0.3
-"""Of this area, sides of a square."""
+"""Diameter of the round area outside of an outer corner of a checkerboard, sides of a square."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,12 +87,12 @@ class Checkerboard:
 
     @property
     def corner_area_diameter(self) -> float:
-        """Of each of the ``corner_areas``, and of the origin's dot, metres."""
+        """Diameter of each of the ``corner_areas``, and of the origin's dot, metres."""
         return AREA_DIAMETER * self.square
 
     @property
     def turned_alike(self) -> bool:
-        """Whether the sheet looks the same when it is turned by half."""
+        """True if the sheet looks the same after half a turn."""
         return not self.origin_mark and (self.columns + self.rows) % 2 == 0
 
 
@@ -118,19 +126,17 @@ class Charuco:
         _check_lengths(self.kind, square=self.square, marker=self.marker)
         _check_flags(self.kind, legacy_pattern=self.legacy_pattern)
         if not isinstance(self.dictionary, str):
-            raise CalibrationError(
-                f"charuco: expected the name of a dictionary, got {self.dictionary!r}",
-                code=Code.SHAPE,
-                expected="DICT_5X5_250",
-                got=self.dictionary,
+            raise Code.SHAPE.refusal(
+                f"charuco: expected the name of a dictionary, got {shown(self.dictionary)}",
+                "DICT_5X5_250",
+                self.dictionary,
             )
         if self.marker >= self.square:
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 f"charuco: expected a marker smaller than its square ({self.square:g} m), "
                 f"got {self.marker:g} m",
-                code=Code.SHAPE,
-                expected=self.square,
-                got=self.marker,
+                self.square,
+                self.marker,
             )
 
     @property
@@ -145,13 +151,13 @@ class CircleGrid:
 
     Attributes:
         columns: dots of a row, at least 3.
-        rows: at least 3.
+        rows: dots of a column, at least 3.
         spacing: between the centres of two neighbours of a row, metres.
-        diameter: of a dot, metres, less than ``spacing``.
-        asymmetric: every other row is shifted by half of ``spacing``, and rows are half of it
-            apart.
-        origin_diameter: of the dot at the origin where it is larger, metres; None for a grid that
-            looks the same when it is turned.
+        diameter: diameter of a dot, metres, less than ``spacing``.
+        asymmetric: True if rows are half of ``spacing`` apart and every other one is shifted by as
+            much.
+        origin_diameter: diameter of the dot at the origin where it is larger, metres; None for a
+            grid that looks the same when it is turned.
     """
 
     kind: ClassVar[str] = "circles"
@@ -172,20 +178,18 @@ class CircleGrid:
         between = (self.diameter + (self.origin_diameter or self.diameter)) / 2
         apart = self.spacing * (math.sqrt(0.5) if self.asymmetric else 1.0)
         if between >= apart:
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 f"circles: expected dots that do not touch each other at a distance of {apart:g} "
                 f"m, got a mean diameter of two neighbours of {between:g} m",
-                code=Code.SHAPE,
-                expected=apart,
-                got=between,
+                apart,
+                between,
             )
         if self.origin_diameter is not None and self.origin_diameter <= self.diameter:
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 f"circles: expected origin_diameter larger than the other dots' "
                 f"({self.diameter:g} m), got {self.origin_diameter:g} m",
-                code=Code.SHAPE,
-                expected=self.diameter,
-                got=self.origin_diameter,
+                self.diameter,
+                self.origin_diameter,
             )
 
     @property
@@ -201,20 +205,114 @@ class CircleGrid:
 
     @property
     def turned_alike(self) -> bool:
-        """Whether the sheet looks the same when it is turned by half."""
+        """True if the sheet looks the same after half a turn."""
         return self.origin_diameter is None and not (self.asymmetric and self.rows % 2 == 1)
 
 
-Target: TypeAlias = Checkerboard | Charuco | CircleGrid
-"""What :func:`~smartcam.calibration.find_target` looks for."""
+@dataclass(frozen=True, kw_only=True)
+class MarkerGrid:
+    """Markers in rows and columns; its points are the markers' corners, some may be hidden.
 
-T = TypeVar("T", bound=Target)
+    It is OpenCV's ``GridBoard``, whose numbers count from the upper left marker row by row, or
+    Kalibr's AprilGrid (:meth:`april_grid`), whose numbers count from the lower left one upwards.
+    Points are numbered along x through the lower corners of the lowest row, then through their
+    upper ones, and so on.
+
+    Attributes:
+        columns: markers along x, at least 1.
+        rows: markers along y, at least 1; two markers or more in all.
+        marker: side of a marker with its black border, metres.
+        gap: between two neighbouring markers, metres.
+        dictionary: name of one of OpenCV's, such as ``DICT_4X4_50``.
+        border: modules of a marker's black border: 1, or 2.
+        first_id: number of the first marker.
+        kalibr: numbered, turned and with black squares between the corners as Kalibr prints it.
+    """
+
+    kind: ClassVar[str] = "marker_grid"
+
+    columns: int
+    rows: int
+    marker: float
+    gap: float
+    dictionary: str = "DICT_4X4_50"
+    border: int = 1
+    first_id: int = 0
+    kalibr: bool = False
+
+    turned_alike: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        _check_counts(self.kind, self.columns, self.rows, least=1)
+        _check_counts(self.kind, 2 * self.columns, 2 * self.rows, least=1)
+        _check_lengths(self.kind, marker=self.marker, gap=self.gap)
+        _check_flags(self.kind, kalibr=self.kalibr)
+        _check_whole(self.kind, 1, border=self.border)
+        _check_whole(self.kind, 0, first_id=self.first_id)
+        if not isinstance(self.dictionary, str) or self.columns * self.rows < 2:
+            raise Code.SHAPE.refusal(
+                f"{self.kind}: expected the name of a dictionary and two markers or more, got "
+                f"{shown(self.dictionary)} and {self.columns} x {self.rows}",
+                got=(self.dictionary, self.columns, self.rows),
+            )
+
+    @classmethod
+    def april_grid(
+        cls, *, columns: int, rows: int, tag: float, spacing: float, border: int = 2
+    ) -> MarkerGrid:
+        """Return Kalibr's AprilGrid of tags 36h11.
+
+        Args:
+            columns: tags along x, Kalibr's ``tagCols``.
+            rows: tags along y, ``tagRows``.
+            tag: side of a tag from edge to edge of its black border, metres, ``tagSize``.
+            spacing: between two tags in parts of ``tag``, ``tagSpacing``.
+            border: modules of a tag's black border; Kalibr prints 2.
+        """
+        return cls(
+            columns=columns,
+            rows=rows,
+            marker=tag,
+            gap=spacing * tag,
+            dictionary="DICT_APRILTAG_36h11",
+            border=border,
+            kalibr=True,
+        )
+
+    @property
+    def points(self) -> Array:
+        """(N, 3), metres, in the target's frame: its origin is the lower left corner."""
+        points = _grid(2 * self.columns, 2 * self.rows, 1.0)
+        cells, sides = np.divmod(points, 2)
+        return np.asarray(cells * (self.marker + self.gap) + sides * self.marker)
+
+    @property
+    def corners(self) -> NDArray[np.intp]:
+        """(M, 4), numbers of each marker's points as OpenCV has its corners, by marker.
+
+        Corners go clockwise from the upper left one of a marker as OpenCV prints it; it prints
+        tags of AprilTag, and so those of Kalibr, upside down.
+        """
+        row, column = np.divmod(np.arange(self.columns * self.rows), self.columns)
+        row = row if self.kalibr else self.rows - 1 - row
+        lower_left = 4 * self.columns * row + 2 * column
+        up = 2 * self.columns
+        clockwise = np.array([up, up + 1, 1, 0])
+        found: NDArray[np.intp] = lower_left[:, None] + np.roll(clockwise, 2 * self.kalibr)
+        return found
+
+
+Target: TypeAlias = Checkerboard | Charuco | CircleGrid | MarkerGrid
+"""Targets that :func:`~smartcam.calibration.find_target` looks for."""
+
+T = TypeVar("T", bound="DataclassInstance")
 
 _KINDS: Mapping[str, type[Target]] = {
-    kind.kind: kind for kind in (Checkerboard, Charuco, CircleGrid)
+    kind.kind: kind for kind in (Checkerboard, Charuco, CircleGrid, MarkerGrid)
 }
 
 
+@takes(target=a_target)
 def target_to_data(target: Target) -> dict[str, Any]:
     """Return a target as JSON takes it; :func:`target_from_data` gives it back."""
     return {"kind": target.kind, **dataclasses.asdict(target)}
@@ -230,29 +328,27 @@ def target_from_data(data: Mapping[str, Any]) -> Target:
     named = given.pop("kind", None)
     kind = _KINDS.get(named) if isinstance(named, str) else None
     if kind is None:
-        raise CalibrationError(
-            f"target: expected a kind of {sorted(_KINDS)}, got {named!r}",
-            code=Code.SHAPE,
-            expected=sorted(_KINDS),
-            got=named,
+        raise Code.SHAPE.refusal(
+            f"target: expected a kind of {sorted(_KINDS)}, got {shown(named)}",
+            sorted(_KINDS),
+            named,
         )
     try:
         return kind(**given)
     except TypeError as exc:
-        raise CalibrationError(f"target: {exc}", code=Code.SHAPE, got=sorted(given)) from exc
+        raise Code.SHAPE.refusal(f"target: {exc}", got=sorted(given)) from exc
 
 
-def resized(target: T, factor: float) -> T:
-    """Return a target with all of its lengths multiplied by a factor.
+def resized(target: T, factor: float, digits: int | None = None) -> T:
+    """Return a target with all of its lengths multiplied by a factor, and rounded to some digits.
 
     Raises:
         CalibrationError: SHAPE: a factor that is not positive.
     """
     lengths = {
-        one.name: factor * value
+        one.name: factor * value if digits is None else round(factor * value, digits)
         for one in dataclasses.fields(target)
-        if one.name not in {"columns", "rows"}
-        and not isinstance(value := getattr(target, one.name), bool | str | None)
+        if str(one.type).startswith("float") and (value := getattr(target, one.name)) is not None
     }
     return dataclasses.replace(target, **lengths)
 
@@ -264,42 +360,50 @@ def _grid(columns: int, rows: int, spacing: float) -> Array:
     return points
 
 
-def _check_counts(kind: str, columns: Any, rows: Any) -> None:
-    for name, count in (("columns", columns), ("rows", rows)):
-        if not isinstance(count, int) or isinstance(count, bool) or count < 3:
-            raise CalibrationError(
-                f"{kind}: expected {name} to be a whole number of at least 3, got {count!r}",
-                code=Code.SHAPE,
-                expected=3,
-                got=count,
-            )
+def _check_counts(kind: str, columns: Any, rows: Any, least: int = 3) -> None:
+    _check_whole(kind, least, columns=columns, rows=rows)
     if columns * rows > MAX_POINTS:
-        raise CalibrationError(
-            f"{kind}: expected at most {MAX_POINTS} points, got {columns} x {rows}",
-            code=Code.SHAPE,
-            expected=MAX_POINTS,
-            got=columns * rows,
+        raise Code.SHAPE.refusal(
+            f"{kind}: expected at most {MAX_POINTS} points, got {shown(columns)} x {shown(rows)}",
+            MAX_POINTS,
+            columns * rows,
         )
+
+
+def _check_whole(kind: str, least: int, **numbers: Any) -> None:
+    for name, count in numbers.items():
+        if not isinstance(count, int) or isinstance(count, bool) or count < least:
+            raise Code.SHAPE.refusal(
+                f"{kind}: expected {name} to be a whole number of at least {least}, "
+                f"got {shown(count)}",
+                least,
+                count,
+            )
 
 
 def _check_flags(kind: str, **flags: Any) -> None:
     for name, flag in flags.items():
         if not isinstance(flag, bool):
-            raise CalibrationError(
-                f"{kind}: expected {name} to be True or False, got {flag!r}",
-                code=Code.SHAPE,
-                expected="True or False",
-                got=flag,
+            raise Code.SHAPE.refusal(
+                f"{kind}: expected {name} to be True or False, got {shown(flag)}",
+                "True or False",
+                flag,
             )
 
 
 def _check_lengths(kind: str, **lengths: Any) -> None:
     for name, length in lengths.items():
         number = isinstance(length, int | float) and not isinstance(length, bool)
+        if number and MAX_LENGTH_M < length < math.inf:
+            raise Code.UNIT_UNKNOWN.refusal(
+                f"{kind}: expected {name} to be a length of {MAX_LENGTH_M:g} m at most, got "
+                f"{shown(length)} m; is it in millimetres?",
+                MAX_LENGTH_M,
+                length,
+            )
         if not (number and math.isfinite(length) and length > 0):
-            raise CalibrationError(
-                f"{kind}: expected {name} to be a length in metres, got {length!r}",
-                code=Code.SHAPE,
-                expected="metres",
-                got=length,
+            raise Code.SHAPE.refusal(
+                f"{kind}: expected {name} to be a length in metres, got {shown(length)}",
+                "metres",
+                length,
             )

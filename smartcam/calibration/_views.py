@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, get_args
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.rotations import Array, as_points
 from smartcam.calibration._targets import MAX_POINTS, Target
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+from smartcam.geometry._inside import Array, as_points, check_size
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
+
 
 IDS = storage.Form(
     list[storage.Count],
@@ -29,7 +29,7 @@ ROUNDED: Final = 1e-9
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TargetView(storage.Stored):
-    """Where the points of a target are in an image.
+    """The points of a target in one image.
 
     Pixels count from the middle of the upper left one: u to the right, v down.
 
@@ -43,7 +43,8 @@ class TargetView(storage.Stored):
         margin: how clearly the origin was told from the other corners: by how many grey levels of
             255 its mark, or the rim by which its dot is larger, is darker there; None where the
             target says it by itself (ids, colours of squares), or looks the same when turned.
-        name: of the image, for messages.
+        name: name of the image, for messages.
+        warnings: what was left out of the image because it contradicts the target.
 
     Raises:
         CalibrationError: ``SHAPE``: no target, no size, arrays that do not fit together, or ids
@@ -53,7 +54,7 @@ class TargetView(storage.Stored):
 
     _called: ClassVar[str] = "view"
     _keys: ClassVar[storage.Keys] = {"target": ""}
-    _later: ClassVar[frozenset[str]] = frozenset({"margin", "name"})
+    _later: ClassVar[frozenset[str]] = frozenset({"margin", "name", "warnings"})
 
     target: Target
     size: storage.Size
@@ -62,6 +63,7 @@ class TargetView(storage.Stored):
     covariance: Annotated[Array, storage.rows(tuple[storage.Pair, storage.Pair], 2, 2)]
     margin: storage.Number | None = None
     name: str = ""
+    warnings: storage.Remarks = ()
 
     def __post_init__(self) -> None:
         """Take read-only copies, and check them."""
@@ -72,7 +74,7 @@ class TargetView(storage.Stored):
         points = as_points(self.points, 2, f"{called}: points").copy()
         if len(points) != len(ids):
             expected = f"{called}: points: expected shape ({len(ids)}, 2) as there are ids"
-            raise _refused(expected, (len(ids), 2), points.shape)
+            raise Code.SHAPE.unexpected(expected, (len(ids), 2), points.shape)
         covariance = as_covariances(self.covariance, len(ids), f"{called}: covariance").copy()
         check_size(self.size, called)
         for name, value in (("ids", ids), ("points", points), ("covariance", covariance)):
@@ -93,7 +95,7 @@ class TargetView(storage.Stored):
 
     @property
     def agreement(self) -> float:
-        """How far the target's plane and the image turn alike, -1 to 1; NaN of points on a line.
+        """Agreement, -1 to 1, of the target's orientation with the image's; NaN on a line.
 
         Near -1 for the sheet as one reads it (y is up there, and v down), near 1 for one in a
         mirror, near 0 where points are taken for others.
@@ -125,11 +127,11 @@ def checked(value: Any, kinds: type | tuple[type, ...], what: str) -> Any:
     if isinstance(value, kinds):
         return value
     names = [one.__name__ for one in (kinds if isinstance(kinds, tuple) else (kinds,))]
-    raise _refused(f"{what}: expected a {' or '.join(names)}", names, described(value))
+    raise Code.SHAPE.unexpected(f"{what}: expected a {' or '.join(names)}", names, described(value))
 
 
 def described(value: Any) -> str:
-    """Return what a value is, in a few words."""
+    """Return the kind of a value, in a few words."""
     shape = getattr(value, "shape", None)
     kind = "None" if value is None else type(value).__name__
     return kind if shape is None else f"{kind} of shape {tuple(shape)}"
@@ -141,16 +143,10 @@ def as_views(views: Iterable[TargetView], what: str) -> list[TargetView]:
 
 
 def as_list(values: Any, kinds: type | tuple[type, ...], what: str) -> list[Any]:
-    """Return what may be gone through as a list; else SHAPE. All of it is of one of some kinds."""
+    """Return a list of the values, which are all of one of some kinds; else raise SHAPE."""
     if isinstance(values, str | bytes | dict | np.ndarray) or not hasattr(values, "__iter__"):
-        raise _refused(f"{what}: expected a list of such", "a list", described(values))
+        raise Code.SHAPE.unexpected(f"{what}: expected a list of such", "a list", described(values))
     return [checked(one, kinds, f"{what} {number}") for number, one in enumerate(values)]
-
-
-def check_choice(value: object, among: Sequence[str], what: str) -> None:
-    """Raise (SHAPE) where an option is none of those that there are."""
-    if not isinstance(value, str) or value not in among:
-        raise _refused(f"{what}: expected one of {list(among)}", list(among), repr(value))
 
 
 def as_covariances(values: Any, count: int, what: str) -> Array:
@@ -160,10 +156,12 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
     """
     try:
         given = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as exc:
-        raise _refused(f"{what}: expected numbers", (count, 2, 2), exc) from exc
+    except (TypeError, ValueError, ArithmeticError) as exc:
+        raise Code.SHAPE.unexpected(f"{what}: expected numbers", (count, 2, 2), exc) from exc
     if given.shape != (count, 2, 2):
-        raise _refused(f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape)
+        raise Code.SHAPE.unexpected(
+            f"{what}: expected shape ({count}, 2, 2)", (count, 2, 2), given.shape
+        )
     found = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
     # a symmetric matrix is one where neither its trace nor its determinant is negative
     trace = np.trace(found, axis1=1, axis2=2)
@@ -173,12 +171,11 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
         got = found[wrong[0]].tolist()
-        raise CalibrationError(
+        raise Code.NO_COVARIANCE.refusal(
             f"{what}: expected symmetric matrices of no negative variance, got {got} in row "
             f"{wrong[0]}",
-            code=Code.NO_COVARIANCE,
-            expected="covariances",
-            got=got,
+            "covariances",
+            got,
         )
     return found
 
@@ -187,32 +184,25 @@ def _as_ids(values: Any, known: int, called: str) -> np.ndarray[tuple[int], np.d
     try:
         given = np.asarray(values)
     except ValueError as exc:
-        raise _refused(f"{called}: ids: expected whole numbers", "(N,)", str(exc)) from exc
+        raise Code.SHAPE.unexpected(
+            f"{called}: ids: expected whole numbers", "(N,)", str(exc)
+        ) from exc
     if given.ndim != 1 or (given.size and given.dtype.kind not in "iu"):
         got = f"{given.dtype} of shape {given.shape}"
-        raise _refused(f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", got)
+        raise Code.SHAPE.unexpected(
+            f"{called}: ids: expected whole numbers of shape (N,)", "(N,)", got
+        )
     wrong = given[(given < 0) | (given >= known)]
     if len(wrong) and wrong[0] < 0:
-        raise _refused(f"{called}: ids: expected 0 or more", 0, int(wrong[0]))
+        raise Code.SHAPE.unexpected(f"{called}: ids: expected 0 or more", 0, int(wrong[0]))
     if len(wrong):
-        raise _refused(f"{called}: ids: expected less than {known}", known, int(wrong[0]))
+        raise Code.SHAPE.unexpected(
+            f"{called}: ids: expected less than {known}", known, int(wrong[0])
+        )
     ids = given.astype(np.intp)
     back = np.flatnonzero(np.diff(ids) <= 0)
     if len(back):
         got = ids[back[0] : back[0] + 2].tolist()
         expected = f"{called}: ids: expected each once, ascending (points in the order of the ids)"
-        raise _refused(expected, "ascending", got)
+        raise Code.SHAPE.unexpected(expected, "ascending", got)
     return ids
-
-
-def check_size(values: Any, called: str) -> None:
-    """Raise (SHAPE) where something is no size of an image: width and height, pixels."""
-    whole = (int, np.integer)
-    plain = isinstance(values, tuple | list) and len(values) == 2
-    if not plain or not all(isinstance(one, whole) and one > 0 for one in values):
-        expected = f"{called}: size: expected width and height in pixels"
-        raise _refused(expected, "(width, height)", values)
-
-
-def _refused(text: str, expected: object, got: object) -> CalibrationError:
-    return CalibrationError(f"{text}, got {got}", code=Code.SHAPE, expected=expected, got=got)

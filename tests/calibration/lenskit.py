@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Checkerboard
-from smartcam.calibration._views import TargetView
+from smartcam.calibration import CameraModel, Checkerboard, TargetView, Transform
 from smartcam.calibration.simulation import _scenes as scenes
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._targets import Target
+    from smartcam.calibration._inside import Target
+    from smartcam.geometry._inside import Array
 
 __all__ = ["BOARD", "FISHEYE", "LEFT", "RIG", "RIGHT", "TURNED", "WIDE", "pairs", "poses", "seen"]
 

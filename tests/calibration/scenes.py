@@ -10,13 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Checkerboard
-from smartcam.calibration.simulation._images import render
-from smartcam.calibration.simulation._scenes import HandEyeScene, hand_eye_scene
+from smartcam.calibration import CameraModel, Checkerboard, Transform, find_target
+from smartcam.calibration._homography import apply_homography, fit_homography
+from smartcam.calibration.simulation import HandEyeScene, hand_eye_scene, render
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -24,10 +20,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration import TargetView
     from smartcam.calibration._hand_eye.equations import Setup
-    from smartcam.calibration._targets import Target
-    from smartcam.calibration._views import TargetView
+    from smartcam.calibration._inside import Target
+    from smartcam.geometry._inside import Array
 
 CAMERA = CameraModel(
     size=(1280, 960),

@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rotations import Array
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Checkerboard, Target
-from smartcam.calibration.simulation._images import render
+from smartcam.calibration import CameraModel, Checkerboard, Transform
+from smartcam.calibration._inside import Target
+from smartcam.calibration.simulation import render
+from smartcam.calibration.wizards import WizardSession, sheet_wizard
 from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._sequence import WizardSession
-from smartcam.calibration.wizards._sheet import sheet_wizard
+from smartcam.geometry._inside import Array
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 CAMERA = CameraModel(

@@ -11,16 +11,20 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import smartcam
-from smartcam.calibration._files.load import load_calibration
+from smartcam.calibration import (
+    CameraModel,
+    PlaneCalibration,
+    SheetCalibration,
+    TargetView,
+    calibrate_sheet,
+    fit_corners,
+    load_calibration,
+)
 from smartcam.calibration._files.store import write
-from smartcam.calibration._geometry.rotations import Array
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._plane.calibration import PlaneCalibration
-from smartcam.calibration._sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
-from smartcam.calibration._views import TargetView
 from smartcam.calibration.simulation import _scenes as scenes
-from smartcam.calibration.wizards._services import CalibrationService
+from smartcam.calibration.wizards import CalibrationService
 from smartcam.exceptions import ConfigurationError
+from smartcam.geometry._inside import Array
 from tests.calibration.scenes import refused
 from tests.calibration.sheetkit import (
     CAMERA,

@@ -7,14 +7,18 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
+from smartcam.calibration import (
+    CameraModel,
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    Code,
+    RobotSigmas,
+    Transform,
+)
 from smartcam.calibration._detection.charucos import charuco_board
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
-from smartcam.calibration.simulation._images import render
-from smartcam.calibration.simulation._scenes import around, view
+from smartcam.calibration._hand_eye.equations import Setup
+from smartcam.calibration.simulation import around, render, view
 from tests.calibration.scenes import BENT, CAMERA, FACING, SHEET, STRAIGHT, facing, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
@@ -244,5 +248,5 @@ def test_render_from_behind_is_refused() -> None:
 def test_render_of_sheet_behind_the_camera_is_refused() -> None:
     board = Checkerboard(columns=3, rows=3, square=0.01)
     grazing = facing(board, tilt=85, away=0.01)
-    with refused(Code.OUT_OF_FIELD, "expected the sheet before the camera, got a corner at z = -"):
+    with refused(Code.OUT_OF_FIELD, "the sheet in front of the camera, got a corner at z = -"):
         render(board, STRAIGHT, grazing)

@@ -12,47 +12,46 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
-LEAST_STEP = 7
+MIN_CONTRAST = 7
 """Grey levels of 255 by which a pixel is darker than the mean around it at least."""
 
-LEAST_AREA = 9
+MIN_SPOT_PIXELS = 9
 """Pixels of a spot at least."""
 
-LEAST_SPECK, LARGEST_SPECK = 3, 24
+MIN_SPECK, LARGEST_SPECK = 3, 24
 """Pixels of a dot that is too small, or that is said to be small, to be told from others."""
 
 LARGEST_PART = 1 / 16
-"""Of an image, the area of a spot at most: a grid has nine dots or more."""
+"""A spot covers at most this part of the image's area: a grid has nine dots or more."""
 
-LEAST_FILLED = 0.85
-"""Of the ellipse with a piece's second moments, what the piece fills at least: a rectangle has
-0.955, a triangle 0.83."""
+MIN_ELLIPSE_SHARE = 0.85
+"""A dot fills at least this part of its moments' ellipse: rectangles fill 0.955, triangles 0.83."""
 
-MOST_LONG = 6.0
-"""Times as long as wide at most: a dot that is seen 80 degrees from the front."""
+MAX_ASPECT_RATIO = 6.0
+"""A dot is at most as many times longer than wide: one that is seen 80 degrees from the front."""
 
 
-LEAST_OF_BOX = 0.2
-"""Of the upright rectangle around it, what a piece fills at least: an ellipse six times as long as
-wide, filled as little as that, has 0.22 where it lies aslant."""
+MIN_RECTANGLE_SHARE = 0.2
+"""A dot fills at least this part of the upright rectangle around it: an ellipse six times as long
+as wide that lies aslant fills 0.22, if it is filled as little as MIN_ELLIPSE_SHARE allows."""
 
 
 class Spots(NamedTuple):
-    """What may be dots."""
+    """Dark spots that may be dots of a grid."""
 
     points: Array  # (N, 2), middles, pixels
     areas: Array  # (N,), pixels^2
 
 
 class Pieces(NamedTuple):
-    """What is dark in an image and hangs together."""
+    """The connected dark pieces of an image."""
 
     dark: NDArray[np.uint8]  # (H, W), 1 where it is
     labels: NDArray[np.int32]  # (H, W), which piece each pixel is of; 0: none
@@ -60,10 +59,10 @@ class Pieces(NamedTuple):
     middles: Array  # (N, 2), pixels
 
     def spots(self, most: int) -> Spots:
-        """Return those that are filled and round, of the ``most`` largest pieces."""
+        """Return the filled, round pieces among the ``most`` largest ones."""
         _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= LEAST_AREA) & (areas <= LARGEST_PART * self.dark.size)
-        chosen &= areas >= LEAST_OF_BOX * wide * high
+        chosen = (areas >= MIN_SPOT_PIXELS) & (areas <= LARGEST_PART * self.dark.size)
+        chosen &= areas >= MIN_RECTANGLE_SHARE * wide * high
         chosen[0] = False
         kept = np.flatnonzero(chosen)
         if len(kept) > most:
@@ -75,10 +74,10 @@ class Pieces(NamedTuple):
         return Spots(pieces.points[good], pieces.areas[good])
 
     def specks(self) -> Spots:
-        """Return those that may be dots of which only a few pixels are seen."""
+        """Return the pieces that may be dots of which only a few pixels are seen."""
         _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= LEAST_SPECK) & (areas <= LARGEST_SPECK)
-        chosen &= (wide <= MOST_LONG / 2 * high) & (high <= MOST_LONG / 2 * wide)
+        chosen = (areas >= MIN_SPECK) & (areas <= LARGEST_SPECK)
+        chosen &= (wide <= MAX_ASPECT_RATIO / 2 * high) & (high <= MAX_ASPECT_RATIO / 2 * wide)
         chosen[0] = False
         return self._some(np.flatnonzero(chosen))
 
@@ -97,14 +96,14 @@ def dark_pieces(image: NDArray[np.uint8], around: int) -> Pieces:
     smooth = cv2.blur(image, (3, 3))
     side = max(3, around | 1)
     dark = cv2.adaptiveThreshold(
-        smooth, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, side, LEAST_STEP
+        smooth, 1, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, side, MIN_CONTRAST
     )
     _, labels, boxes, middles = cv2.connectedComponentsWithStats(dark, connectivity=4)
     return Pieces(dark, labels, boxes, middles)
 
 
 def _filled(all_: Pieces, number: NDArray[np.int32], pieces: Spots) -> NDArray[np.bool_]:
-    """Return whether each piece fills an ellipse that is not too long.
+    """Return True for each piece that fills an ellipse which is not too long.
 
     ``number`` says which of the ``pieces`` each of all pieces is; -1: none.
     """
@@ -122,7 +121,7 @@ def _filled(all_: Pieces, number: NDArray[np.int32], pieces: Spots) -> NDArray[n
     spread = np.sqrt(np.maximum(xx * yy - xy * xy, 0))
     mean = (xx + yy) / 2
     longest = mean + np.sqrt(np.maximum(mean * mean - spread * spread, 0))
-    filled: NDArray[np.bool_] = (pieces.areas >= LEAST_FILLED * 4 * np.pi * spread) & (
-        longest <= MOST_LONG * spread
+    filled: NDArray[np.bool_] = (pieces.areas >= MIN_ELLIPSE_SHARE * 4 * np.pi * spread) & (
+        longest <= MAX_ASPECT_RATIO * spread
     )
     return filled

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.dots import GridMap
 from smartcam.calibration._detection.grid_growing import lattices
 from smartcam.calibration._detection.image import reduced
 from smartcam.calibration._detection.saddles import find_saddles
-from smartcam.calibration._geometry.homography import local_steps
+from smartcam.calibration._homography import local_steps
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._detection.grid_growing import Lattice
     from smartcam.calibration._detection.image import GreyImage
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 USUAL_SIDE = 800
 """Longest side, pixels, of the image that is looked at in half of this size first, then in this,
@@ -37,28 +38,41 @@ NEIGHBOURS = 8
 """Saddles around one among which a board's next ones are: four and what else is near."""
 
 PART = 0.45
-"""Of a square around a corner that is fitted: its own edges, not the next ones and their blur."""
+"""Edges at a corner are fitted along this part of a square's side, short of the next edges."""
 
-LEAST_FITTED = 0.6
-"""Of the corners whose fit is good and whose colours are in turn; what is no board has fewer."""
+MIN_FITTED_SHARE = 0.6
+"""A board has at least this part of its tried corners fitted well, with colours in turn."""
 
-LEAST_FILLED = 0.5
-"""Of an outermost row or column, which is left out with fewer corners."""
+MIN_FILLED_SHARE = 0.5
+"""An outermost row or column is left out where fewer than this part of its corners are seen."""
 
 ASIDE = 0.25
-"""Of a step, from where a corner should be to where it is at most."""
+"""A fitted corner may lie off its expected place by this part of a step to the next corner."""
 
-LEAST_AREA = 9.0
-"""Of a square that is fitted, pixels^2."""
+MIN_SQUARE_PIXELS = 9.0
+"""A corner is fitted only where a square has a larger area than this in the image, pixels^2."""
 
-MOST_REACH = 8.0
+MAX_REACH = 8.0
 """Pixels from a corner that are fitted at most: enough to see whether there is one."""
 
-MOST_FITTED = 24
+MAX_CORNERS_JUDGED = 24
 """Corners of a part of a board by which is judged whether it is one."""
 
-MOST_ROUNDS = 4
-"""In which a board is completed."""
+WITHIN_SQUARES = np.array(
+    [
+        (side * x, up * y)
+        for side, up in ((1, 1), (-1, -1), (1, -1), (-1, 1))
+        for x, y in itertools.product((0.2, 0.35), repeat=2)
+    ]
+)
+"""(16, 2), places in the four squares beside a corner, in parts of the ways to the next ones: those
+of two squares that lie opposite each other, then of the other two."""
+
+SAME_BOARD_PX = 3.0
+"""Median distance of a board's corners as two sizes of an image show them, at most, pixels."""
+
+MAX_ROUNDS = 4
+"""A board is completed in at most this many rounds."""
 
 
 class Board(NamedTuple):
@@ -66,6 +80,7 @@ class Board(NamedTuple):
 
     points: Array  # (N, 2), pixels
     places: NDArray[np.intp]  # (N, 2), column and row, counted from anywhere in any direction
+    again: bool = False  # whether the image has another board of as many columns and rows
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -77,7 +92,7 @@ class Board(NamedTuple):
 
     @property
     def is_full(self) -> bool:
-        """Whether no corner is missing."""
+        """True if no corner is missing."""
         columns, rows = self.shape
         return len(self.places) == columns * rows
 
@@ -88,15 +103,29 @@ class Board(NamedTuple):
         row, column = (1, 0) if self.shape == (columns, rows) else (0, 1)
         return self.points[np.lexsort((self.places[:, column], self.places[:, row]))]
 
+    def shows(self, other: Board) -> bool:
+        """Return True if this board has most of the corners of another one."""
+        tree = load("scipy.spatial").cKDTree(self.points)
+        return bool(np.median(tree.query(other.points)[0]) < SAME_BOARD_PX)
+
+    def filled(self) -> Board:
+        """Return the board with missing corners put where the others say that they are."""
+        low, high = self.places.min(axis=0), self.places.max(axis=0)
+        missing = _missing(self, low, high)
+        points = GridMap(self.places.astype(np.float64), self.points)(missing.astype(np.float64))
+        return Board(np.concatenate([self.points, points]), np.concatenate([self.places, missing]))
+
     def trimmed(self) -> Board:
-        """Return it without outermost rows and columns that have few corners."""
+        """Return the board without outermost rows and columns that have few corners."""
         places = self.places
         for axis, end in itertools.product((0, 1), (np.min, np.max)):
             if not len(places):
                 break
             outermost = places[:, axis] == end(places[:, axis])
-            if outermost.sum() < LEAST_FILLED * self.shape[1 - axis]:
-                return Board(self.points[~outermost], places[~outermost]).trimmed()
+            if outermost.sum() < MIN_FILLED_SHARE * self.shape[1 - axis]:
+                return self._replace(
+                    points=self.points[~outermost], places=places[~outermost]
+                ).trimmed()
         return self
 
 
@@ -114,38 +143,48 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
     for times in dict.fromkeys((2 * least, least, (least + 1) // 2)):
         seen = find_saddles(reduced(image.bytes, times))
         largest: Lattice = {}
-        for found in lattices(seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS):
+        grids = lattices(seen.points, seen.alike, least=4, most=most, neighbours=NEIGHBOURS)
+        for found in grids:
             largest = max(largest, found, key=len)
             if len(largest) >= count:
                 break
         if largest:
+            again = any(_shape(one) == _shape(largest) for one in grids)
             points = (seen.points[list(largest.values())] + 0.5) * times - 0.5
-            yield Board(points, np.array(list(largest), dtype=np.intp)).trimmed()
+            yield Board(points, np.array(list(largest), dtype=np.intp), again).trimmed()
+
+
+def _shape(grid: Lattice) -> list[int]:
+    """Return the counts of a grid's columns and rows, the smaller first, and of its corners."""
+    return [*sorted(np.ptp(np.array(list(grid)), axis=0).tolist()), len(grid)]
 
 
 def completed(image: GreyImage, board: Board) -> Board | None:
     """Return a board with the corners that were missed; None where fits show none."""
-    some = board.places[:: math.ceil(len(board.places) / MOST_FITTED)]
+    some = board.places[:: math.ceil(len(board.places) / MAX_CORNERS_JUDGED)]
     _, signs = _fitted(image, board, some)
     sign = float(parity(some) @ signs)
-    if abs(sign) < LEAST_FITTED * len(some):
+    if abs(sign) < MIN_FITTED_SHARE * len(some):
         return None
-    for _ in range(MOST_ROUNDS):
-        missing = _missing(board)
+    near = board.places
+    for _ in range(MAX_ROUNDS):
+        missing = _missing(board, board.places.min(axis=0) - 1, board.places.max(axis=0) + 1)
+        # what was no corner is one only where a corner beside it has said better where it is
+        beside = np.abs(missing[:, None] - near).max(axis=2).min(axis=1, initial=2) <= 1
+        missing = missing[beside]
         points, signs = _fitted(image, board, missing)
         right = parity(missing) * signs * sign > 0
         if not right.any():
             break
+        near = missing[right]
         board = Board(
-            np.concatenate([board.points, points[right]]),
-            np.concatenate([board.places, missing[right]]),
+            np.concatenate([board.points, points[right]]), np.concatenate([board.places, near])
         ).trimmed()
     return board
 
 
-def _missing(board: Board) -> NDArray[np.intp]:
-    """Return the places (N, 2) where no corner was found, those next to the board among them."""
-    low, high = board.places.min(axis=0) - 1, board.places.max(axis=0) + 1
+def _missing(board: Board, low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the places (N, 2) from ``low`` to ``high`` where no corner was found."""
     every = itertools.product(*(range(a, b + 1) for a, b in zip(low, high, strict=True)))
     there = set(map(tuple, board.places.tolist()))
     missing = [place for place in every if place not in there]
@@ -162,10 +201,11 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
     points, ways = mapped(at), local_steps(mapped, at, 1.0)
     signs = np.zeros(len(places))
     inside = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
-    inside &= np.abs(np.linalg.det(ways)) > LEAST_AREA
+    inside &= np.abs(np.linalg.det(ways)) > MIN_SQUARE_PIXELS
+    inside[inside] = like_corners(image, points[inside], ways[inside])
     if inside.any():
         lengths = np.linalg.norm(ways[inside], axis=2)
-        part = np.minimum(PART, MOST_REACH / lengths.max(axis=1))[:, None, None]
+        part = np.minimum(PART, MAX_REACH / lengths.max(axis=1))[:, None, None]
         corners = refine_corners(image, points[inside], part * ways[inside])
         aside = np.linalg.norm(corners.points - points[inside], axis=1)
         step = lengths.min(axis=1)
@@ -173,3 +213,20 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
         points[inside] = corners.points
         signs[inside] = np.sign(corners.gains) * good
     return points, signs
+
+
+def like_corners(image: GreyImage, points: Array, ways: Array) -> NDArray[np.bool_]:
+    """Return True for each point (N, 2) beside which two opposite squares are darker than the rest.
+
+    The test tells most places that are no corners, for a small part of what a fit takes. ``ways``
+    (N, 2, 2) lead to the next corners, pixels.
+    """
+    if not len(points):
+        return np.zeros(0, dtype=np.bool_)
+    cv2 = load("cv2")
+    at = points[:, None] + np.einsum("pk,nki->npi", WITHIN_SQUARES, ways)
+    levels = cv2.remap(
+        image.levels, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    one, other = levels.reshape(len(points), 2, 2, -1).mean(axis=3).transpose(1, 0, 2)
+    return np.asarray((one.max(axis=1) < other.min(axis=1)) | (other.max(axis=1) < one.min(axis=1)))

@@ -8,22 +8,30 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
 from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography, local_steps
-from smartcam.calibration._optional_imports import load
+from smartcam.calibration._detection.markers import (
+    Markers,
+    agreeing,
+    check_one_board,
+    marker_dictionary,
+    seen_from_nearest,
+    strays_told,
+)
+from smartcam.calibration._homography import apply_homography, fit_homography, local_steps
 from smartcam.calibration._views import TargetView
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import Charuco
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry._inside import Array
 
 FEWEST = 4
 """Corners that fix a pose at least."""
@@ -31,44 +39,37 @@ FEWEST = 4
 LARGEST_DOUBLED = 2600
 """Longest side, pixels, of an image that is looked at in double size, too, for small markers."""
 
-LEAST_IN_ROWS = 5
+MIN_QUADRANGLES = 5
 """Dark quadrangles in rows and columns that may be a board's markers, at least."""
 
-LEAST_READ, MOST_UNREAD = 0.6, 2.5
+MIN_MODULE_PIXELS, MAX_UNREAD_MODULE_PIXELS = 0.6, 2.5
 """Pixels of a module of a marker: with fewer it is not read in double size, either; with more there
 is none, where none was read."""
 
+MAX_SQUARES_OFF = 0.3
+"""Sides of a square by which a corner may lie off where the nearest markers see it."""
+
 PART = 0.45
-"""Of a square around a corner that is fitted."""
+"""The edges at a corner are fitted along this part of a square's side."""
 
 
-def charuco_board(target: Charuco) -> Any:
-    """Return OpenCV's board; SHAPE: no such dictionary, or too few markers in it."""
+def charuco_board(target: Charuco, *, legacy_pattern: bool | None = None) -> Any:
+    """Return OpenCV's board; SHAPE: no such dictionary, or too few markers in it.
+
+    ``legacy_pattern``: None for the target's.
+    """
     cv2 = load("cv2")
-    number = getattr(cv2.aruco, target.dictionary, None)
-    if not (target.dictionary.startswith("DICT_") and isinstance(number, int)):
-        raise CalibrationError(
-            "charuco: expected the name of one of OpenCV's dictionaries such as DICT_5X5_250, "
-            f"got {target.dictionary!r}",
-            code=Code.SHAPE,
-            expected="DICT_5X5_250",
-            got=target.dictionary,
-        )
-    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    needed = target.columns * target.rows // 2
+    dictionary = marker_dictionary(target.dictionary, needed, _name(target))
     board = cv2.aruco.CharucoBoard(
         (target.columns, target.rows), target.square, target.marker, dictionary
     )
-    board.setLegacyPattern(target.legacy_pattern)
-    needed, there = len(board.getIds()), len(dictionary.bytesList)
-    if needed > there:
-        raise CalibrationError(
-            f"charuco of {target.columns} x {target.rows} squares: expected at least {needed} "
-            f"markers in {target.dictionary}, got {there}",
-            code=Code.SHAPE,
-            expected=needed,
-            got=there,
-        )
+    board.setLegacyPattern(target.legacy_pattern if legacy_pattern is None else legacy_pattern)
     return board
+
+
+def _name(target: Charuco) -> str:
+    return f"charuco of {target.columns} x {target.rows} squares"
 
 
 def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetView:
@@ -76,7 +77,8 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
 
     Raises TARGET_NOT_FOUND, MIRRORED, or SHAPE: no such dictionary.
     """
-    ids, found = _numbered(image, target)
+    sighting = _numbered(image, target)
+    ids, found = sighting.ids, sighting.points
     flat = target.points[ids, :2]
     matrix = fit_homography(flat, found)
     if matrix is None:
@@ -96,33 +98,48 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
         points=corners.points[seen],
         covariance=corners.covariance[seen],
         name=name,
+        warnings=strays_told(sighting.strays),
     )
 
 
-def _numbered(image: GreyImage, target: Charuco) -> tuple[NDArray[np.intp], Array]:
-    """Return numbers (N,), ascending, and corners (N, 2).
+def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
+    """Return the sighting of a board, with at least four corners.
 
     Where few are found beside what may be markers, the mirror image is looked at as well: a
-    marker's mirror image can be another one of its dictionary, and such neighbours give corners
-    with wrong numbers.
+    marker's mirror image can be another one of its dictionary.
     """
     seen = _detect(image, target)
     count = len(seen.ids)
+    if seen.otherwise >= max(FEWEST, seen.agreeing + 1):
+        raise _other_pattern(target, seen)
+    check_one_board(seen.agreeing, seen.contrary, _name(target))
     if 2 * count > max(len(target.points), 4 * FEWEST):
-        return seen.ids, seen.points
+        return seen
     if seen.side and len(_detect(_flipped(image), target).ids) >= max(FEWEST, 2 * count):
-        raise CalibrationError(
-            f"charuco of {target.columns} x {target.rows} squares: expected an image of the sheet "
+        raise Code.MIRRORED.refusal(
+            f"{_name(target)}: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
-            code=Code.MIRRORED,
-            expected="the sheet as one reads it",
-            got="its mirror image",
+            "the sheet as one reads it",
+            "its mirror image",
         )
     if count < FEWEST:
-        doubt = seen.markers and not count and target.rows % 2 == 0
-        legacy = ": is its legacy_pattern right?" if doubt else ""
-        raise _not_found(target, f"beside {seen.markers} of its markers{legacy}", count)
-    return seen.ids, seen.points
+        read = f"beside {seen.markers} markers of its dictionary"
+        if seen.markers:
+            read += f", of which {seen.agreeing} stand to each other as on such a board"
+        raise _not_found(target, read, count)
+    return seen
+
+
+def _other_pattern(target: Charuco, seen: _Sighting) -> CalibrationError:
+    """Return an error of a board whose markers stand as on the other pattern's."""
+    said, other = target.legacy_pattern, not target.legacy_pattern
+    return Code.WRONG_TARGET.refusal(
+        f"{_name(target)}: expected markers as "
+        f"legacy_pattern={said} has them, of which {seen.agreeing} stand to each other as on "
+        f"that board; got {seen.otherwise} that stand as legacy_pattern={other} has them",
+        f"legacy_pattern={said}",
+        f"legacy_pattern={other}",
+    )
 
 
 def _flipped(image: GreyImage) -> GreyImage:
@@ -132,11 +149,15 @@ def _flipped(image: GreyImage) -> GreyImage:
 
 
 class _Sighting(NamedTuple):
-    """What was found of a board."""
+    """The markers and corners that were found of one board."""
 
     ids: NDArray[np.intp]  # (N,), ascending
     points: Array  # (N, 2), pixels
     markers: int  # how many were read
+    agreeing: int  # how many of these stand to each other as on the board
+    contrary: int  # how many stand so to each other, but not to these
+    otherwise: int  # the same as on the board of the other legacy_pattern
+    strays: tuple[int, ...]  # the numbers of those that were left out
     # of what may be markers, pixels of the given image: of those that were read, or of quadrangles
     # in rows and columns; 0: there are none
     side: float
@@ -148,7 +169,7 @@ def _detect(image: GreyImage, target: Charuco) -> _Sighting:
     The next one is looked at where the one before does not show enough; the last one only where
     there may be markers that are too small to be read.
     """
-    best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0.0)
+    best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
     times = math.ceil(max(image.size) / USUAL_SIZE)
     if times > 1:
         best = _look(reduced(image.bytes, times), 1 / times, target, best)
@@ -156,13 +177,15 @@ def _detect(image: GreyImage, target: Charuco) -> _Sighting:
             return best
     best = _look(image.bytes, 1.0, target, best)
     few = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
-    if few and (best.markers or 0 < best.side < MOST_UNREAD * _modules(charuco_board(target))):
+    if few and (
+        best.markers or 0 < best.side < MAX_UNREAD_MODULE_PIXELS * _modules(charuco_board(target))
+    ):
         best = _look(scaled(image.bytes, 2.0), 2.0, target, best)
     return best
 
 
 def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
-    """Return whether all corners were found that should be in the image."""
+    """Return True if all corners were found that should be in the image."""
     if len(seen.ids) < FEWEST:
         return False
     matrix = fit_homography(target.points[seen.ids, :2], seen.points)
@@ -174,33 +197,80 @@ def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
 
 
 def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sighting) -> _Sighting:
-    """Return what an image shows that is ``scale`` times as large, or the best before it."""
+    """Return the sighting in an image ``scale`` times as large, or the best one before it."""
     cv2 = load("cv2")
     board = charuco_board(target)
-    given = cv2.aruco.CharucoParameters()
-    given.minMarkers = 1
     finder = cv2.aruco.ArucoDetector(board.getDictionary())
     quads, numbers, others = finder.detectMarkers(bytes_)
     side = _side(quads) if numbers is not None else _side_in_rows(others, board)
     best = best._replace(side=max(best.side, side / scale))
     if numbers is None:
         return best
-    quads, numbers, _, _ = finder.refineDetectedMarkers(bytes_, board, quads, numbers, others)
-    detector = cv2.aruco.CharucoDetector(board, given)
-    corners, found, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
-    markers = max(best.markers, len(numbers))
-    if found is None or len(found) <= len(best.ids):
-        return best._replace(markers=markers)
+    flat = _map(board)
+    read = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), numbers.ravel())
+    good, contrary = agreeing(read, flat)
+    strays = tuple(sorted(read.ids[~good].tolist()))
+    otherwise = 0
+    if target.rows % 2 == 0:
+        turned = charuco_board(target, legacy_pattern=not target.legacy_pattern)
+        otherwise = int(agreeing(read, _map(turned)).good.sum())
+    best = best._replace(
+        markers=max(best.markers, len(good)),
+        agreeing=max(best.agreeing, int(good.sum())),
+        contrary=max(best.contrary, contrary),
+        otherwise=max(best.otherwise, otherwise),
+    )
+    if not good.any():
+        return best
+    kept = [quad for quad, fits in zip(quads, good, strict=True) if fits]
+    quads, numbers, *_ = finder.refineDetectedMarkers(bytes_, board, kept, numbers[good], others)
+    read = Markers(np.array(quads, dtype=np.float64).reshape(-1, 4, 2), numbers.ravel())
+    ids, corners = _between(bytes_, board, read.some(agreeing(read, flat).good))
+    if len(ids) <= len(best.ids):
+        return best
     # OpenCV counts rows from the top
-    row, column = np.divmod(np.array(found, dtype=np.intp).ravel(), target.columns - 1)
+    row, column = np.divmod(ids, target.columns - 1)
     ids = (target.rows - 2 - row) * (target.columns - 1) + column
-    points = (np.array(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5
     order = np.argsort(ids)
-    return _Sighting(ids[order], points[order], markers, best.side)
+    points = (corners + 0.5) / scale - 0.5
+    return best._replace(ids=ids[order], points=points[order], strays=strays)
+
+
+def _map(board: Any) -> Array:
+    """Return (M, 4, 2): the corners of a board's markers by their numbers."""
+    return np.asarray(board.getObjPoints(), dtype=np.float64)[:, :, :2]
+
+
+def _between(
+    bytes_: NDArray[np.uint8], board: Any, markers: Markers
+) -> tuple[NDArray[np.intp], Array]:
+    """Return the numbers, as OpenCV has them, and places (N, 2) of corners beside markers.
+
+    Those that are not where their markers see them are left out.
+    """
+    cv2 = load("cv2")
+    given = cv2.aruco.CharucoParameters()
+    given.minMarkers = 1
+    if hasattr(given, "checkMarkers"):  # OpenCV 4.11 and later
+        given.checkMarkers = False  # they agree
+    detector = cv2.aruco.CharucoDetector(board, given)
+    quads = [quad[None].astype(np.float32) for quad in markers.quads]
+    numbers = markers.ids.astype(np.int32)[:, None]
+    corners, found, *_ = detector.detectBoard(bytes_, markerCorners=quads, markerIds=numbers)
+    if found is None or not len(found):
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    ids = np.asarray(found, dtype=np.intp).ravel()
+    points = np.array(corners, dtype=np.float64).reshape(-1, 2)
+    at = np.asarray(board.getChessboardCorners(), dtype=np.float64)[ids, :2]
+    flat = _map(board)[markers.ids]
+    seen, step = seen_from_nearest(markers.quads, flat, at)
+    square = float(board.getSquareLength())
+    right = np.linalg.norm(points - seen, axis=1) < MAX_SQUARES_OFF * square * step
+    return ids[right], points[right]
 
 
 def _modules(board: Any) -> int:
-    """Return how many squares a side of a marker has, its black rim among them."""
+    """Return the count of squares along a marker's side, its black rim included."""
     return int(board.getDictionary().markerSize) + 2
 
 
@@ -220,21 +290,20 @@ def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
 
     0: there are none, or too small ones for a marker that can be read.
     """
-    if len(quads) < LEAST_IN_ROWS:
+    if len(quads) < MIN_QUADRANGLES:
         return 0.0
     areas = _areas(quads)
     middles = np.array(quads, dtype=np.float64).reshape(-1, 4, 2).mean(axis=1)
     most = len(board.getIds())
-    found = lattices(middles, alike_areas(areas), least=LEAST_IN_ROWS, most=most)
+    found = lattices(middles, alike_areas(areas), least=MIN_QUADRANGLES, most=most)
     sides = [_side([quads[one] for one in grid.values()]) for grid in found]
-    return max((side for side in sides if side > LEAST_READ * _modules(board)), default=0.0)
+    return max((side for side in sides if side > MIN_MODULE_PIXELS * _modules(board)), default=0.0)
 
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:
-    return CalibrationError(
+    return Code.TARGET_NOT_FOUND.refusal(
         f"charuco: expected at least {FEWEST} corners of a board of {target.columns} x "
         f"{target.rows} squares, found {count} {how}",
-        code=Code.TARGET_NOT_FOUND,
-        expected=FEWEST,
-        got=count,
+        FEWEST,
+        count,
     )

@@ -3,36 +3,47 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._detection.boards import LEAST_FITTED, PART, boards, completed, parity
-from smartcam.calibration._detection.corners import refine_corners
+from smartcam.calibration._detection.boards import (
+    MIN_FITTED_SHARE,
+    PART,
+    boards,
+    completed,
+    like_corners,
+    parity,
+)
+from smartcam.calibration._detection.corners import UNREFINED, Corners, refine_corners
 from smartcam.calibration._detection.dots import GridMap
-from smartcam.calibration._detection.image import USUAL_SIZE, scaled
-from smartcam.calibration._detection.ordering import arrangements, leftmost, marked, rows_of
+from smartcam.calibration._detection.ordering import (
+    MIN_ORIGIN_CONTRAST,
+    arrangements,
+    leftmost,
+    marked,
+    rows_of,
+)
 from smartcam.calibration._detection.sampling import mean_level
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._targets import AREA_DIAMETER
+from smartcam.calibration._homography import apply_homography, fit_homography
+from smartcam.calibration._targets import AREA_DIAMETER, AREA_DISTANCE
 from smartcam.calibration._views import TargetView
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._detection.corners import Corners
+    from smartcam.calibration._detection.boards import Board
     from smartcam.calibration._detection.image import GreyImage
     from smartcam.calibration._detection.ordering import Arrangement
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import Checkerboard
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry._inside import Array
 
-LEAST_SEEN = 10
+MIN_CORNERS_CONNECTED = 10
 """Corners that hang together in what may be a part of a board: pictures of leaves, bricks and noise
 have up to nine."""
 
@@ -41,7 +52,12 @@ STRAY = 0.5
 median of that."""
 
 AREA_PART = 0.8
-"""Of the area outside of a corner that is looked at: not its rim."""
+"""The area outside of a corner is looked at within this part of its diameter, not at its rim."""
+
+RING = 0.3
+"""Sides of a square from the middle of the dot at the origin to the paper around it."""
+
+RING_ANGLES = np.arange(8) * np.pi / 4
 
 SQUARES = np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5], [1.5, 1.5]])
 """Middles of the four squares next to an outer corner, in sides of one."""
@@ -57,79 +73,120 @@ def find_checkerboard(image: GreyImage, target: Checkerboard, name: str = "") ->
     """
     seen = _Search()
     for found in _candidates(image, target, seen):
-        corners = refine_corners(image, found, PART * _steps(found, target))
-        if _looks_right(corners, target):
-            corners = _without_strays(image, corners, target)
-            break
+        part = found.part
+        corners = _refined(image, found, _steps(found.points, part))
+        if not _looks_right(corners, part):
+            continue
+        corners = _without_strays(image, corners, found.seen, part)
+        ways = arrangements(corners.points, rows_of(part.columns, part.rows), part)
+        if part == target:
+            way, margin = _number(image, target, corners, ways)
+        else:
+            numbered = _number_part(image, part, corners, ways)
+            if numbered is None:
+                continue
+            way, margin = numbered
+        break
     else:
         raise _not_found(target, seen)
-    ways = arrangements(corners.points, rows_of(target.columns, target.rows), target)
-    way, margin = _number(image, target, corners, ways)
     order = way.order.ravel()
+    shown = np.flatnonzero((found.seen | corners.fitted)[order])
+    row, column = np.divmod(shown, part.columns)
+    order = order[shown]
     return TargetView(
         target=target,
         size=image.size,
-        ids=np.arange(len(order), dtype=np.intp),
+        ids=row * target.columns + column,
         points=corners.points[order],
         covariance=corners.covariance[order],
         margin=margin,
         name=name,
+        warnings=(_ANOTHER,) if found.again else (),
     )
+
+
+_ANOTHER: Final = Code.WRONG_TARGET.remark(
+    "expected one such board in the picture, got several: which one is meant is not told; cover "
+    "the others, or use ChArUco boards of other markers"
+)
 
 
 @dataclass
 class _Search:
-    """What a search came by, for its error."""
+    """The findings of a search, kept for the text of its error."""
 
     shape: tuple[int, int] | None = None  # columns and rows of the largest board
 
 
-def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterator[Array]:
-    """Yield corners row by row, as we and then OpenCV's detectors see them.
+class _BoardCorners(NamedTuple):
+    """Corners of a board, row by row."""
 
-    The latter take much longer and are asked only where a part of such a board is seen.
+    points: Array  # (N, 2), pixels
+    seen: NDArray[np.bool_]  # (N,), whether a corner was seen there; else the others say the place
+    part: Checkerboard  # the target, or as many of its columns and rows as are seen
+    again: bool = False  # whether the image has another one that is whole
+
+
+def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterator[_BoardCorners]:
+    """Yield corners row by row, of boards that are seen as a whole, and then of those that are not.
+
+    Of the latter, the corners that were not found are where the others say that they are.
     """
     count = target.columns * target.rows
-    parts = []
+    looked_at: list[Board] = []
     for board in boards(image, count, most=(target.columns + 2) * (target.rows + 2)):
         found = board.by_rows(target.columns, target.rows)
         if found is not None:
-            yield found
-        if min(board.shape) >= 3 and len(board.places) >= min(LEAST_SEEN, LEAST_FITTED * count):
-            parts.append(board)
-    for board in sorted(parts, key=lambda part: -len(part.places)):
+            yield _BoardCorners(found, np.ones(count, dtype=np.bool_), target, board.again)
+        small = min(board.shape) < 3 or len(board.places) < min(
+            MIN_CORNERS_CONNECTED, MIN_FITTED_SHARE * count
+        )
+        if small or any(one.shows(board) for one in looked_at):
+            continue
         whole = completed(image, board)
         if whole is None:
             continue
-        found = whole.by_rows(target.columns, target.rows)
-        if found is not None:
-            yield found
+        looked_at.append(whole)
         if seen.shape is None or math.prod(whole.shape) > math.prod(seen.shape):
             seen.shape = whole.shape
-        if found is None and whole.is_full:
+        filled = whole.filled()
+        for part in _parts(target, whole.shape):
+            found = filled.by_rows(part.columns, part.rows)
+            if found is not None and len(whole.places) >= MIN_FITTED_SHARE * len(found):
+                there = np.asarray(np.isin(found, whole.points).all(axis=1))
+                yield _BoardCorners(found, there, part)
+        if whole.is_full and len(whole.places) >= MIN_FITTED_SHARE * count:
             return
-    if seen.shape is not None:
-        yield from _opencvs(image, target)
 
 
-def _opencvs(image: GreyImage, target: Checkerboard) -> Iterator[Array]:
-    """Yield corners row by row, as one of OpenCV's detectors after the other sees them."""
-    cv2: Any = load("cv2")
-    pattern = (target.columns, target.rows)
-    classic = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-    sector = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-    usual = min(1.0, USUAL_SIZE / max(image.size))
-    attempts = [
-        (usual, cv2.findChessboardCorners, classic),
-        (usual, cv2.findChessboardCornersSB, sector),
-        (usual / 2, cv2.findChessboardCorners, classic),
-        (2 * usual, cv2.findChessboardCornersSB, sector),
-    ]
-    for scale, find, flags in attempts:
-        ok, corners = find(scaled(image.bytes, scale), pattern, flags=flags)
-        if ok and len(corners) == target.columns * target.rows:
-            found: Array = np.array(corners, dtype=np.float64).reshape(-1, 2)
-            yield (found + 0.5) / scale - 0.5
+def _parts(target: Checkerboard, shape: tuple[int, int]) -> Iterator[Checkerboard]:
+    """Yield the target where it has a shape, or what its mark may tell of it that has."""
+    for columns, rows in dict.fromkeys((shape, shape[::-1])):
+        if (columns, rows) == (target.columns, target.rows):
+            yield target
+        elif target.origin_mark and columns <= target.columns and rows <= target.rows:
+            yield replace(target, columns=columns, rows=rows)
+
+
+def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
+    """Return corners refined; a place that shows none stays where it is, not fitted.
+
+    ``steps`` (N, 2, 2) lead to the next corners, pixels.
+    """
+    points, some = found.points, found.seen.copy()
+    inside = ((points >= 0) & (points <= np.array(image.size) - 1)).all(axis=1)
+    doubted = inside & ~some
+    some[doubted] = like_corners(image, points[doubted], steps[doubted])
+    some &= inside
+    if some.all():
+        return refine_corners(image, points, PART * steps)
+    covariance = np.tile(UNREFINED**2 * np.eye(2), (len(points), 1, 1))
+    corners = Corners(points.copy(), covariance, np.zeros(len(points)), np.zeros_like(some))
+    if some.any():
+        found_there = refine_corners(image, points[some], PART * steps[some])
+        for mine, other in zip(corners, found_there, strict=True):
+            mine[some] = other
+    return corners
 
 
 def _steps(points: Array, target: Checkerboard) -> Array:
@@ -139,24 +196,30 @@ def _steps(points: Array, target: Checkerboard) -> Array:
     return steps.reshape(-1, 2, 2)
 
 
-def _without_strays(image: GreyImage, corners: Corners, target: Checkerboard) -> Corners:
+def _without_strays(
+    image: GreyImage, corners: Corners, seen: NDArray[np.bool_], target: Checkerboard
+) -> Corners:
     """Return corners of which those that could not be fitted, or lie apart, are looked for again.
 
-    They start from where the others say that they are; what cannot be fitted there, either, has a
-    covariance as large as the way.
+    They start from where the others say that they are; what cannot be fitted there, or lies
+    apart again, has a covariance as large as the way.
     """
     flat = rows_of(target.columns, target.rows).astype(np.float64)
     good = corners.fitted
     expected = GridMap(flat[good], corners.points[good])(flat)
     apart = np.linalg.norm(corners.points - expected, axis=1)
-    stray = ~good | (apart > STRAY + 4 * np.median(apart[good]))
+    most = STRAY + 4 * float(np.median(apart[good]))
+    stray = ~good | (apart > most)
     if not stray.any():
         return corners
     expected = GridMap(flat[~stray], corners.points[~stray])(flat)
-    again = refine_corners(image, expected[stray], PART * _steps(expected, target)[stray])
+    again = _refined(
+        image, _BoardCorners(expected[stray], seen[stray], target), _steps(expected, target)[stray]
+    )
     back = np.linalg.norm(again.points - expected[stray], axis=1)
     covariance = again.covariance.copy()
-    covariance[~again.fitted] += back[~again.fitted, None, None] ** 2 * np.eye(2)
+    doubted = ~again.fitted | (back > most)
+    covariance[doubted] += back[doubted, None, None] ** 2 * np.eye(2)
     for mine, other in zip(corners, again._replace(covariance=covariance), strict=True):
         mine[stray] = other
     return corners
@@ -164,19 +227,18 @@ def _without_strays(image: GreyImage, corners: Corners, target: Checkerboard) ->
 
 def _looks_right(corners: Corners, target: Checkerboard) -> bool:
     colours = parity(rows_of(target.columns, target.rows)) * np.sign(corners.gains) * corners.fitted
-    return bool(abs(colours.mean()) >= LEAST_FITTED)
+    return bool(abs(colours.mean()) >= MIN_FITTED_SHARE)
 
 
 def _not_found(target: Checkerboard, seen: _Search) -> CalibrationError:
     """Return an error that says which board is seen instead, if there is one."""
     shape = seen.shape
     instead = "found none" if shape is None else f"found one of about {shape[0]} x {shape[1]}"
-    return CalibrationError(
+    return Code.TARGET_NOT_FOUND.refusal(
         f"checkerboard: expected a board of {target.columns} x {target.rows} inner corners that is "
         f"seen as a whole, {instead}",
-        code=Code.TARGET_NOT_FOUND,
-        expected=(target.columns, target.rows),
-        got=shape,
+        (target.columns, target.rows),
+        shape,
     )
 
 
@@ -210,14 +272,57 @@ def _white_origin(target: Checkerboard, what: str) -> CalibrationError:
     Of counts that are both odd and differ, two corners that lie opposite each other are black, and
     turning the sheet exchanges no black one with a white one.
     """
-    return CalibrationError(
+    return Code.MIRRORED.refusal(
         f"{what}: expected a black square outside of the corner at the origin, got a white one: "
         "an image that is mirrored, or a negative, or the board is one of "
         f"{target.rows} x {target.columns}",
-        code=Code.MIRRORED,
-        expected="a black square",
-        got="a white one",
+        "a black square",
+        "a white one",
     )
+
+
+def _number_part(
+    image: GreyImage, part: Checkerboard, corners: Corners, ways: list[Arrangement]
+) -> tuple[Arrangement, float] | None:
+    """Return the numbering of a part of a board whose mark is seen; None where no mark is seen.
+
+    Beside the dark dot at the origin the paper is light: around the dot, and along both of the
+    board's edges that meet there. So a place within the board or on something else is none.
+    """
+    found = []
+    for way in ways:
+        if not way.proper or _blackness(part, corners, way) <= 0:
+            continue
+        shades = _shades(image, part, corners, way)
+        light = min(_margin_levels(image, corners.points[way.order]), default=0.0)
+        middle = (shades.black + shades.white) / 2
+        if (
+            shades.area is not None
+            and light - shades.area >= MIN_ORIGIN_CONTRAST
+            and light > middle
+        ):
+            found.append((way, light - shades.area))
+    return found[0] if len(found) == 1 else None
+
+
+def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
+    """Yield the levels of the paper around the dot, and along the two edges beside it.
+
+    Places outside of the image have the level 0.
+    """
+    rows, columns, _ = grid.shape
+    low = -(1 + AREA_DISTANCE)
+    around = RING * np.column_stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)]) + low
+    along = (
+        [(at + 0.5, low) for at in range(columns - 1)],
+        [(low, at + 0.5) for at in range(rows - 1)],
+    )
+    flat = rows_of(columns, rows).astype(np.float64)
+    seen = GridMap(flat, grid.reshape(-1, 2))(np.concatenate([around, *along]))
+    last = np.array(image.size) - 1
+    for place in seen:
+        inside = bool(((place >= 0) & (place <= last)).all())
+        yield mean_level(image, place[None]) if inside else 0.0
 
 
 class _Shades(NamedTuple):

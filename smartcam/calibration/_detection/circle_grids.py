@@ -13,16 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.blobs import dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
 from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
 from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
 from smartcam.calibration._detection.sampling import mean_level
-from smartcam.calibration._geometry.homography import local_steps
+from smartcam.calibration._homography import local_steps
 from smartcam.calibration._views import TargetView
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -32,8 +31,9 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.blobs import Pieces, Spots
     from smartcam.calibration._detection.dots import Dots
     from smartcam.calibration._detection.ordering import Arrangement
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import CircleGrid
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry._inside import Array
 
 WIDE, NARROW = 1.0, 0.3
 """Side of the square that a pixel is compared with, in distances between dots of a grid that fills
@@ -42,21 +42,21 @@ the image."""
 SMALL_SIDE = 800
 """Longest side of the image in which a grid is looked for first, pixels."""
 
-LEAST_PART = 0.4
-"""Of the dots of a grid that stand in rows and columns among those of a few pixels, at least. So
-many of them are still told apart where all of them are in an image twice as large."""
+MIN_DOT_SHARE = 0.4
+"""At least this part of a grid's dots must stand in rows and columns among dots of a few pixels. So
+many are still told apart in an image that shows all of them once it is twice as large."""
 
 NEIGHBOURS = 8
-"""Of a dot of a few pixels, among which a grid's next ones are."""
+"""The next dots of a grid are looked for among this many dots around one of a few pixels."""
 
 MORE_SPOTS = 1000
-"""Beside twice the dots of the target: of an image with more, the largest are looked at."""
+"""Spots looked at beside twice the dots of the target: of an image with more, the largest."""
 
-LEAST_TOLD = 9
+MIN_DOTS_REPORTED = 9
 """Dots in rows and columns that an error tells of at least."""
 
-MOST_OFF = 0.15
-"""Of the distance between dots, by which one lies apart from where the others say it is."""
+MAX_OFFSET_RATIO = 0.15
+"""A dot may lie off the place that the others give it by this part of the distance between dots."""
 
 RING = np.column_stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)])
 """(16, 2), points of the unit circle."""
@@ -77,7 +77,7 @@ def find_circles(image: GreyImage, target: CircleGrid, name: str = "") -> Target
 
 @dataclass
 class _Counted:
-    """What a search came by, for its error."""
+    """The counts of a search, kept for the text of its error."""
 
     spots: int | None = None  # how many dark ones, in the first look at the image
     # dots in rows and columns at most; not counted on where there are more than those of the target
@@ -96,15 +96,12 @@ def _grids(
             found = (points + 0.5) / scale - 0.5
             ways = arrangements(found, places, target)
             if ways and _is_flat(target, found[ways[0].order.ravel()]):
-                yield _negative(image) if light else image, found, ways
-
-
-def _negative(image: GreyImage) -> GreyImage:
-    return GreyImage(255 - image.levels, 255 - image.bytes)
+                dark = GreyImage(255 - image.levels, 255 - image.bytes) if light else image
+                yield dark, found, ways
 
 
 def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool, float, Spots]]:
-    """Yield whether it is the negative of an image, its size in parts of the given one, and spots.
+    """Yield looks at an image: True for its negative, the size relative to the image, and spots.
 
     A large image is looked at in a small size first, and any one in double size where there may be
     dots of a few pixels.
@@ -129,13 +126,15 @@ def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool,
 
 
 def _pieces(image: NDArray[np.uint8], light: bool, part: float, target: CircleGrid) -> Pieces:
-    around = round(part * max(image.shape) / _longest(target))
+    # the longer side of the grid, distances between its dots
+    longest = max(target.columns, target.rows / 2 if target.asymmetric else target.rows)
+    around = round(part * max(image.shape) / longest)
     return dark_pieces(255 - image if light else image, around)
 
 
 def _may_be_dots(specks: Spots, target: CircleGrid) -> bool:
-    """Return whether a good part of a grid may be among dots of a few pixels."""
-    least = max(4, round(LEAST_PART * len(target.points)))
+    """Return True if a good part of a grid may be among dots of a few pixels."""
+    least = max(4, round(MIN_DOT_SHARE * len(target.points)))
     alike = alike_areas(specks.areas)
     return any(lattices(specks.points, alike, least=least, most=least, neighbours=NEIGHBOURS))
 
@@ -155,28 +154,23 @@ def _laid_out(
     def follows(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
         return like(one, other) | larger_like(one, other)
 
-    for grid in lattices(spots.points, like, follows=follows, least=LEAST_TOLD, most=count):
+    for grid in lattices(spots.points, like, follows=follows, least=MIN_DOTS_REPORTED, most=count):
         seen.largest = max(seen.largest, len(grid))
         if len(grid) == count:
             yield spots.points[list(grid.values())], np.array(list(grid), dtype=np.intp)
 
 
-def _longest(target: CircleGrid) -> float:
-    """Return the longer side of a grid, distances between its dots."""
-    return max(target.columns, target.rows / 2 if target.asymmetric else target.rows)
-
-
 def _is_flat(target: CircleGrid, points: Array) -> bool:
-    """Return whether dots are where a flat grid's are seen."""
+    """Return True if dots are where a flat grid shows them."""
     flat = target.points[:, :2]
     mapped = GridMap(flat, points)
     steps = np.linalg.norm(local_steps(mapped, flat, target.spacing), axis=2).min(axis=1)
     off = np.linalg.norm(mapped(flat) - points, axis=1)
-    return bool((off < MOST_OFF * steps).all())
+    return bool((off < MAX_OFFSET_RATIO * steps).all())
 
 
 def _is_whole(image: GreyImage, target: CircleGrid, points: Array) -> bool:
-    """Return whether no dots stand where the grid's rows and columns would go on.
+    """Return True if no dots stand where the grid's rows and columns would go on.
 
     A dot there is dark, and all around it is light; what is outside of the image is neither.
     """
@@ -300,9 +294,8 @@ def _not_found(target: CircleGrid, seen: _Counted) -> CalibrationError:
         what = f"saw {seen.spots} dark spots and no such grid among them"
         if seen.largest:
             what += f", at most {seen.largest} in rows and columns"
-    return CalibrationError(
+    return Code.TARGET_NOT_FOUND.refusal(
         f"circles: expected {target.columns} x {target.rows} dots, {what}",
-        code=Code.TARGET_NOT_FOUND,
-        expected=count,
-        got=seen.largest or seen.spots,
+        count,
+        seen.largest or seen.spots,
     )

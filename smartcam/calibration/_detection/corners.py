@@ -1,4 +1,4 @@
-r"""Where the corners of a checkerboard are.
+r"""Refine the corners of a checkerboard.
 
 Two edges cross at a corner. Behind a lens that blurs by a Gaussian of width ``s`` the grey levels
 around it are ``offset + gain * erf(d1 / s') * erf(d2 / s')``, where ``d`` is the distance from an
@@ -8,10 +8,12 @@ offset, are fitted to all pixels around a corner. The corner is where the edges 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.calibration._detection.levenberg import (
     BLUR,
     GAIN,
@@ -21,7 +23,6 @@ from smartcam.calibration._detection.levenberg import (
     refined,
 )
 from smartcam.calibration._detection.pixels import cut_windows, edge
-from smartcam.calibration._optional_imports import load
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,19 +30,23 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.image import GreyImage
     from smartcam.calibration._detection.levenberg import Fits
     from smartcam.calibration._detection.pixels import Windows
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
-MOST_REACH = 13
+MAX_REACH = 13
 """Pixels to each side of a window at most: more of the edges adds little and takes time."""
 
 WORST_RESIDUAL = 0.35
 """Rms of the residuals in parts of the gain at most; without an edge it is 1."""
 
-LEAST_SINE = 0.17
-"""Of the angle between the two edges: 10 degrees."""
+MIN_SINE = 0.17
+"""The two edges of a corner must cross at an angle whose sine is larger than this: 10 degrees."""
 
 UNREFINED = 0.25
 """Standard deviation of a corner that could not be refined, pixels: what detectors reach."""
+
+ROUNDED_PX = 2.0
+"""Pixels around the corner of a single square that are not fitted: there a blur rounds it, and
+where its angle is not right the levels are no product of two edges."""
 
 PLACES, ANGLES = slice(0, 4, 2), slice(1, 4, 2)
 
@@ -59,7 +64,12 @@ class Corners(NamedTuple):
 
 
 def refine_corners(
-    image: GreyImage, points: Array, ways: Array, clear: Array | None = None
+    image: GreyImage,
+    points: Array,
+    ways: Array,
+    clear: Array | None = None,
+    *,
+    single: bool = False,
 ) -> Corners:
     """Return corners to a fraction of a pixel, never worse than they were.
 
@@ -69,17 +79,23 @@ def refine_corners(
     ``points`` (N, 2) are found to a pixel or two. ``ways`` (N, 2, 2), pixels, lead along the two
     edges; to both sides they span the part of the corner's four squares that is looked at.
     ``clear`` (N, 2) is the part of ``ways`` from an edge within which nothing is printed on the
-    squares; None: all of it.
+    squares; None: all of it. ``single``: the corner of one square; it lies between the first way
+    and the second one's opposite, which stand counter-clockwise in the image's u and v.
     """
     reach = np.linalg.norm(ways, axis=2).min(axis=1)
     start = _start(image, points, reach if clear is None else reach * clear.min(axis=1))
-    windows = cut_windows(image, start, ways, MOST_REACH, round_=False, clear=clear)
+    windows = cut_windows(image, start, ways, MAX_REACH, round_=False, clear=clear)
+    if single:
+        windows = windows.without(start, ROUNDED_PX)
     guess = _guess(start - windows.middle, ways)
-    fits, good = refined(_evaluate, windows, guess, moving=(0, 2), worst=WORST_RESIDUAL)
+    evaluate = partial(_evaluate, alone=1.0 if single else 0.0)
+    fits, good = refined(evaluate, windows, guess, moving=(0, 2), worst=WORST_RESIDUAL)
     corners, covariance, crossing = _crossings(fits, windows)
     corners += windows.middle
     moved = np.linalg.norm(corners - start, axis=1)
     good &= crossing & (moved < np.clip(0.5 * reach, 0.75, 3.0))
+    if single:
+        good &= reach > 1.5 * ROUNDED_PX
     start[good] = corners[good]
     covariance[~good] = UNREFINED**2 * np.eye(2)
     return Corners(start, covariance, fits.values[:, GAIN], good)
@@ -106,7 +122,12 @@ def _guess(near: Array, ways: Array) -> Array:
     return values
 
 
-def _evaluate(windows: Windows, values: Array) -> Fits:
+def _evaluate(windows: Windows, values: Array, alone: float = 0.0) -> Fits:
+    """Return the fits of four squares, or with ``alone`` = 1 of a single one.
+
+    Its levels are ``offset + gain * ((1 + E1) * (1 + E2) / 2 - 1)``; those of four are the same
+    with 0 in place of the three ones, and without the half.
+    """
     x, y, weights = windows.x, windows.y, windows.weights
     narrow = values.astype(np.float32)
     blur, gain, offset = (narrow[:, [column]] for column in (BLUR, GAIN, OFFSET))
@@ -125,9 +146,11 @@ def _evaluate(windows: Windows, values: Array) -> Fits:
         shape, slope = edge(far[side])
         shapes.append(shape)
         slopes.append(slope)
-    first = slopes[0] * shapes[1] * weights
-    second = slopes[1] * shapes[0] * weights
-    product = shapes[0] * shapes[1] * weights
+    half = np.float32(1 - alone / 2)
+    one_side, other_side = (half * (np.float32(alone) + shape) * weights for shape in shapes)
+    first = slopes[0] * other_side
+    second = slopes[1] * one_side
+    product = (np.float32(alone) + shapes[0]) * other_side - np.float32(alone) * weights
     columns = (
         first,
         first * along[0],
@@ -148,7 +171,7 @@ def _crossings(fits: Fits, windows: Windows) -> tuple[Array, Array, NDArray[np.b
     # by da moves by da along its edge, so dN p is da times the way along it.
     places, angles = fits.values[:, PLACES], fits.values[:, ANGLES]
     normals = np.stack([np.cos(angles), np.sin(angles)], axis=2)
-    crossing = np.abs(np.linalg.det(normals)) > LEAST_SINE
+    crossing = np.abs(np.linalg.det(normals)) > MIN_SINE
     normals[~crossing] = np.eye(2)
     inverse = np.linalg.inv(normals)
     corners: Array = (inverse @ places[:, :, None])[:, :, 0]

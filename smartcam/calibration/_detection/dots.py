@@ -1,4 +1,4 @@
-"""Where the dots of a circle grid are.
+"""Refine the dots of a circle grid.
 
 A round dot is seen as an ellipse. Behind a lens that blurs by a Gaussian of width ``s`` the grey
 levels around its rim are ``offset + gain * erf(d / s')``, where ``d`` is the distance from the rim
@@ -25,16 +25,16 @@ from smartcam.calibration._detection.levenberg import (
     refined,
 )
 from smartcam.calibration._detection.pixels import cut_windows, edge
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography
+from smartcam.calibration._homography import apply_homography, fit_homography
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration._detection.levenberg import Fits
     from smartcam.calibration._detection.pixels import Windows
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
-MOST_REACH = 20
+MAX_REACH = 20
 """Pixels to each side of a dot's window at most; larger dots are looked at in a smaller image."""
 
 WORST_RESIDUAL = 0.5
@@ -45,7 +45,7 @@ UNREFINED = 0.5
 
 MIDDLE, SHAPE = slice(0, 2), slice(2, 5)
 
-LEAST_BENT = 20
+MIN_DOTS_FOR_LENS = 20
 """Dots from which on the bend of a lens is taken from the grid, too: ten values an axis."""
 
 # The points of a regular polygon with n corners at distance R are on average, squared,
@@ -68,7 +68,7 @@ class Dots(NamedTuple):
 
 
 class GridMap:
-    """How a flat grid is seen: a homography, and a cubic where a lens bends it.
+    """The map from a flat grid to pixels: a homography, and a cubic where a lens bends the grid.
 
     Args:
         flat: (N, 2), of the grid's dots, metres.
@@ -81,7 +81,7 @@ class GridMap:
         self._middle = flat.mean(axis=0)
         self._scale = np.abs(flat - self._middle).max()
         self._bend = np.zeros((10, 2))
-        if len(flat) >= LEAST_BENT and found is not None:
+        if len(flat) >= MIN_DOTS_FOR_LENS and found is not None:
             off = pixels - apply_homography(found, flat)
             self._bend[:] = np.linalg.lstsq(self._powers(flat), off, rcond=None)[0]
 
@@ -117,9 +117,9 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     to the rim along the sheet's x and y, ``reaches`` as far as nothing but the dot is seen; pixels.
     """
     longest = float(np.hypot(reaches[:, 0], reaches[:, 1]).max())
-    if longest > MOST_REACH:
-        return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MOST_REACH))
-    windows = cut_windows(image, points, reaches, MOST_REACH, round_=True)
+    if longest > MAX_REACH:
+        return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MAX_REACH))
+    windows = cut_windows(image, points, reaches, MAX_REACH, round_=True)
     near = points - windows.middle
     guess = _guess(near, radii)
     fits, good = refined(_evaluate, windows, guess, moving=(0, 1), worst=WORST_RESIDUAL)
@@ -139,7 +139,7 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
 def _refine_smaller(
     image: GreyImage, points: Array, radii: Array, reaches: Array, times: int
 ) -> Dots:
-    """Return the same of an image whose pixels are the means of ``times`` by ``times`` of them."""
+    """Return the dots by an image whose pixels are the means of ``times`` by ``times`` pixels."""
     levels = reduced(image.levels, times)
     smaller = GreyImage(levels, np.rint(levels).astype(np.uint8))
     dots = refine_dots(smaller, (points + 0.5) / times - 0.5, radii / times, reaches / times)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.charucos import find_charuco
 from smartcam.calibration._detection.checkerboards import find_checkerboard
 from smartcam.calibration._detection.circle_grids import find_circles
 from smartcam.calibration._detection.image import grey_image
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._detection.marker_grids import find_marker_grid
+from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, MarkerGrid
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
@@ -21,8 +21,11 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
     """Find a target's points in an image.
 
     Corners of squares are found where two fitted edges cross, dots by the fitted ellipse of their
-    rim, from whose middle the centre is told by how the whole grid is seen. All points of a
-    checkerboard and of a grid of dots must be seen; of a ChArUco board at least four corners. Dots
+    rim, from whose middle the centre is told by how the whole grid is seen. All points of a grid of
+    dots must be seen; of a checkerboard some in each row and column, most of them in the outermost
+    ones, those that are covered are left out, or any part with the origin's mark; of a ChArUco
+    board at least four. Its markers are held against each other by the board's map: those that
+    stand elsewhere than their numbers say are left out and named in the view's ``warnings``. Dots
     may be dark on light or light on dark; a grid that goes on beside them is refused.
 
     Points are numbered as the target does. Its origin is told by its mark, its larger dot or its
@@ -44,18 +47,21 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
         image: uint8 or uint16, (H, W) or (H, W, 3) with blue, green, red; 16 to 20,000 pixels wide
             and high. Or a :class:`~smartcam.frames.Frame`, whose brightness counts.
         target: what is printed on the sheet.
-        name: of the image, for messages.
+        name: name of the image, for messages.
 
     Returns:
         Points with a covariance that follows from the noise in the image alone: what its
-        compression, the print or the lens do to an edge comes on top. A corner that is covered
-        stays where it was found first, with a standard deviation of a quarter of a pixel or more.
+        compression, the print or the lens do to an edge comes on top. A corner that cannot be
+        fitted stays where it was found first, with a standard deviation of a quarter of a pixel or
+        more.
 
     Raises:
         CalibrationError: SHAPE: no such image, or a ChArUco board of an unknown dictionary;
-            TARGET_NOT_FOUND; AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30
-            grey levels of 255; MIRRORED: the image shows the target as in a mirror, or, where only
-            its black corners tell, as a negative or with columns and rows exchanged.
+            TARGET_NOT_FOUND; WRONG_TARGET: markers contradict the target's description: they stand
+            as on a board of the other ``legacy_pattern``, of other counts, or on several boards;
+            AMBIGUOUS_ORIGIN: the mark is not darker than the other corners by 30 grey levels of
+            255; MIRRORED: the image shows the target as in a mirror, or, where only its black
+            corners tell, as a negative or with columns and rows exchanged.
         MissingExtraError: OpenCV is not installed, or what reads a compressed frame.
         FrameFormatError: a frame has no brightness, or its bytes are wrong.
     """
@@ -67,8 +73,9 @@ def find_target(image: Any, target: Target, *, name: str = "") -> TargetView:
             return find_charuco(grey, target, name)
         case CircleGrid():
             return find_circles(grey, target, name)
-    raise CalibrationError(
-        f"target: expected a Checkerboard, Charuco or CircleGrid, got {type(target).__name__}",
-        code=Code.SHAPE,
-        got=type(target).__name__,
+        case MarkerGrid():
+            return find_marker_grid(grey, target, name)
+    got = type(target).__name__
+    raise Code.SHAPE.unexpected(
+        "target: expected a Checkerboard, Charuco, CircleGrid or MarkerGrid", got=got
     )

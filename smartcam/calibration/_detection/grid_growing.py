@@ -12,47 +12,47 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.calibration._detection.dots import GridMap
-from smartcam.calibration._geometry.homography import local_steps
-from smartcam.calibration._optional_imports import load
+from smartcam.calibration._homography import local_steps
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 NEIGHBOURS = 12
 """Dots around one among which those opposite each other are looked for: a grid's eight next ones
 and what may be printed between."""
 
 OPPOSITE = 0.2
-"""Of a step, by which the steps to two dots opposite each other differ at most."""
+"""Steps to two opposite dots differ by less than this part of the shorter step."""
 
-LEAST_SINE = 0.5
-"""Of the angle between the steps to a grid's next column and its next row: 30 degrees; the two
-shortest steps of a lattice have 60 or more."""
+MIN_SINE = 0.5
+"""The steps to a grid's next column and next row must enclose an angle whose sine is larger than
+this: 30 degrees. The two shortest steps of a lattice enclose 60 degrees or more."""
 
 NEAR, NEAR_FIRST = 0.3, 0.2
-"""Of a step, from where it leads to the dot that is found there at most; within two steps of the
-first dot, from where steps change less."""
+"""A dot is the grid's next one where it lies within this part of a step of the place to which the
+step leads. The second part counts within two steps of the first dot, where steps change less."""
 
 ALIKE = 1.8
-"""Times the area of its neighbour that a dot has at most."""
+"""A dot has at most as many times the area of its neighbour."""
 
 REGULAR = 0.08
-"""Of a step, from where a flat grid has its dots to where they are, in the median at most: lenses
-bend one of less than 20 dots less."""
+"""The dots of a flat grid lie off their places by less than this part of a step in the median:
+lenses bend a grid of fewer than 20 dots by less."""
 
-MOST_RANKED = 128
+MAX_SEEDS_RANKED = 128
 """Dots with the best two opposite each other, among which those are chosen that have four."""
 
-MOST_TRIES = 4
-"""Of these, from which a grid is grown. A grid's dots stand opposite each other more exactly than
-what stands so by chance, so the first one is one of them as a rule."""
+MAX_SEEDS_TRIED = 4
+"""A grid is grown from at most this many dots. A grid's dots stand opposite each other more exactly
+than dots that do so by chance, so the first dot that is tried is the grid's as a rule."""
 
-LEAST_AROUND = 8
+MIN_DOTS_REACHED = 8
 """Dots that are reached by two steps from a grid's dot at least, itself among them."""
 
 Place = tuple[int, int]
@@ -63,7 +63,7 @@ Lattice = dict[Place, int]
 """The dot at a column and a row, counted from anywhere in any direction."""
 
 Alike: TypeAlias = "Callable[[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]"
-"""Whether dots, by their indices, may be neighbours of others."""
+"""Function that tells, from indices of dots, whether each may be a neighbour of the other."""
 
 
 def lattices(
@@ -80,11 +80,11 @@ def lattices(
     ``alike`` tells which of the ``points`` (N, 2), pixels, may be neighbours, ``follows`` which
     else may come after one. A grid has at least ``least`` dots, four or more; of one with more than
     ``most``, a few more than these are returned. It is grown from dots that have two pairs of their
-    next ``neighbours`` opposite each other, of which no more than MOST_TRIES are tried.
+    next ``neighbours`` opposite each other, of which no more than MAX_SEEDS_TRIED are tried.
     """
     if len(points) < 5:
         return
-    tries = MOST_TRIES
+    tries = MAX_SEEDS_TRIED
     grown = _Grown(points, alike, follows or alike)
     seen = np.zeros(len(points), dtype=np.bool_)
     for start, steps in grown.starts(neighbours):
@@ -101,7 +101,7 @@ def lattices(
 
 
 def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
-    """Return whether dots are alike by their ``areas`` (N,), or one is ``larger`` times another."""
+    """Return a test of dots for like ``areas`` (N,), or for one ``larger`` times the other."""
 
     def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
         part = areas[one] / (larger * areas[other])
@@ -138,7 +138,7 @@ class _Grown:
         apart = np.sqrt(np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None]))
         apart[~(alike[:, :, None] & alike[:, None])] = np.inf
         best = apart.min(axis=(1, 2))
-        ranked = np.argsort(best)[: min(MOST_RANKED, int((best < OPPOSITE).sum()))]
+        ranked = np.argsort(best)[: min(MAX_SEEDS_RANKED, int((best < OPPOSITE).sum()))]
         worse = _across(ways[ranked], apart[ranked])
         for index in ranked[np.argsort(worse)][: int((worse < OPPOSITE).sum())].tolist():
             ahead, behind = np.nonzero(np.triu(apart[index] < OPPOSITE))
@@ -147,7 +147,7 @@ class _Grown:
             across, *others = steps
             for other in others:
                 area = abs(float(across[0] * other[1] - across[1] * other[0]))
-                if area > LEAST_SINE * float(np.hypot(*across) * np.hypot(*other)):
+                if area > MIN_SINE * float(np.hypot(*across) * np.hypot(*other)):
                     yield index, np.stack([across, other])
                     break
 
@@ -159,7 +159,7 @@ class _Grown:
         reached = [((0, 0), start, steps, start)]
         waves = 0
         while reached and len(places) <= most:
-            if waves == 2 and len(places) < LEAST_AROUND:
+            if waves == 2 and len(places) < MIN_DOTS_REACHED:
                 break
             waves += 1
             around = self._around(reached, NEAR_FIRST if waves < 2 else NEAR)
@@ -230,7 +230,7 @@ class _Grown:
 
 
 def _across(ways: Array, apart: Array) -> Array:
-    """Return how far apart (N,) the best two opposites are that lie across the best two of all.
+    """Return the distance from being opposite (N,) of the best pair that lies across the best one.
 
     ``ways`` (N, K, 2) lead to neighbours, two of which are ``apart`` (N, K, K) from being opposite.
     """
@@ -240,11 +240,11 @@ def _across(ways: Array, apart: Array) -> Array:
     flat = apart.reshape(count, around * around)
     first = between[np.arange(count), flat.argmin(axis=1)][:, None]
     sine = np.abs(between[:, :, 0] * first[:, :, 1] - between[:, :, 1] * first[:, :, 0])
-    return np.asarray(np.where(sine > LEAST_SINE, flat, np.inf).min(axis=1))
+    return np.asarray(np.where(sine > MIN_SINE, flat, np.inf).min(axis=1))
 
 
 def _is_regular(points: Array, grid: Lattice) -> bool:
-    """Return whether a flat sheet's grid may be seen so: among many dots, chance finds others."""
+    """Return True if a flat sheet may show the grid: among many dots, chance makes other grids."""
     places = np.array(list(grid), dtype=np.float64)
     found = points[list(grid.values())]
     seen = GridMap(places, found)

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, runtime_ch
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._optional_imports import load
-from smartcam.exceptions import CalibrationError
+from smartcam._extras import load
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +30,7 @@ Level = TypeVar("Level", np.uint8, np.float32)
 
 @runtime_checkable
 class HasGrey(Protocol):
-    """What knows its brightness, as a frame of a camera does."""
+    """An object that knows its brightness, as a frame of a camera does."""
 
     def grey(self) -> NDArray[Any]:
         """Return the brightness, (H, W), uint8 or uint16."""
@@ -70,12 +69,11 @@ def grey_image(image: Any) -> GreyImage:
         and all(SMALLEST <= side <= LARGEST for side in shape[:2])
     ):
         what = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
-        raise CalibrationError(
+        raise Code.SHAPE.unexpected(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
-            f"{SMALLEST} to {LARGEST} pixels wide and high, got {what}",
-            code=Code.SHAPE,
-            expected="uint8 or uint16, (H, W) or (H, W, 3)",
-            got=what,
+            f"{SMALLEST} to {LARGEST} pixels wide and high",
+            "uint8 or uint16, (H, W) or (H, W, 3)",
+            what,
         )
     cv2 = load("cv2")
     flat = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if len(shape) == 3 else image

@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration._detection.pixels import Floats, Windows
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 BLUR, GAIN, OFFSET = -3, -2, -1
 
-LEAST_BLUR = 0.25
+MIN_BLUR_PIXELS = 0.25
 """Pixels: the pixel's own width; a drawn image may have less, which no fit can tell."""
 
-MOST_BLUR = 6.0
+MAX_BLUR_PIXELS = 6.0
 """Pixels; a fit that needs more has seen something else than an edge."""
 
-LEAST_GAIN = 4.0
+MIN_HALF_STEP = 4.0
 """Grey levels of 255: half the step from black to white at least."""
 
-MOST_STEPS = 20
-"""Of a fit; most take four to seven."""
+MAX_STEPS = 20
+"""A fit takes at most this many steps; most fits take four to seven."""
 
 STILL = 1e-3
 """Pixels by which a point moves in the last step at most."""
@@ -99,7 +99,7 @@ def refined(
     fits, settled = _solve(evaluate, windows, values, moving)
     blur, gain = fits.values[:, BLUR], np.abs(fits.values[:, GAIN])
     rms = np.sqrt(fits.cost / windows.counts)
-    return fits, settled & (blur < MOST_BLUR) & (gain > LEAST_GAIN) & (rms < worst * gain)
+    return fits, settled & (blur < MAX_BLUR_PIXELS) & (gain > MIN_HALF_STEP) & (rms < worst * gain)
 
 
 def _solve(
@@ -114,7 +114,7 @@ def _solve(
     damping = np.full(len(values), 1e-3)
     active = np.arange(len(values))
     identity = np.eye(values.shape[1])
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         hessian = best.hessian[active]
         # (J^T J + damping diag(J^T J)) step = J^T r, each point with a damping of its own.
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
@@ -123,7 +123,7 @@ def _solve(
         damped = hessian + diagonal[:, :, None] * identity
         step = np.linalg.solve(damped, best.gradient[active, :, None])[:, :, 0]
         trial = best.values[active] + step
-        trial[:, BLUR] = np.clip(trial[:, BLUR], LEAST_BLUR, 2 * MOST_BLUR)
+        trial[:, BLUR] = np.clip(trial[:, BLUR], MIN_BLUR_PIXELS, 2 * MAX_BLUR_PIXELS)
         tried = evaluate(windows, trial)
         better = tried.cost <= best.cost[active]
         best.put(active, tried, better)

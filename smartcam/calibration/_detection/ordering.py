@@ -1,4 +1,4 @@
-"""Which of the points that were found is which of the target's.
+"""Number the points that were found as the target numbers them.
 
 A detector returns a grid whose first point may be any of its corners. The ways to lay the target's
 rows and columns over it are few; those that keep the sheet's front towards the camera are
@@ -12,19 +12,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._targets import CircleGrid
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import Checkerboard
+    from smartcam.geometry._inside import Array
 
-LEAST_MARGIN = 30.0
+MIN_ORIGIN_CONTRAST = 30.0
 """Grey levels of 255 by which a marked origin is darker than the next corner at least."""
 
 _TURNS: Final = [
@@ -32,8 +31,9 @@ _TURNS: Final = [
     for entries in itertools.product((-1, 0, 1), repeat=4)
     if abs(entries[0] * entries[3] - entries[1] * entries[2]) == 1
 ]
-"""What may be between the steps that were followed and those to the next column and row: turns,
-mirrored or not, and where a tilted sheet's diagonals look shorter than its sides, shears."""
+"""Matrices that may lie between the steps that were followed and those to the next column and row:
+turns, mirrored or not, and shears, since a tilted sheet's diagonals may look shorter than its
+sides."""
 
 
 class Arrangement(NamedTuple):
@@ -101,11 +101,10 @@ def leftmost(ways: Sequence[Arrangement], what: str) -> Arrangement:
     """
     proper = [way for way in ways if way.proper]
     if not proper:
-        raise CalibrationError(
+        raise Code.MIRRORED.refusal(
             f"{what}: expected an image of the sheet as one reads it, got one that is mirrored",
-            code=Code.MIRRORED,
-            expected="y to the left of x",
-            got="y to the right of x",
+            "y to the left of x",
+            "y to the right of x",
         )
     return max(proper, key=lambda way: way.rightward)
 
@@ -122,12 +121,11 @@ def marked(
     levels = {int(way.order[0, 0]): level(way.order) for way in ways}
     origin, second = sorted(levels, key=lambda corner: levels[corner])[:2]
     margin = levels[second] - levels[origin]
-    if not margin >= LEAST_MARGIN:
-        raise CalibrationError(
+    if not margin >= MIN_ORIGIN_CONTRAST:
+        raise Code.AMBIGUOUS_ORIGIN.refusal(
             f"{what}: expected the origin to be darker than the other corners by "
-            f"{LEAST_MARGIN:g} grey levels of 255, got {margin:.0f}",
-            code=Code.AMBIGUOUS_ORIGIN,
-            expected=LEAST_MARGIN,
-            got=margin,
+            f"{MIN_ORIGIN_CONTRAST:g} grey levels of 255, got {margin:.0f}",
+            MIN_ORIGIN_CONTRAST,
+            margin,
         )
     return leftmost([way for way in ways if way.order[0, 0] == origin], what), margin

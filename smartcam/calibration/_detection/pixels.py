@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from smartcam.calibration._detection.image import GreyImage
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 Floats: TypeAlias = NDArray[np.float32]
 
@@ -18,7 +18,7 @@ CUBIC: Final = 0.0997927
 """``erf(x)`` is taken as ``tanh(x * (LINEAR + CUBIC * x^2))``: off by 0.0003 at most, which is far
 below one grey level, and ten times as fast (fitted)."""
 
-LEAST_REACH = 3
+MIN_REACH = 3
 """Pixels to each side of a window at least."""
 
 
@@ -37,8 +37,14 @@ class Windows(NamedTuple):
         counts: Array = self.weights.sum(axis=1, dtype=np.float64)
         return counts
 
+    def without(self, points: Array, radius: float) -> Windows:
+        """Return the windows without the pixels within a radius of points (N, 2)."""
+        u, v = (points - self.middle).astype(np.float32).T[:, :, None]
+        far = ((self.x - u) ** 2 + (self.y - v) ** 2 > radius**2).astype(np.float32)
+        return self._replace(levels=self.levels * far, weights=self.weights * far)
+
     def some(self, which: NDArray[np.bool_]) -> Windows:
-        """Return those of some points."""
+        """Return the windows of some points."""
         if which.all():
             return self
         return self._replace(
@@ -63,7 +69,7 @@ def cut_windows(
     wide along each of them; None: all of it.
     """
     reach = np.hypot(ways[:, 0], ways[:, 1]) if round_ else np.abs(ways).sum(axis=1)
-    half = int(np.clip(np.ceil(reach.max()), LEAST_REACH, most))
+    half = int(np.clip(np.ceil(reach.max()), MIN_REACH, most))
     span = np.arange(-half, half + 1)
     y, x = (side.ravel() for side in np.meshgrid(span, span, indexing="ij"))
     middle = np.rint(points).astype(np.intp)
@@ -76,7 +82,7 @@ def cut_windows(
     within = (parts**2).sum(axis=1) <= 1 if round_ else (np.abs(parts) <= 1).all(axis=1)
     if clear is not None:
         within &= (np.abs(parts) <= clear[:, :, None]).any(axis=1)
-    near = np.maximum(np.abs(x), np.abs(y)) < LEAST_REACH
+    near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH
     weights = (inside & (within | near)).astype(np.float32)
     return Windows(middle, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)
 

@@ -1,4 +1,4 @@
-"""Where four squares may meet: saddles of the grey levels.
+"""Find saddles of the grey levels, at which four squares may meet.
 
 Around a corner of a checkerboard two dark sectors lie opposite each other between two light ones.
 Its grey levels are a saddle there, and on a circle around it they come twice: a half turn further
@@ -12,34 +12,34 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration._detection.pixels import Floats
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 SMOOTHED = 1.0
 """Standard deviation of the Gaussian before second derivatives are taken, pixels."""
 
-LEAST_BENT = 0.3
-"""Of a saddle: ``f_xy^2 - f_xx f_yy``, in grey levels of 255 and pixels; a sharp corner with a step
-of 15 grey levels has 1."""
+MIN_CURVATURE = 0.3
+"""The bend of a saddle, ``f_xy^2 - f_xx f_yy`` in grey levels of 255 and pixels, must be larger
+than this; a sharp corner with a step of 15 grey levels has 1."""
 
 RADIUS = 3.0
-"""Of the circle that is looked at, pixels: squares of seven pixels have only their own on it."""
+"""Radius of the circle of levels around a saddle, pixels: it stays in squares of seven pixels."""
 
-LEAST_STEP = 1.0
+MIN_SWING = 1.0
 """Grey levels by which a circle's levels swing at least."""
 
-MOST_UNLIKE = 0.35
-"""Of what a circle's levels have in common with those opposite, what they differ by at most."""
+MAX_ASYMMETRY = 0.35
+"""Part of the squared swing common to a circle's halves that their squared difference may reach."""
 
-MOST_KEPT = 600
-"""Of those that look like a corner, the strongest ones."""
+MAX_SADDLES_KEPT = 600
+"""At most this many saddles that look like a corner are kept, the strongest ones."""
 
-MOST_LOOKED_AT = 1500
+MAX_SADDLES_EXAMINED = 1500
 """Saddles of an image, the strongest ones; so that noise and leaves take no more than others."""
 
 _ANGLES = np.arange(16) * np.pi / 8
@@ -48,14 +48,14 @@ _TWICE = np.column_stack([np.cos(2 * _ANGLES), np.sin(2 * _ANGLES)]) / 16
 
 
 class Saddles(NamedTuple):
-    """What may be corners."""
+    """Saddles of the grey levels that may be corners."""
 
     points: Array  # (N, 2), pixels
     # (N, 2), unit vectors, at twice the angle of where the lighter sectors lie
     turns: Array
 
     def alike(self, one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return whether corners, by their indices, may be neighbours on a board."""
+        """Return True for each two corners, by their indices, that may be neighbours on a board."""
         cosine = (self.turns[one] * self.turns[other]).sum(axis=-1)
         return np.asarray(cosine < -0.5)
 
@@ -70,23 +70,23 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
     )
     bent = xy * xy - xx * yy
     highest = cv2.dilate(bent, np.ones((5, 5), np.uint8))
-    peaks = (bent == highest) & (bent > LEAST_BENT)
+    peaks = (bent == highest) & (bent > MIN_CURVATURE)
     rim = int(RADIUS) + 1
     inside = peaks[rim:-rim, rim:-rim]
     v, u = np.divmod(np.flatnonzero(inside), inside.shape[1])
     at = np.column_stack([u, v]) + rim
-    if len(at) > MOST_LOOKED_AT:
+    if len(at) > MAX_SADDLES_EXAMINED:
         strength = bent[at[:, 1], at[:, 0]]
-        at = at[np.argpartition(strength, -MOST_LOOKED_AT)[-MOST_LOOKED_AT:]]
+        at = at[np.argpartition(strength, -MAX_SADDLES_EXAMINED)[-MAX_SADDLES_EXAMINED:]]
     if not len(at):
         return Saddles(np.zeros((0, 2)), np.zeros((0, 2)))
     ring = (at[:, None] + _CIRCLE).astype(np.float32)
     levels = cv2.remap(smooth, ring, None, cv2.INTER_LINEAR).astype(np.float64)
     turns = levels @ _TWICE
     swing = np.linalg.norm(turns, axis=1)
-    good = _comes_twice(levels) & (swing > LEAST_STEP)
-    if good.sum() > MOST_KEPT:
-        good &= swing >= np.partition(swing[good], -MOST_KEPT)[-MOST_KEPT]
+    good = _comes_twice(levels) & (swing > MIN_SWING)
+    if good.sum() > MAX_SADDLES_KEPT:
+        good &= swing >= np.partition(swing[good], -MAX_SADDLES_KEPT)[-MAX_SADDLES_KEPT]
     at = at[good]
     bends = np.stack([part[at[:, 1], at[:, 0]] for part in (xx, xy, xy, yy)], axis=1)
     return Saddles(at + _way(smooth, at, bends), turns[good] / swing[good, None])
@@ -106,12 +106,12 @@ def _way(smooth: Floats, at: NDArray[np.intp], bends: Array) -> Array:
 
 
 def _comes_twice(levels: Array) -> NDArray[np.bool_]:
-    """Return whether circles (N, 16) have the same on both halves, one dark and one light part."""
+    """Return True for each circle (N, 16) with two like halves, each of a dark and a light part."""
     here, opposite = levels[:, :8], levels[:, 8:]
     common, apart = (here + opposite) / 2, (here - opposite) / 2
     middle = (common.max(axis=1) + common.min(axis=1)) / 2
     light = common > middle[:, None]
     changes = (light != np.roll(light, 1, axis=1)).sum(axis=1)
     spread = common - common.mean(axis=1, keepdims=True)
-    same = (apart**2).sum(axis=1) < MOST_UNLIKE * (spread**2).sum(axis=1)
+    same = (apart**2).sum(axis=1) < MAX_ASYMMETRY * (spread**2).sum(axis=1)
     return np.asarray(same & (changes == 2))

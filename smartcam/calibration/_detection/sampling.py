@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
     from smartcam.calibration._detection.image import GreyImage
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 
 def mean_level(image: GreyImage, points: Array) -> float:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 WIDTH, HEIGHT = 900.0, 260.0
-"""Of a chart, pixels."""
+"""A chart is drawn this wide and this high, pixels."""
 
 LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
 """Pixels beside a chart, above it, below it, and on the right."""
@@ -71,7 +71,7 @@ def short_names(names: Sequence[str]) -> list[str]:
 
 
 def _common(names: Sequence[str]) -> str:
-    """Return what all names begin with."""
+    """Return the beginning that all names have in common."""
     same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
     return "".join(letters[0] for letters in same)
 
@@ -97,7 +97,7 @@ def _chart(chart: Chart, top: float) -> Iterator[str]:
 
 
 def _largest(chart: Chart) -> float:
-    """Return what a chart reaches to: those that were left out do not make the others small."""
+    """Return the upper end of a chart: views that were left out do not make the others small."""
     used = [
         value
         for one in chart.series

@@ -1,4 +1,4 @@
-"""What a calibration from images looks like: its views, its scene, its uncertainty."""
+"""Draw a calibration from images: its views, its scene, its uncertainty."""
 
 from __future__ import annotations
 
@@ -7,27 +7,29 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._argument_checks import a_number, or_none, takes
+from smartcam._arguments import check_text
 from smartcam.calibration._drawing.bars import Chart, Series, draw_bars, short_names
 from smartcam.calibration._drawing.maps import Map, draw_maps
 from smartcam.calibration._drawing.scene import Axes, DrawnBoard, DrawnCamera, DrawnScene
 from smartcam.calibration._drawing.scene import draw_scene as _draw_scene
-from smartcam.calibration._geometry.rigid import IDENTITY
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
 from smartcam.calibration._lens.comparison import LensComparison
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration._views import label
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+from smartcam.geometry._inside import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.uncertainty import MapFigures
     from smartcam.calibration._targets import Target
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
 
 FromImages = IntrinsicCalibration | StereoCalibration | HandEyeCalibration
 """Calibrations from images."""
@@ -35,6 +37,7 @@ FromImages = IntrinsicCalibration | StereoCalibration | HandEyeCalibration
 MILLIMETRES: Final = 1e3
 
 
+@takes(title=check_text)
 def draw_views(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of each view's errors as bars, SVG.
 
@@ -49,6 +52,7 @@ def draw_views(calibration: FromImages, *, title: str = "") -> str:
     return draw_bars(_of(calibration, _CHARTS, "draw_views")(calibration), title)
 
 
+@takes(title=check_text)
 def draw_scene(calibration: FromImages, *, title: str = "") -> str:
     """Return a picture of targets and cameras in space, SVG; as :func:`draw_views` else.
 
@@ -59,6 +63,7 @@ def draw_scene(calibration: FromImages, *, title: str = "") -> str:
     return _draw_scene(_of(calibration, _SCENES, "draw_scene")(calibration), title)
 
 
+@takes(distance=or_none(a_number), title=check_text)
 def draw_uncertainty(
     shown: IntrinsicCalibration | ProjectionUncertainty | LensComparison,
     *,
@@ -69,8 +74,8 @@ def draw_uncertainty(
 
     Of a comparison both maps: by how much the two lenses differ, and what noise leads to. Colours
     go by the logarithm, from dark to light; numbers are of a coordinate, pixels. A white cross is
-    where it is largest. ``distance`` is that of
-    :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
+    where it is largest; white dots are the points in the views of a calibration. ``distance`` is
+    that of :meth:`~smartcam.calibration.IntrinsicCalibration.uncertainty`.
     """
     if isinstance(shown, LensComparison):
         observed = [Map("difference", _size(shown.pixels), shown.lengths, _said(shown.observed))]
@@ -79,13 +84,18 @@ def draw_uncertainty(
             said = _said(shown.predicted)
             observed.append(Map("what noise leads to", _size(shown.pixels), expected, said))
         return draw_maps(observed, title, "px")
+    points = np.zeros((0, 2))
     if isinstance(shown, IntrinsicCalibration):
+        points = np.concatenate([fit.view.points for fit in shown.views if fit.used])
         shown = shown.uncertainty(distance=distance)
     if not isinstance(shown, ProjectionUncertainty):
         raise _wrong("draw_uncertainty", "a calibration of a lens, its map or a comparison", shown)
     where = "infinity" if shown.distance is None else f"{shown.distance:g} m"
     name = f"standard deviation of where a point at {where} is projected"
-    return draw_maps([Map(name, shown.size, shown.sigma, _said(shown.figures))], title, "px")
+    said = _said(shown.figures)
+    if not (reached := np.isfinite(shown.sigma)).all():
+        said += f"; the model of the lens ends before {1 - reached.mean():.1%} of the image"
+    return draw_maps([Map(name, shown.size, shown.sigma, said, points)], title, "px")
 
 
 def _of(calibration: object, table: Mapping[type, Any], what: str) -> Callable[[Any], Any]:
@@ -97,12 +107,7 @@ def _of(calibration: object, table: Mapping[type, Any], what: str) -> Callable[[
 
 
 def _wrong(what: str, expected: str, got: object) -> CalibrationError:
-    return CalibrationError(
-        f"{what}: expected {expected}, got {type(got).__name__}",
-        code=Code.WRONG_KIND,
-        expected=expected,
-        got=type(got).__name__,
-    )
+    return Code.WRONG_KIND.unexpected(f"{what}: expected {expected}", expected, type(got).__name__)
 
 
 def _size(pixels: Array) -> tuple[int, int]:
@@ -111,8 +116,8 @@ def _size(pixels: Array) -> tuple[int, int]:
 
 
 def _said(figures: MapFigures) -> str:
-    names = figures._fields
-    return ", ".join(f"{name} {value:.2g}" for name, value in zip(names, figures, strict=True))
+    known = {name: one for name, one in figures._asdict().items() if math.isfinite(one)}
+    return ", ".join(f"{name} {value:.2g}" for name, value in known.items())
 
 
 # ---------------------------------------------------------------------- bars

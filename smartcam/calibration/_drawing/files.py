@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._drawing.draw import draw_scene, draw_uncertainty, draw_views
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
@@ -12,7 +11,7 @@ from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration._plane.drawing import draw as draw_plane
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     import os
@@ -26,7 +25,7 @@ PICTURES: Final[Mapping[str, tuple[Picture, ...]]] = {
     HandEyeCalibration.kind: ("views", "scene"),
     PlaneCalibration.kind: ("plane",),
 }
-"""By the kind of a file what may be drawn of it, the first where nothing is asked for."""
+"""Pictures that may be drawn of each kind of file, the first where nothing is asked for."""
 
 
 def draw_file(
@@ -41,12 +40,11 @@ def draw_file(
     known = PICTURES.get(document.kind, ())
     if not known or picture not in {None, *known}:
         wanted = picture or " or ".join(PICTURES)
-        raise CalibrationError(
+        raise Code.WRONG_KIND.refusal(
             f"{path}: holds {document.kind!r}, of which there is "
             f"{' and '.join(known) or 'no picture'}; expected {wanted}",
-            code=Code.WRONG_KIND,
-            expected=wanted,
-            got=document.kind,
+            wanted,
+            document.kind,
         )
     title, data = str(path), document.data
     chosen = picture or known[0]

@@ -12,10 +12,10 @@ from smartcam.calibration._svg import document, line, rectangle, text
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 WIDTH: Final = 640.0
-"""Of a map, pixels."""
+"""A map is drawn this wide, pixels."""
 
 BORDER, HEAD, FOOT = 30.0, 70.0, 84.0
 """Pixels beside, above and below a map."""
@@ -24,7 +24,7 @@ COLOURS: Final = (
     *((68, 1, 84), (65, 68, 135), (42, 120, 142), (34, 168, 132)),
     *((122, 209, 81), (253, 231, 37)),
 )
-"""From small to large: each is lighter than the one before it, for whoever sees no colours, too.
+"""Colours from small to large values: each is lighter than the one before, for the colour-blind.
 
 Source: S. van der Walt and N. Smith, viridis (public domain).
 """
@@ -33,18 +33,19 @@ STEPS: Final = 24
 """Colours of a map: neighbours in one merge into one rectangle."""
 
 DECADES: Final = 3.0
-"""Of a map's colours at most; what is smaller has the first one."""
+"""A map's colours span this many powers of ten at most; smaller values have the first colour."""
 
 TICKS: Final = 5
 
 
 class Map(NamedTuple):
-    """What is drawn."""
+    """The values of one map, with the texts and points drawn on it."""
 
     title: str
     size: tuple[int, int]  # of the image, pixels
     values: Array  # (h, w), from corner to corner; NaN: none
     said: str = ""  # below it
+    points: Array = np.zeros((0, 2))  # pixels that are marked by dots
 
 
 def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
@@ -78,6 +79,9 @@ def _map(one: Map, left: float, least: float, most: float) -> Iterator[str]:
             place = (left + start * cell[0], HEAD + row * cell[1])
             yield rectangle(place, ((end - start) * cell[0], cell[1]), fill)
     yield "</g>"
+    places = [left, HEAD] + (one.points + 0.5) * WIDTH / one.size[0]
+    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in places.tolist())
+    yield f'<path d="{dots}" class="seen"/>'
     yield rectangle((left, HEAD), (WIDTH, tall), 'class="axis"')
     yield from _numbers(one.values, left, tall)
     if one.said:

@@ -15,18 +15,17 @@ from smartcam.calibration._svg import document, line, polygon, round_down, text
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from smartcam.calibration._geometry.rigid import Rigid
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array, Rigid
 
 WIDTH, HEIGHT = 900.0, 560.0
-"""Of the scene, pixels."""
+"""The scene is drawn this wide and this high at most, pixels."""
 
 BORDER, HEAD, FOOT = 40.0, 56.0, 50.0
 """Pixels beside, above and below it."""
 
 AZIMUTH, ELEVATION = math.radians(-38.0), math.radians(24.0)
-"""From where it is looked at: turned about the vertical, and from above."""
+"""Direction from which the scene is looked at: turned about the vertical, and from above."""
 
 FRUSTUM: Final = 0.16
 """Length of a camera's frustum, parts of the scene's extent; of many cameras it is shorter."""
@@ -38,14 +37,14 @@ LETTER: Final = (7.5, 15.0)
 """Width and height of a letter, about, pixels."""
 
 BELOW: Final = np.array([0.0, 14.0])
-"""From a thing's place to its label, pixels."""
+"""Way from a thing's place to its label, pixels."""
 
 OFFSETS: Final = [(0.0, 0.0)] + [
     (reach * math.cos(angle), 0.7 * reach * math.sin(angle))
     for reach in (18, 30, 44, 60, 80, 105)
     for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
 ]
-"""Where a label may be beside its place, pixels; the first that is free is taken."""
+"""Places of a label beside its thing, pixels; the first that is free is taken."""
 
 
 class DrawnBoard(NamedTuple):
@@ -72,7 +71,7 @@ class Axes(NamedTuple):
 
 
 class DrawnScene(NamedTuple):
-    """What is drawn, in a frame of its own."""
+    """The objects of one drawing, in a frame of the drawing's own."""
 
     boards: Sequence[DrawnBoard]
     cameras: Sequence[DrawnCamera]
@@ -88,7 +87,7 @@ class _Drawn(NamedTuple):
 
 
 class _Outlook:
-    """How points of a scene become pixels."""
+    """The projection from points of a scene to pixels of the drawing."""
 
     def __init__(self, scene: DrawnScene, points: Array) -> None:
         # upright first, z up; then turned about the vertical and looked at from above
@@ -117,7 +116,7 @@ class _Outlook:
         return places
 
     def depth(self, points: Array) -> float:
-        """Return how far away the middle of points is."""
+        """Return the depth of the middle of points, along the line of sight."""
         return float((points @ self.axes[1]).mean())
 
 

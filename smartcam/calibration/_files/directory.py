@@ -7,23 +7,25 @@ symbolic link on the way is refused too: what stands in the folder is in it.
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from smartcam.calibration._codes import Code
-from smartcam.exceptions import CalibrationError
+from smartcam._arguments import check_path
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     import os
+    from pathlib import Path
+
+    from smartcam.exceptions import CalibrationError
 
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
-"""What a name is made of: no dot, no slash, nothing that a file system gives a meaning to."""
+"""Pattern of a name: no dot, no slash, nothing that a file system gives a meaning to."""
 
 MAX_NAME = 64
 """Characters of a name."""
 
 EXPORTS = "exports"
-"""Where exported files stand, in the folder."""
+"""Name of the folder, inside of the given one, in which exported files stand."""
 
 _SUFFIXES = (".json", ".yaml", ".txt", ".calib")
 _RESERVED = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])", re.IGNORECASE)
@@ -40,11 +42,12 @@ class Folder:
         path: the folder, absolute.
 
     Raises:
+        ConfigurationError: it is no path.
         OSError: it cannot be made.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path: Path = Path(path).resolve()
+        self.path: Path = check_path(path, "path", "Folder").resolve()
         self.path.mkdir(parents=True, exist_ok=True)
 
     def names(self) -> list[str]:
@@ -64,7 +67,7 @@ class Folder:
         """Return the journal of a wizard.
 
         Args:
-            name: of the calibration.
+            name: name of the calibration.
             wizard: name of the wizard; empty for the one that makes the calibration.
 
         Raises:
@@ -85,7 +88,7 @@ class Folder:
         """Return the file that an export goes to; its folder is made.
 
         Args:
-            target: its name, with the suffix ``.json`` or ``.yaml``.
+            target: name of the file, with the suffix ``.json`` or ``.yaml``.
 
         Raises:
             CalibrationError: ``BAD_NAME``.
@@ -116,10 +119,8 @@ class Folder:
             raise _bad(name_or_path, f"a name, or {EXPORTS}/NAME.json")
         if not path.is_file():
             known = ", ".join(self.names()[:20]) or "none: the folder is empty"
-            raise CalibrationError(
-                f"no calibration {name_or_path!r}; there are {known}",
-                code=Code.NOT_FOUND,
-                got=name_or_path,
+            raise Code.NOT_FOUND.refusal(
+                f"no calibration {name_or_path!r}; there are {known}", got=name_or_path
             )
         return path
 
@@ -146,9 +147,6 @@ def _checked(name: str) -> str:
 
 def _bad(name: str, expected: str) -> CalibrationError:
     shown = repr(name) if len(name) <= MAX_NAME else f"{name[:MAX_NAME]!r}..."
-    return CalibrationError(
-        f"the name {shown} cannot be used: expected {expected}",
-        code=Code.BAD_NAME,
-        got=name,
-        expected=expected,
+    return Code.BAD_NAME.refusal(
+        f"the name {shown} cannot be used: expected {expected}", expected, name
     )

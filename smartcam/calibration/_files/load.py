@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from smartcam.calibration._codes import Code
+from smartcam._argument_checks import takes
+from smartcam._arguments import check_path
 from smartcam.calibration._files.store import Document, read_document
 from smartcam.calibration._plane.calibration import PlaneCalibration
 from smartcam.calibration._sheet.calibration import SheetCalibration
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._verdict import warn
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     import os
@@ -19,11 +21,14 @@ AnyCalibration: TypeAlias = PlaneCalibration | SheetCalibration
 KINDS: Final[Mapping[str, type[AnyCalibration]]] = {
     one.kind: one for one in (PlaneCalibration, SheetCalibration)
 }
-"""What a file may hold."""
+"""Calibrations that a file may hold, by their kinds."""
 
 
+@takes(path=check_path)
 def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
     """Load the calibration that a file holds: a plane's, or a sheet's.
+
+    That it is not good goes to the log, as a warning.
 
     Raises:
         CalibrationError: the file is damaged, newer, or holds something else.
@@ -38,11 +43,10 @@ def of_document(document: Document, name: str) -> AnyCalibration:
     Raises WRONG_KIND, or SHAPE: its data are no calibration.
     """
     if document.kind in KINDS:
-        return KINDS[document.kind].from_data(document.data)
+        found = KINDS[document.kind].from_data(document.data)
+        warn(found, name)
+        return found
     expected = " or ".join(map(repr, KINDS))
-    raise CalibrationError(
-        f"{name}: holds {document.kind!r}, expected {expected}",
-        code=Code.WRONG_KIND,
-        got=document.kind,
-        expected=expected,
+    raise Code.WRONG_KIND.refusal(
+        f"{name}: holds {document.kind!r}, expected {expected}", expected, document.kind
     )

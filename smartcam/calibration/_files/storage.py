@@ -1,211 +1,117 @@
-"""Calibrations as plain data: each field stands once, where its class declares it.
+"""Calibrations that have files of their own, and the forms of their fields.
 
-A :class:`Stored` class is a dataclass whose annotations say how its fields stand in a file: what
-pydantic checks there, how the value is made of that, and plain data of the value. A :class:`Form`
-is all three, such as nested lists of numbers for an array::
-
-    @dataclass(frozen=True, kw_only=True, eq=False)
-    class CameraModel(storage.Stored):
-        size: storage.Size
-        matrix: storage.Matrix3
+The forms are those of ``smartcam/geometry/_stored.py``, which says how they are used. Here they
+are names of this module, since ``storage.rows`` reads better in a list of fields than ``rows``.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
-import math
-from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import dataclass
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    ClassVar,
-    NamedTuple,
-    TypeAlias,
-    get_args,
-    get_type_hints,
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from smartcam.calibration._files import store
+from smartcam.calibration._targets import Target, target_from_data, target_to_data
+from smartcam.calibration._verdict import warn
+from smartcam.geometry._inside import (
+    AsList as AsList,
+)
+from smartcam.geometry._inside import (
+    Context as Context,
+)
+from smartcam.geometry._inside import (
+    Count as Count,
+)
+from smartcam.geometry._inside import (
+    Form as Form,
+)
+from smartcam.geometry._inside import (
+    Keys as Keys,
+)
+from smartcam.geometry._inside import (
+    Matrix3 as Matrix3,
+)
+from smartcam.geometry._inside import (
+    Matrix43 as Matrix43,
+)
+from smartcam.geometry._inside import (
+    NonNegative as NonNegative,
+)
+from smartcam.geometry._inside import (
+    Number as Number,
+)
+from smartcam.geometry._inside import (
+    Open as Open,
+)
+from smartcam.geometry._inside import (
+    OpenPair as OpenPair,
+)
+from smartcam.geometry._inside import (
+    OpenTriple as OpenTriple,
+)
+from smartcam.geometry._inside import (
+    Others as Others,
+)
+from smartcam.geometry._inside import (
+    Pair as Pair,
+)
+from smartcam.geometry._inside import (
+    Positive as Positive,
+)
+from smartcam.geometry._inside import (
+    Remarks as Remarks,
+)
+from smartcam.geometry._inside import (
+    SheetOffsets as SheetOffsets,
+)
+from smartcam.geometry._inside import (
+    Size as Size,
+)
+from smartcam.geometry._inside import (
+    Stored as Stored,
+)
+from smartcam.geometry._inside import (
+    Triple as Triple,
+)
+from smartcam.geometry._inside import (
+    Vector2 as Vector2,
+)
+from smartcam.geometry._inside import (
+    Vector3 as Vector3,
+)
+from smartcam.geometry._inside import (
+    as_array as as_array,
+)
+from smartcam.geometry._inside import (
+    check_counts as check_counts,
+)
+from smartcam.geometry._inside import (
+    check_shape as check_shape,
+)
+from smartcam.geometry._inside import (
+    matrix as matrix,
+)
+from smartcam.geometry._inside import (
+    motion as motion,
+)
+from smartcam.geometry._inside import (
+    refused as refused,
+)
+from smartcam.geometry._inside import (
+    row as row,
+)
+from smartcam.geometry._inside import (
+    rows as rows,
 )
 
-import numpy as np
-from pydantic import AfterValidator, Field, FiniteFloat, TypeAdapter, ValidationError
-from pydantic_core import core_schema
-
-from smartcam.calibration._codes import Code, Remark
-from smartcam.calibration._files import store
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rotations import LARGEST, Array
-from smartcam.calibration._targets import Target, target_from_data, target_to_data
-from smartcam.exceptions import CalibrationError
-
 if TYPE_CHECKING:
-    from collections.abc import Iterable
     from pathlib import Path
     from typing import Self
-
-    from pydantic import GetCoreSchemaHandler
-    from pydantic_core import CoreSchema
-
-Context: TypeAlias = MutableMapping[str, Any]
-"""What is known when a value is read: how errors call the whole (``called``), and the values that
-a class shares with those behind them."""
-
-Keys: TypeAlias = Mapping[str, str]
-"""Names in a file by those of fields; empty for a field that is made of other keys."""
-
-Others: TypeAlias = Mapping[str, tuple[Any, Callable[[Any], Any]]]
-"""What stands in a file beside the fields: its type, and how it is got from an object."""
-
-
-@dataclass(eq=False)
-class Form:
-    """How the value that it annotates stands in a file."""
-
-    checked: Any  # the type that pydantic checks there
-    read: Callable[[Any, Context], Any]  # makes the value, of what was checked and the context
-    write: Callable[[Any], Any]  # makes plain data of the value
-
-    def __get_pydantic_core_schema__(self, _: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.with_info_after_validator_function(
-            lambda value, info: self.read(value, info.context),
-            handler.generate_schema(self.checked),
-            serialization=core_schema.plain_serializer_function_ser_schema(self.write),
-        )
-
-
-@dataclass(eq=False)
-class AsList:
-    """A tuple of any length stands as a list, of ``least`` items at least."""
-
-    least: int = 0
-
-    def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        items = handler.generate_schema(get_args(kind)[0])
-        found = core_schema.list_schema(items, min_length=self.least)
-        return _made_of(found, read=lambda found, _: tuple(found), write=list)
-
-
-class AsMapping:
-    """A NamedTuple stands as a mapping."""
-
-    def __get_pydantic_core_schema__(self, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        hints = get_type_hints(kind, include_extras=True)
-        fields = {
-            key: core_schema.typed_dict_field(handler.generate_schema(hint))
-            for key, hint in hints.items()
-        }
-        return _made_of(
-            core_schema.typed_dict_schema(fields, extra_behavior="forbid"),
-            read=lambda found, _: kind(**found),
-            write=lambda value: value._asdict(),
-        )
-
-
-def _made_of(
-    parts: CoreSchema, read: Callable[[Any, Context], Any], write: Callable[[Any], Any]
-) -> CoreSchema:
-    """Return the schema of values that are made of parts with forms of their own."""
-    return core_schema.with_info_after_validator_function(
-        lambda found, info: read(found, info.context),
-        parts,
-        serialization=core_schema.wrap_serializer_function_ser_schema(
-            lambda value, plain: plain(write(value)), schema=parts
-        ),
-    )
-
-
-class Stored:
-    """A dataclass whose annotations say how its fields stand in a file."""
-
-    _called: ClassVar[str] = "data"
-    """What errors call it."""
-
-    _keys: ClassVar[Keys] = {}
-
-    _others: ClassVar[Others] = {}
-    """They stand before the fields."""
-
-    _shared: ClassVar[frozenset[str]] = frozenset({"target"})
-    """Keys whose values are known when those behind them are read."""
-
-    _later: ClassVar[frozenset[str]] = frozenset()
-    """Keys that a file need not have: defaults take their place."""
-
-    def to_data(self) -> dict[str, Any]:
-        """Return everything as JSON takes it, None for NaN; :meth:`from_data` gives it back."""
-        kind: Any = type(self)
-        data: dict[str, Any] = _adapter(kind).dump_python(self, warnings=False)
-        return data
-
-    @classmethod
-    def from_data(cls, data: Mapping[str, Any], **known: Any) -> Self:
-        """Return the object of :meth:`to_data`, bit by bit; nothing is calculated anew.
-
-        Args:
-            data: what a file holds.
-            known: what does not stand there: the ``target`` of a view.
-
-        Raises:
-            CalibrationError: SHAPE: it is something else; NOT_FINITE or NOT_RIGID: numbers that no
-                such calibration has.
-        """
-        found: Self = _checked(cls, data, cls._called, **known)
-        return found
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, kind: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        hints = get_type_hints(cls, include_extras=True)
-        attributes = [one.name for one in dataclasses.fields(kind)]
-        names: dict[str, str] = {cls._keys.get(name, name): name for name in attributes}
-        names.pop("", None)
-        types = {key: hint for key, (hint, _) in cls._others.items()}
-        types |= {key: hints[name] for key, name in names.items()}
-
-        def field(key: str) -> core_schema.TypedDictField:
-            schema = handler.generate_schema(types[key])
-            if key in cls._shared:
-                schema = core_schema.with_info_after_validator_function(_share(key), schema)
-            return core_schema.typed_dict_field(schema, required=key not in cls._later)
-
-        def write(one: Stored) -> dict[str, Any]:
-            others = {key: value(one) for key, (_, value) in cls._others.items()}
-            return others | {key: getattr(one, name) for key, name in names.items()}
-
-        def read(found: dict[str, Any], context: Context) -> Stored:
-            return cls._read({names.get(key, key): one for key, one in found.items()}, context)
-
-        fields = {key: field(key) for key in types}
-        parts = core_schema.typed_dict_schema(fields, extra_behavior="forbid")
-        return _made_of(parts, read, write)
-
-    @classmethod
-    def _read(cls, found: dict[str, Any], context: Context) -> Self:
-        """Return an object of what was found for its fields and ``_others``; check how it fits.
-
-        Raises SHAPE: the fields do not fit together.
-        """
-        made = cls(**{name: value for name, value in found.items() if name not in cls._others})
-        made._check(found, context["called"])
-        return made
-
-    def _check(self, found: Mapping[str, Any], called: str) -> None:
-        """Raise where fields do not fit together, or to the others that were found."""
-
-
-def _share(key: str) -> Callable[[Any, core_schema.ValidationInfo[Context]], Any]:
-    def share(value: Any, info: core_schema.ValidationInfo[Context]) -> Any:
-        info.context[key] = value
-        return value
-
-    return share
 
 
 class SavedCalibration(Stored):
     """A calibration that has files of its own."""
 
     kind: ClassVar[str]
-    """What its files are called in the store."""
+    """Name of the calibration's kind of file in the store."""
 
     def save(self, path: str | Path) -> None:
         """Write it to a file, whole or not at all; see :mod:`smartcam.calibration._files.store`."""
@@ -213,183 +119,17 @@ class SavedCalibration(Stored):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what :meth:`save` wrote.
+        """Read what :meth:`save` wrote; that it is not good goes to the log, as a warning.
 
         Raises:
             CalibrationError: the file is damaged, newer, or holds something else.
             OSError: it is not there, or cannot be read.
         """
-        return cls.from_data(store.read(path, cls.kind))
+        found = cls.from_data(store.read(path, cls.kind))
+        warn(found, str(path))
+        return found
 
-
-@functools.cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
-def _checked(kind: Any, data: Any, called: str, **known: Any) -> Any:
-    try:
-        return _adapter(kind).validate_python(data, context={"called": called, **known})
-    except ValidationError as exc:
-        first = exc.errors()[0]
-        error = first.get("ctx", {}).get("error")
-        if isinstance(error, CalibrationError):
-            raise error from None
-        where = ".".join(map(str, first["loc"]))
-        raise refused(called, f"{where}: {first['msg']}", first["input"]) from exc
-
-
-def refused(called: str, text: str, got: object) -> CalibrationError:
-    """Return the error that says why stored data are none."""
-    return CalibrationError(f"stored {called}: {text}", code=Code.SHAPE, got=got)
-
-
-def check_counts(found: Mapping[str, Any], names: Iterable[str], count: int, called: str) -> None:
-    """Raise (SHAPE) where a field has not as many items as another one."""
-    for name in names:
-        if len(found[name]) != count:
-            raise refused(called, f"{name}: expected {count}", len(found[name]))
-
-
-def check_shape(values: Array, shape: tuple[int, ...], called: str, name: str) -> None:
-    """Raise (SHAPE) where a field has not as many values as others ask for."""
-    if values.shape != shape:
-        raise refused(called, f"{name}: expected shape {shape}", values.shape)
-
-
-# ---------------------------------------------------------------------- numbers
-
-
-def _bounded(value: float) -> float:
-    if abs(value) > LARGEST:
-        raise ValueError(f"expected a number up to {LARGEST:g}")
-    return value
-
-
-Number = Annotated[FiniteFloat, AfterValidator(_bounded)]
-"""A number that may stand in a file: what is calculated of a few of them is finite, too."""
-
-NonNegative = Annotated[Number, Field(ge=0)]
-Positive = Annotated[Number, Field(gt=0)]
-Count = Annotated[int, Field(ge=0)]
-Pair = tuple[Number, Number]
-Triple = tuple[Number, Number, Number]
-OpenTriple = tuple[Number | None, Number | None, Number | None]
-
-
-def _opened(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _closed(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-Open = Annotated[float, Form(Number | None, lambda value, _: _opened(value), _closed)]
-"""A number that may be NaN; it stands as null."""
-
-OpenPair = Annotated[
-    tuple[float, float],
-    Form(
-        tuple[Number | None, Number | None],
-        read=lambda values, _: (_opened(values[0]), _opened(values[1])),
-        write=lambda values: [*map(_closed, values)],
-    ),
-]
-
-
-def row(checked: Any, make: Callable[[Any], Any] = tuple) -> Form:
-    """Return the form of a tuple of fixed length, or of what ``make`` makes of it; a list."""
-    return Form(checked, read=lambda values, _: make(values), write=list)
-
-
-Size = Annotated[tuple[int, int], row(tuple[int, int])]
-"""Width and height, pixels."""
-
-# ---------------------------------------------------------------------- arrays
-
-
-def as_array(values: Any, _: Context | None = None) -> Array:
-    """Return nested lists as an array, NaN for None; an empty one where rows differ in length."""
-    try:
-        return np.array(values, dtype=np.float64)
-    except ValueError:
-        return np.zeros(0)
-
-
-def _tolist(values: Array) -> Any:
-    return values.tolist()
-
-
-def _lists(values: Array) -> Any:
-    """Return an array as nested lists, None for NaN."""
-    if not np.isnan(values).any():
-        return values.tolist()
-    return [_lists(one) for one in values] if values.ndim > 1 else [*map(_closed, values.tolist())]
-
-
-Vector2 = Annotated[Array, Form(Pair, as_array, _tolist)]
-Vector3 = Annotated[Array, Form(Triple, as_array, _tolist)]
-Matrix3 = Annotated[Array, Form(tuple[Triple, Triple, Triple], as_array, _tolist)]
-Matrix43 = Annotated[Array, Form(tuple[Triple, Triple, Triple, Triple], as_array, _tolist)]
-
-
-def matrix(count: int | None = None) -> Form:
-    """Return the form of a matrix of ``count`` rows; its class checks what is not said here."""
-    checked = Annotated[list[list[Number]], Field(min_length=count or 0, max_length=count)]
-    return Form(checked, as_array, _tolist)
-
-
-def rows(checked: Any, *shape: int, least: int = 0, nulls: bool = False) -> Form:
-    """Return the form of an array (N, ``*shape``) that stands as a list.
-
-    ``checked``: the type of an item that pydantic checks. ``least``: how many there are at least.
-    ``nulls``: whether NaN may be among them; it stands as null.
-    """
-    return Form(
-        Annotated[list[checked], Field(min_length=least)],
-        read=lambda values, _: as_array(values).reshape(-1, *shape),
-        write=_lists if nulls else _tolist,
-    )
-
-
-SheetOffsets = Annotated[Array, rows(Triple, 3)]
-"""How far a target's points are from where they were meant to be, metres."""
-
-# ---------------------------------------------------------------------- remarks, targets, motions
-
-_REMARK = Form(
-    Annotated[Remark, AsMapping()],
-    read=lambda remark, _: remark,
-    write=lambda remark: {"code": remark.code.value, "text": remark.text},
-)
-Remarks = Annotated[tuple[Annotated[Remark, _REMARK], ...], AsList()]
 
 StoredTarget = Annotated[
     Target, Form(dict[str, Any], lambda data, _: target_from_data(data), target_to_data)
 ]
-
-
-class _Motion(NamedTuple):
-    rotation: Matrix3
-    translation: Vector3
-
-
-def motion(frames: Callable[[Context], tuple[str, str]]) -> Form:
-    """Return the form of a transform without the names of its frames, which ``frames`` gives."""
-    return Form(
-        Annotated[_Motion, AsMapping()],
-        read=lambda found, context: Transform(*frames(context), *found),
-        write=motion_to_data,
-    )
-
-
-def motion_to_data(transform: Transform) -> dict[str, Any]:
-    """Return a rigid motion as JSON takes it, without its frames."""
-    found = _Motion(transform.rotation, transform.translation)
-    return {name: values.tolist() for name, values in found._asdict().items()}
-
-
-def motion_from_data(data: Mapping[str, Any], target: str, source: str) -> Transform:
-    """Return the motion that :func:`motion_to_data` was made of; else SHAPE or NOT_RIGID."""
-    return Transform(target, source, *_checked(Annotated[_Motion, AsMapping()], data, "motion"))

@@ -1,4 +1,4 @@
-"""Where the solution begins: OpenCV's closed-form methods, and what no method can make up for."""
+"""Solve hand-eye by OpenCV's closed forms, and refuse motions that no method can solve."""
 
 from __future__ import annotations
 
@@ -7,27 +7,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.rigid import Rigid, log_rotation
-from smartcam.calibration._optional_imports import load
-from smartcam.exceptions import CalibrationError
+from smartcam._extras import load
+from smartcam.geometry import Code
+from smartcam.geometry._inside import Rigid, log_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.equations import RobotPoses
+    from smartcam.geometry._inside import Array
 
-LEAST_POSES = 3
+MIN_POSES = 3
 """Two motions about axes that differ determine the camera."""
 
 SAME_TURN = math.radians(0.5)
 """Poses turned less against each other count as one."""
 
-MOST_PAIRED = 40
+MAX_POSES_PAIRED = 40
 """Poses of which each pair is taken: time grows with the square of their number."""
 
-LEAST_TURN = math.radians(2.0)
+MAX_POSES_COMPARED = 200
+"""Poses that are compared with each other; of more, some tell as well how they are turned."""
+
+MIN_TURN_RADIANS = math.radians(2.0)
 """Rms turn of the poses about the second of their axes; one axis alone determines nothing."""
 
 # A motion of the robot between two poses, A, and what the camera sees of it, B, are the same
@@ -73,13 +75,10 @@ def check_motion(robot: RobotPoses) -> None:
     ``TOO_FEW``: fewer than three poses; ``POSES_TOO_SIMILAR``: fewer than three whose orientations
     differ; ``INSUFFICIENT_ROTATION``: turned about one axis only.
     """
-    turns = robot.poses.rotation
-    if len(turns) < LEAST_POSES:
-        raise CalibrationError(
-            f"hand-eye: expected at least {LEAST_POSES} poses with a view, got {len(turns)}",
-            code=Code.TOO_FEW,
-            expected=LEAST_POSES,
-            got=len(turns),
+    turns = _some_turns(robot)
+    if len(turns) < MIN_POSES:
+        raise Code.TOO_FEW.unexpected(
+            f"hand-eye: expected at least {MIN_POSES} poses with a view", MIN_POSES, len(turns)
         )
     against = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
     apart = np.linalg.norm(against, axis=-1) > SAME_TURN
@@ -87,25 +86,32 @@ def check_motion(robot: RobotPoses) -> None:
     for index in range(len(turns)):
         if apart[index, distinct].all():
             distinct.append(index)
-    if len(distinct) < LEAST_POSES:
-        raise CalibrationError(
-            f"hand-eye: expected at least {LEAST_POSES} orientations of the robot that are "
+    if len(distinct) < MIN_POSES:
+        raise Code.POSES_TOO_SIMILAR.refusal(
+            f"hand-eye: expected at least {MIN_POSES} orientations of the robot that are "
             f"{math.degrees(SAME_TURN):g} deg apart or more, got {len(distinct)}: pure shifts do "
             "not tell where the camera is",
-            code=Code.POSES_TOO_SIMILAR,
-            expected=LEAST_POSES,
-            got=len(distinct),
+            MIN_POSES,
+            len(distinct),
         )
     second = second_turn(robot)
-    if not second > LEAST_TURN:
-        raise CalibrationError(
+    if not second > MIN_TURN_RADIANS:
+        raise Code.INSUFFICIENT_ROTATION.refusal(
             "hand-eye: expected turns about two axes or more, "
-            f"{math.degrees(LEAST_TURN):g} deg rms about the second one, got "
+            f"{math.degrees(MIN_TURN_RADIANS):g} deg rms about the second one, got "
             f"{math.degrees(second):.2g} deg: along a single axis the camera is not determined",
-            code=Code.INSUFFICIENT_ROTATION,
-            expected=LEAST_TURN,
-            got=second,
+            MIN_TURN_RADIANS,
+            second,
         )
+
+
+def _some_turns(robot: RobotPoses) -> Array:
+    """Return the rotations of the poses; of many, some of them."""
+    turns, count = robot.poses.rotation, robot.poses.size
+    if count <= MAX_POSES_COMPARED:
+        return turns
+    some: Array = turns[np.linspace(0, count - 1, MAX_POSES_COMPARED).round().astype(np.intp)]
+    return some
 
 
 def second_turn(robot: RobotPoses) -> float:
@@ -115,17 +121,17 @@ def second_turn(robot: RobotPoses) -> float:
 
 
 def second_turns(robot: RobotPoses) -> Array:
-    """Return the same (V,) of the poses without each in turn; of all where they are too few."""
+    """Return the second turn (V,) without each pose in turn; of all where they are too few."""
     products = _turns(robot)
     whole, count = products.sum(axis=(0, 1)), len(products)
-    if count <= LEAST_POSES:
+    if count <= MIN_POSES:
         return np.full(count, _second(whole, count))
     return _second(whole - 2.0 * products.sum(axis=1), count - 1)
 
 
 def _turns(robot: RobotPoses) -> Array:
     """Return the products b b^T of the turns b from each pose to each, (V, V, 3, 3)."""
-    turns = robot.poses.rotation
+    turns = _some_turns(robot)
     between = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
     products: Array = between[..., None] * between[..., None, :]
     return products
@@ -146,8 +152,8 @@ def solve_linear(
     ``seen``: ``T_camera_target`` of each view. ``exactly``: by all of them, however many: else a
     method that takes them in pairs gets some of many, which is enough to begin with.
     """
-    if name in HAND_EYE and not exactly and seen.size > MOST_PAIRED:
-        some = np.linspace(0, seen.size - 1, MOST_PAIRED).round().astype(np.intp)
+    if name in HAND_EYE and not exactly and seen.size > MAX_POSES_PAIRED:
+        some = np.linspace(0, seen.size - 1, MAX_POSES_PAIRED).round().astype(np.intp)
         robot, seen = robot.taken(some), seen.taken(some)
     try:
         found = LINEAR[name](name, robot, seen)
@@ -199,6 +205,20 @@ def mean_target(camera: Rigid, robot: RobotPoses, seen: Rigid) -> Rigid:
     left, _, right = np.linalg.svd(each.rotation.mean(axis=0))
     proper = np.diag([1.0, 1.0, float(np.linalg.det(left @ right))])
     return Rigid(left @ proper @ right, each.translation.mean(axis=0))
+
+
+def scale_of(robot: RobotPoses, seen: Rigid) -> float | None:
+    """Return the target's size over the one that was said, as the robot's motions tell it."""
+    found = solve_linear("park", robot, seen)  # its rotation asks for no lengths
+    if found is None:
+        return None
+    # S = X^-1 A Z with all of the camera's lengths times s: R_A t_Z - t_X - s R_X t_S = -t_A.
+    between, count = robot.between, seen.size
+    rows = np.zeros((count, 3, 7))
+    rows[:, :, :3], rows[:, :, 3:6] = between.rotation, -np.eye(3)
+    rows[:, :, 6] = -seen.translation @ found[0].rotation.T
+    right = -between.translation.reshape(-1)
+    return float(np.linalg.lstsq(rows.reshape(-1, 7), right, rcond=None)[0][6])
 
 
 def _lists(motions: Rigid) -> tuple[list[Array], list[Array]]:

@@ -16,31 +16,42 @@ import dataclasses
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias, get_args
 
 import numpy as np
 
-from smartcam.calibration._geometry.rigid import Rigid, cross_matrix, right_jacobian
 from smartcam.calibration._least_squares import Normal, minimize, solve_scaled
 from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._lens.projection import linearize, pose_changes
+from smartcam.geometry._inside import Rigid, check_choice, cross_matrix, right_jacobian
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
     Index = NDArray[np.intp] | slice
 
 Setup: TypeAlias = Literal["eye-in-hand", "eye-to-hand"]
-"""Where the camera is: on the robot's hand, or beside the robot, looking at it."""
+"""Place of the camera: on the robot's hand, or beside the robot, looking at it."""
+
+
+def is_in_hand(setup: object, what: str) -> bool:
+    """Return True if the camera is on the hand, False if it looks at the robot.
+
+    ``what`` names the calibration. Raises SHAPE: there is no such setup.
+    """
+    check_choice(setup, get_args(Setup), f"{what}: setup")
+    return setup == "eye-in-hand"
+
 
 SMALLEST_GAIN = 1e-11
-"""Of a step, where the result is given out."""
+"""The last step gains less than this part of the cost, where the result is given out."""
 
 ROUGH_GAIN = 1e-7
-"""Of a step, where the result is compared: a hundredth of its standard deviation off."""
+"""The last step gains less than this part of the cost where results are only compared: they are a
+hundredth of a standard deviation off."""
 
 FIRST_DAMPING = 1e-6
 """Part of the diagonal: closed forms are near enough for steps that hardly need any."""
@@ -50,7 +61,7 @@ ROUNDING = 100.0
 
 
 class RobotSigmas(NamedTuple):
-    """How well a robot knows where it is: standard deviations of each axis.
+    """The accuracy with which a robot knows its pose: standard deviations of each axis.
 
     Attributes:
         rotation: radians.
@@ -62,7 +73,7 @@ class RobotSigmas(NamedTuple):
 
 
 class RobotNoise(NamedTuple):
-    """Of robot and camera."""
+    """Noise of robot and camera."""
 
     robot: RobotSigmas  # standard deviations of its poses
     # factor by which the views' poses are off more than their points tell: what the points of a
@@ -133,7 +144,7 @@ def _chain(camera: Rigid, robot: RobotPoses, target: Rigid) -> tuple[Array, Arra
 
 @dataclass(frozen=True, slots=True)
 class Observations(ABC):
-    """What the camera saw, view by view."""
+    """The camera's observations, view by view."""
 
     whitening: Array  # what makes its errors independent with a variance of 1
     # numbers of the parameters that are adjusted beside the poses, ascending: 0 is the target's
@@ -142,11 +153,11 @@ class Observations(ABC):
 
     @property
     def extra(self) -> int:
-        """How many parameters are adjusted beside the poses."""
+        """Number of parameters that are adjusted beside the poses."""
         return len(self.free)
 
     def spread(self, factor: float) -> Self:
-        """Return them with all standard deviations larger by a factor."""
+        """Return the observations with all standard deviations larger by a factor."""
         return dataclasses.replace(self, whitening=self.whitening / factor)
 
     def scale(self, change: Array) -> float:
@@ -159,7 +170,7 @@ class Observations(ABC):
 
     @abstractmethod
     def settled(self, change: Array) -> Self:
-        """Return them with a change (extra,) of the other parameters, which are known then."""
+        """Return the observations with a change (extra,) of the other parameters, then known."""
 
     @abstractmethod
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
@@ -195,7 +206,7 @@ class PixelObservations(Observations):
         )
 
     def settled(self, change: Array) -> PixelObservations:
-        """Return them with a change (extra,) of the other parameters, which are known then."""
+        """Return the observations with a change (extra,) of the other parameters, then known."""
         points = self.scale(change) * self.points
         return dataclasses.replace(self, model=self.camera(change), points=points, free=())
 
@@ -254,7 +265,7 @@ class PoseObservations(Observations):
         )
 
     def settled(self, change: Array) -> PoseObservations:
-        """Return them with a change (extra,) of the other parameters, which are known then."""
+        """Return the observations with a change (extra,) of the other parameters, then known."""
         return dataclasses.replace(self, poses=self.poses.scaled(self.scale(change)), free=())
 
     def evaluate(self, seen: Rigid, change: Array) -> tuple[Array, Array]:
@@ -273,7 +284,7 @@ class PoseObservations(Observations):
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Where camera and target are."""
+    """The poses of camera and target, with all else that was adjusted."""
 
     camera: Rigid  # ``X``
     target: Rigid  # ``Z``
@@ -291,10 +302,6 @@ class Solution:
     noise: RobotNoise | None = None
 
 
-def _corrected(robot: RobotPoses, corrections: Array) -> RobotPoses:
-    return dataclasses.replace(robot, poses=robot.poses.turned_before(corrections))
-
-
 def sums(
     robot: RobotPoses, seen: Observations, at: Solution, *, poses_only: bool = False
 ) -> tuple[Array, float]:
@@ -305,7 +312,7 @@ def sums(
     squares of the residuals with them. The derivatives are taken at ``at``. ``poses_only`` leaves
     out how well the points of a view fit each other, whatever its pose.
     """
-    moved = _corrected(robot, at.corrections)
+    moved = dataclasses.replace(robot, poses=robot.poses.turned_before(at.corrections))
     off, slopes = seen.evaluate(carried(at.camera, moved, at.target), at.change)
     outer, inner = _chain(at.camera, moved, at.target)
     # A correction v stands in R exp([v]x), and exp([v + dv]x) = exp([v]x) exp([J_r(v) dv]x). With
@@ -416,6 +423,21 @@ def without_each(robot: RobotPoses, seen: Observations, whole: Solution) -> Solu
         whole.target.turned_before(steps[:, 6:12]),
         whole.change + steps[:, 12:],
     )
+
+
+def pull_of_lens(robot: RobotPoses, seen: PixelObservations, at: Solution) -> Array:
+    """Return the derivatives of the steps of ``X`` and ``Z`` by the lens' values, (12, 4 + K)."""
+    # Of least squares the gradient g(x, l) is 0 at any lens l: dx/dl = -(dg/dx)^-1 dg/dl.
+    lens = tuple(range(1, 5 + len(seen.model.distortion)))
+    freed = dataclasses.replace(seen, free=(*seen.free, *lens))
+    change, none = np.zeros(freed.extra), np.zeros((robot.poses.size, 6))
+    change[: seen.extra] = at.change
+    spread = freed if at.noise is None else freed.spread(at.noise.shared)
+    corrections = at.corrections if at.corrections.size else none
+    there = dataclasses.replace(at, change=change, corrections=corrections)
+    whole, fitted = _normal(robot, spread, there).reduced()[0], 12 + seen.extra
+    pull: Array = -solve_scaled(whole[:fitted, :fitted], whole[:fitted, fitted:])[:12]
+    return pull
 
 
 def information(robot: RobotPoses, seen: Observations, truth: Solution) -> Array:

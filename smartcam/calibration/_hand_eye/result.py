@@ -1,4 +1,4 @@
-"""What a hand-eye calibration found, and what it is for: from pixels to the robot's base."""
+"""The result of a hand-eye calibration, and its use: from pixels to the robot's base."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.frames import Transform, as_motion
-from smartcam.calibration._geometry.rotations import Array, as_points, check_finite
 from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
 from smartcam.calibration._hand_eye.model_selection import on_plane, point_errors
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check_view
+from smartcam.calibration._lens.poses import CAMERA, TARGET, PoseInCamera, check_view, half_turned
 from smartcam.calibration._targets import resized
+from smartcam.calibration._verdict import VIEW_CURES, Allowed, judge
 from smartcam.calibration._views import TargetView
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code, Transform
+from smartcam.geometry._inside import Array, as_motion, as_points, check_finite
 from smartcam.models import Pose
 
 if TYPE_CHECKING:
@@ -27,9 +25,10 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from smartcam.calibration._targets import Target
+    from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 
 KIND = "hand-eye"
-"""What the files are called in the store."""
+"""Name of these calibrations' files in the store."""
 
 
 def _frames(context: storage.Context, of: str) -> tuple[str, str]:
@@ -54,7 +53,7 @@ COVARIANCE = storage.Form(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HandEyeCalibration(storage.SavedCalibration):
-    """What :func:`~smartcam.calibration.calibrate_hand_eye` finds; immutable.
+    """The result of :func:`~smartcam.calibration.calibrate_hand_eye`; immutable.
 
     Attributes:
         setup: ``eye-in-hand`` or ``eye-to-hand``.
@@ -67,27 +66,32 @@ class HandEyeCalibration(storage.SavedCalibration):
             the target of this size; a remark ``SCALE_MISMATCH`` says that it is more than half a
             percent off the nominal one. Where a ruler says that the target has its nominal size, it
             is the robot's or the lens' lengths that are off by this factor.
-        method: what the candidate is called that was taken: ``robot``, ``reprojection``, or
-            ``robot and reprojection`` for what lies between them; after a comma, what was adjusted.
+        method: what the candidate is called that was taken: ``robot`` or
+            ``reprojection``, or a closed form; after a comma, what was adjusted.
         candidates: rms held-out error of each candidate on the target, metres; None where a
             candidate has none.
         errors: (V,), rms error of each pose on the target, metres, with all used poses taken in;
             NaN for a bad pose in which the target would not be before the camera.
-        mean_error: mean over all points of the used poses, metres: what others publish as their 3D
+        mean_error: mean over all points of the used poses, metres, which others publish as 3D
             error.
         leave_one_out: (V,), the same of a calibration from the others, with the robot's pose as it
             was given, metres; NaN where there is none.
         held_out_error: rms of these over all points of the used poses, metres; None where there is
             none. It is what picking has to expect.
         covariance: (12, 12), of small steps of ``camera_pose`` (turn about its own axes, rad; shift
-            along those of its target, m) and of ``target_pose``, the lens taken as exact unless it
-            was adjusted; NaN where fewer than 5 poses told the robot's noise.
-        robot_sigmas: of each axis of the robot's poses, as given or estimated; None where they were
-            taken for exact, or the result lies between two methods.
+            along those of its target, m) and of ``target_pose``, by how far the solutions without
+            each of the poses scatter. A lens that was given is taken as exact unless it was
+            adjusted; the error of one that came of the same views is in it. NaN of fewer than 5
+            poses.
+        robot_sigmas: standard deviations of each axis of the robot's poses, as given or estimated;
+            None where the poses were taken for exact.
         robot_poses: ``T_base_flange``, as given.
         used: whether each pose was used; False for a bad one.
-        views: as given; empty where poses were.
+        views: views as given, but all numbered from the same end of a target that looks the same
+            after half a turn; empty where poses were given.
         target_poses: ``T_camera_target`` of each pose, from its own view or as given.
+        allowed_error: the largest error on the target of 95 of 100 points that the user allows,
+            metres; None: :attr:`verdict` takes a hundredth of the target's distance.
         warnings: what one should know before using it.
     """
 
@@ -101,6 +105,7 @@ class HandEyeCalibration(storage.SavedCalibration):
         ),
     }
     _shared: ClassVar[frozenset[str]] = frozenset({"frames", "setup", "target"})
+    _later: ClassVar[frozenset[str]] = frozenset({"allowed_error"})
 
     setup: Setup
     camera_pose: CameraPlace
@@ -119,6 +124,7 @@ class HandEyeCalibration(storage.SavedCalibration):
     used: Annotated[tuple[bool, ...], storage.AsList(3)]
     views: Annotated[tuple[TargetView, ...], storage.AsList()] = ()
     target_poses: Annotated[tuple[PoseInCamera, ...], storage.AsList(3)] = ()
+    allowed_error: storage.Positive | None = None
     warnings: storage.Remarks = ()
 
     def __post_init__(self) -> None:
@@ -141,6 +147,32 @@ class HandEyeCalibration(storage.SavedCalibration):
     def target(self) -> Target | None:
         """The target as large as ``target_scale`` says; None where poses of it were given."""
         return resized(self.views[0].target, self.target_scale) if self.views else None
+
+    @property
+    def verdict(self) -> CalibrationVerdict:
+        """Verdict on the calibration's quality, the millimetres it is good for, and the cure."""
+        return self.judged().verdict
+
+    @property
+    def allowed(self) -> Allowed:
+        """The largest error that is allowed, as the user said or by the target's distance."""
+        distances = [float(np.linalg.norm(one.translation)) for one in self.target_poses]
+        return Allowed.of(self.allowed_error, self.target_scale * float(np.median(distances)))
+
+    def judged(self) -> Judgement:
+        """Return the verdict and what is advisable; of few poses the error tells nothing."""
+        held_out, codes = self.held_out_error, {one.code for one in self.warnings}
+        left_out = [str(number) for number, used in enumerate(self.used, 1) if not used]
+        several = "s" * (len(left_out) > 1)
+        return judge(
+            None if held_out is None or Code.TOO_FEW in codes else 1e3 * held_out,
+            [one for one in self.warnings if not (left_out and one.code == Code.BAD_VIEW)],
+            worst=1 + self.worst,
+            allowed=self.allowed,
+            cures=VIEW_CURES,
+            more="take more views",
+            where=f" without view{several} {', '.join(left_out)}" if left_out else "",
+        )
 
     @property
     def rotation_error(self) -> float:
@@ -170,10 +202,9 @@ class HandEyeCalibration(storage.SavedCalibration):
         if self.setup == "eye-to-hand":
             return self.camera_pose
         if robot_pose is None:
-            raise CalibrationError(
+            raise Code.WRONG_FRAME.refusal(
                 "eye-in-hand: expected the robot's pose when the image was taken, got none",
-                code=Code.WRONG_FRAME,
-                expected="a pose of the robot",
+                "a pose of the robot",
             )
         return as_transform(robot_pose, self.camera_pose.target) @ self.camera_pose
 
@@ -193,7 +224,7 @@ class HandEyeCalibration(storage.SavedCalibration):
                 the hand.
             robot_pose: ``T_base_flange`` when the image was taken; none for a camera beside the
                 robot.
-            height: of the features over the plane, along its z, metres.
+            height: height of the features over the plane, along its z, metres.
 
         Returns:
             (N, 3), in the robot's base, metres.
@@ -221,8 +252,8 @@ class HandEyeCalibration(storage.SavedCalibration):
 
         Args:
             robot_poses: ``T_base_flange``.
-            views: of the same target in the same place, as many; or ``T_camera_target``, of which
-                the error is that of the target's origin.
+            views: views of the same target in the same place, as many; or ``T_camera_target``, of
+                which the error is that of the target's origin.
 
         Returns:
             Of each view (N,), of each pose of the target (1,), metres; infinite where a ray does
@@ -234,12 +265,11 @@ class HandEyeCalibration(storage.SavedCalibration):
                 :func:`~smartcam.calibration._lens.poses.check_view` says.
         """
         if len(robot_poses) != len(views):
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 f"point_errors: expected as many views as poses of the robot, got {len(views)} and "
                 f"{len(robot_poses)}",
-                code=Code.SHAPE,
-                expected=len(robot_poses),
-                got=len(views),
+                len(robot_poses),
+                len(views),
             )
         return tuple(
             self._errors(as_transform(pose, self._flange).undated(), one)
@@ -256,14 +286,17 @@ class HandEyeCalibration(storage.SavedCalibration):
         lens = self._lens("point_errors")
         check_view(view, lens.size)
         if self.views and view.target != self.views[0].target:
-            raise CalibrationError(
+            raise Code.DIFFERENT_TARGETS.refusal(
                 f"point_errors: expected views of {self.views[0].target}, got one of {view.target}",
-                code=Code.DIFFERENT_TARGETS,
-                expected=self.views[0].target,
-                got=view.target,
+                self.views[0].target,
+                view.target,
             )
-        points = self.target_scale * view.object_points
-        return point_errors(lens, seen.rigid, view.points, points)
+        found = [
+            point_errors(lens, seen.rigid, one.points, self.target_scale * one.object_points)
+            for one in (view, *([half_turned(view)] if view.target.turned_alike else []))
+        ]
+        errors = min(found, key=lambda off: float(np.median(off)))
+        return errors if errors is found[0] else errors[::-1]
 
     @property
     def _flange(self) -> str:
@@ -310,11 +343,10 @@ class HandEyeCalibration(storage.SavedCalibration):
 
     def _lens(self, what: str) -> CameraModel:
         if self.camera is None:
-            raise CalibrationError(
+            raise Code.NO_CALIBRATION.refusal(
                 f"{what}: expected a calibration with the camera's lens, got one from poses of "
                 "the target",
-                code=Code.NO_CALIBRATION,
-                expected="camera",
+                "camera",
             )
         return self.camera
 
@@ -327,10 +359,9 @@ def _met(camera: CameraModel, pixels: Array, plane: Transform, height: float) ->
     missed = ~np.isfinite(found).all(axis=1)
     if missed.any():
         row = int(np.argmax(missed))
-        raise CalibrationError(
+        raise Code.OUT_OF_FIELD.refusal(
             "to_plane: expected pixels whose rays meet the plane before the camera, got "
             f"{pixels[row].tolist()} in row {row}, whose ray does not",
-            code=Code.OUT_OF_FIELD,
             got=pixels[row].tolist(),
         )
     above: Array = found + np.array([0.0, 0.0, height])

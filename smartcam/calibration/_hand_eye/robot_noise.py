@@ -1,4 +1,4 @@
-"""How well a robot knows its poses, told from what a camera on it sees.
+"""Estimate a robot's pose noise from what a camera on it sees.
 
 The sums of an adjustment are worked out once; for any two standard deviations of the robot they
 give the restricted likelihood of what was seen, in which neither the unknown poses of camera and
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.calibration._hand_eye.equations import (
     ROUGH_GAIN,
     RobotNoise,
@@ -22,32 +23,32 @@ from smartcam.calibration._hand_eye.equations import (
     sums,
 )
 from smartcam.calibration._least_squares import solve_scaled
-from smartcam.calibration._optional_imports import load
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.equations import Observations, RobotPoses, Solution
+    from smartcam.geometry._inside import Array
 
 FIRST = RobotSigmas(1e-3, 5e-4)
-"""With which the first adjustment is made: 0.06 degrees and half a millimetre."""
+"""Noise of the robot in the first adjustment: 0.06 degrees and half a millimetre."""
 
 LEAST = RobotSigmas(1e-7, 1e-8)
-"""What no robot is better than: a hundredth of a micrometre."""
+"""Least noise of any robot: a hundredth of a micrometre."""
 
 MOST = RobotSigmas(0.3, 0.1)
-"""What no robot is worse than."""
+"""Largest noise of any robot: 0.3 rad and 100 mm."""
 
 FIRST_SHARED = 5.0
-"""With which the first adjustment is made where it is estimated."""
+"""Factor of the views' shared errors in the first adjustment, where it is estimated."""
 
-MOST_SHARED = 300.0
-"""A view of 100 points at a tenth of a pixel would say nothing then."""
+MAX_SHARED_FACTOR = 300.0
+"""Largest factor of the views' shared errors: with it 100 points at 0.1 pixels would say
+nothing."""
 
 COARSE = 5
 """Values of each standard deviation that are tried at first."""
 
 ROUNDS = 4
-"""Of adjusting and estimating; the estimate hardly changes after two."""
+"""Rounds of adjusting and estimating at most; the estimate hardly changes after two."""
 
 SETTLED = 0.02
 """Part of the estimates by which a round must change them for another one."""
@@ -85,7 +86,7 @@ def _estimate(
     ``search``: look for it everywhere, not only from ``noise`` on.
     """
     total = sums(robot, seen, at, poses_only=True)[0]
-    low, high = np.log([*LEAST, 1.0]), np.log([*MOST, MOST_SHARED])
+    low, high = np.log([*LEAST, 1.0]), np.log([*MOST, MAX_SHARED_FACTOR])
 
     def cost(logs: Array) -> float:
         inside = np.clip(logs, low, high)

@@ -1,4 +1,4 @@
-"""What poses of a robot and views say at first sight: whether they belong together, and which.
+"""Check whether a robot's poses and the views belong together, and which of them do not.
 
 Some of the poses tell where camera and target are by a closed form; what most of the poses agree
 with is taken. So a few poses that belong to other views do not spoil the rest.
@@ -7,14 +7,12 @@ with is taken. So a few poses that belong to other views do not spoil the rest.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import as_motion
-from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._hand_eye.closed_forms import solve_linear
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
@@ -25,16 +23,18 @@ from smartcam.calibration._hand_eye.equations import (
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._views import as_list
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+from smartcam.geometry._inside import Rigid, as_motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.model_selection import Problem
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
 
 CLOSED: Final = ("park", "shah")
 """Closed forms that are tried, of unlike kinds: one stands where the other fails."""
@@ -49,23 +49,24 @@ GROSS: Final = 10.0
 """A pose that is more times the median off belongs to another view, if it is nowhere near, too."""
 
 OTHER_WAY: Final = 5.0
-"""Poses that fit as many times better when inverted are taken for given so."""
+"""Poses that fit as many times better when inverted, or a view numbered from the target's other
+end, are taken for given so."""
 
 OTHERWISE: Final = 20.0
-"""The same of other readings, which are rarer than a pose too many of another view."""
+"""Poses that fit as many times better when transposed, mirrored or in another unit of length are
+taken for given so: these readings are rarer than one pose too many of another view."""
 
 POOREST: Final = RobotSigmas(math.radians(2.0), 0.01)
-"""What no robot is worse than that is any good: 2 degrees and 10 mm."""
+"""Largest noise of a robot that is any good: 2 degrees and 10 mm."""
 
 MILLI: Final = 1e-3
 
 MIRROR: Final = np.diag([-1.0, 1.0, 1.0])
-"""Which axis changes its direction does not matter: mirrors differ by turns, which base and flange
-make up for."""
+"""Mirror of one axis; any does, as mirrors differ by turns that base and flange make up for."""
 
 
 class Agreed(NamedTuple):
-    """What most of the poses agree with."""
+    """The poses of camera and target on which most of the robot's poses agree."""
 
     camera: Rigid  # ``X``
     target: Rigid  # ``Z``
@@ -73,7 +74,7 @@ class Agreed(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Of all poses, metres."""
+        """Median of the distances that all poses are off, metres."""
         return float(np.median(self.off))
 
     def gross(self, limit: float) -> NDArray[np.intp]:
@@ -94,11 +95,8 @@ def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
     for number, one in enumerate(found):
         if one.label != found[0].label or (one.target, one.source) == (TARGET, CAMERA):
             wanted = f"T_{CAMERA}_{TARGET}" if number == 0 else found[0].label
-            raise CalibrationError(
-                f"{what} {number}: expected {wanted}, got {one.label}",
-                code=Code.WRONG_FRAME,
-                expected=wanted,
-                got=one.label,
+            raise Code.WRONG_FRAME.unexpected(
+                f"{what} {number}: expected {wanted}", wanted, one.label
             )
     return found
 
@@ -158,12 +156,37 @@ def _better(
         found = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
         if found is None:
             continue
-        apart = problem.poses.after(carried(found[0], problem.robot, found[1]))
-        turn, shift = (np.linalg.norm(part, axis=1) for part in np.split(apart, 2, axis=1))
-        tried = Agreed(*found, np.hypot(shift, arm * turn))
+        expected = carried(found[0], problem.robot, found[1])
+        tried = Agreed(*found, _apart(problem.poses, expected, arm))
         if best is None or tried.median < best.median:
             best = tried
     return best
+
+
+def _apart(poses: Rigid, expected: Rigid, arm: float) -> Array:
+    """Return the distances (V,) of poses from the expected ones, metres at an arm's length."""
+    turn, shift = np.split(poses.after(expected), 2, axis=1)
+    apart: Array = np.hypot(np.linalg.norm(shift, axis=1), arm * np.linalg.norm(turn, axis=1))
+    return apart
+
+
+def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) -> NDArray[np.bool_]:
+    """Return a mask of views that number a target from its other end: at most half of them.
+
+    The target looks the same after a half ``turn``, and each view alone may take either end for
+    the origin: the robot's motions tell. ``arm``: the target's extent, metres.
+    """
+    least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
+    for numbers, name in itertools.product(_parts(poses.size), CLOSED):
+        found = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
+        if found is None:
+            continue
+        expected = carried(found[0], robot, found[1])
+        as_is, turned = (_apart(one, expected, arm) for one in (poses, poses @ turn))
+        middle = float(np.median(np.minimum(as_is, turned)))
+        if middle < least:
+            least, other = middle, OTHER_WAY * turned < as_is
+    return ~other if 2 * other.sum() > len(other) else other
 
 
 def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
@@ -203,12 +226,11 @@ def check_poses(problem: Problem) -> Agreed:
         less = _on_target(other, agreed)
         if less < most_error(other) and off > clear * less:
             so = f"{1e3 * off:.3g} mm off" if math.isfinite(off) else "nowhere near"
-            raise CalibrationError(
+            raise code.refusal(
                 "hand-eye: expected poses of the flange in the base, and the setup as it is, got "
                 f"poses that are {so} so, but {1e3 * less:.3g} mm when read {how}",
-                code=code,
-                expected="T_base_flange",
-                got=less,
+                "T_base_flange",
+                less,
             )
     most = most_error(problem)
     if found is None or off > most:
@@ -222,11 +244,10 @@ def poor_fit(what: str, off: float | None) -> CalibrationError:
 
     ``off``: by how much the target is off, metres; None where that is not known.
     """
-    return CalibrationError(
+    return Code.POOR_FIT.refusal(
         f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "
         "those of the views, in their order and in metres, are their angles in the convention that "
-        "was read, and is the setup right?",
-        code=Code.POOR_FIT,
+        "was read, is the setup right, and is the target numbered from the same end in all views?",
         got=off,
     )
 

@@ -15,37 +15,40 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._geometry.rigid import IDENTITY, Rigid
+from smartcam.calibration._jackknife import weighed_jackknife
 from smartcam.calibration._least_squares import Normal, inverse_scaled, minimize, solve_scaled
-from smartcam.calibration._lens.projection import (
-    SMOOTH,
-    excess,
-    linearize,
-    pose_changes,
-    smooth_changes,
-    whitening,
-)
+from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.geometry._inside import IDENTITY, Rigid
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
 SETTLED: Final = 1e-7
 """Part of the weighted squares by which the last step still lowers them: of 1000 coordinates it is
 a hundredth of a standard deviation."""
 
-LOOSE: Final = 0.1
+LOOSE: Final = 0.01
 """Standard deviation that a sheet's point is thought to be off, in parts of its distance to the
-next: one that few views show does not go astray."""
+next: of six recorded views a tenth makes the held-out error 1.7 times as large as an exact sheet
+does, a hundredth 1.1, and of many both the same (measured)."""
 
 TIGHT: Final = 1e-4
-"""The same for place, direction and size of all points as a whole, which no view tells."""
+"""Standard deviation of the place, direction and size of all of a sheet's points as a whole, which
+no view tells, in parts of a point's distance to the next."""
+
+ANEW: Final = 1e-5
+"""Part of the weighted squares by which the last step lowers them, in a fit without a pose."""
 
 FEW: Final = 5
 """Poses up to which a fit without one of them is no small step away."""
+
+BENT: Final = 1.2
+"""Squares of a pose that was left out over those that one step foretells, beyond which the way is
+too bent for one step: lenses whose coefficients make up for each other."""
 
 Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 """Numbers of things."""
@@ -82,18 +85,18 @@ class Bundle:
         basis: Array | None = None,
         points: Array | None = None,
     ) -> Bundle:
-        """Return that of one camera; without a basis its lens is known."""
+        """Return the bundle of one camera; without a basis its lens is known."""
         known = known_lens(camera) if basis is None else basis
         return cls((camera,), Rigid.stacked([]), poses, (known,), points=points)
 
     def known(self) -> Bundle:
-        """Return it with nothing to adjust but the poses."""
+        """Return the bundle with nothing to adjust but the poses."""
         lenses = tuple(known_lens(one) for one in self.cameras)
         return dataclasses.replace(self, basis=lenses, rigid=True, free=False)
 
     @property
     def lens_columns(self) -> list[slice]:
-        """Where each camera's unknowns stand among the shared ones."""
+        """Slices of each camera's unknowns among the shared ones."""
         ends = np.cumsum([0, *(one.shape[1] for one in self.basis)]).tolist()
         return [slice(first, last) for first, last in itertools.pairwise(ends)]
 
@@ -114,7 +117,7 @@ class Bundle:
         return self.rig.taken(camera - 1) if camera else IDENTITY
 
     def moved(self, shared: Array, poses: Array) -> Bundle:
-        """Return it changed by the shared unknowns (S,) and by those of the poses (P, 6)."""
+        """Return the bundle changed by the shared unknowns (S,) and by the poses' ones (P, 6)."""
         columns = self.lens_columns
         cameras = tuple(
             with_lens(camera, lens_values(camera) + basis @ shared[some]) if basis.size else camera
@@ -128,6 +131,14 @@ class Bundle:
         return dataclasses.replace(
             self, cameras=cameras, rig=rig, poses=self.poses.turned_after(poses), points=points
         )
+
+    def camera_changes(self, other: Bundle) -> Array:
+        """Return by how much the cameras' unknowns of another bundle are more than these."""
+        lenses = [
+            np.linalg.pinv(basis) @ (lens_values(to) - lens_values(camera))
+            for camera, to, basis in zip(self.cameras, other.cameras, self.basis, strict=True)
+        ]
+        return np.concatenate([*lenses, *([] if self.rigid else self.rig.after(other.rig))])
 
 
 def known_lens(camera: CameraModel) -> Array:
@@ -150,7 +161,7 @@ def with_lens(camera: CameraModel, values: Array) -> CameraModel:
 
 @dataclass(frozen=True, slots=True)
 class AdjustedBundle:
-    """What an adjustment leads to."""
+    """The result of adjusting a bundle."""
 
     bundle: Bundle  # the values with the least weighted squares
     residuals: list[Array]  # of each sight (N, 2), seen minus projected, pixels
@@ -160,8 +171,12 @@ class AdjustedBundle:
     freedom: int  # coordinates less unknowns
 
     @property
-    def covariance(self) -> Array:
-        """That of the cameras' unknowns; NaN where ``weighted`` is infinite."""
+    def by_noise(self) -> Array:
+        """Covariance of the cameras' unknowns, were each point's error its own.
+
+        It is far too small where views err as a whole, but tells what views leave open. NaN where
+        ``weighted`` is infinite.
+        """
         count = self.bundle.of_cameras
         if not math.isfinite(self.weighted):
             return np.full((count, count), np.nan)
@@ -172,7 +187,7 @@ class AdjustedBundle:
 
     @property
     def pose_covariance(self) -> Array:
-        """That of each pose (P, 6, 6)."""
+        """Covariance of each pose (P, 6, 6)."""
         return self.normal.covariance()[1]
 
     @property
@@ -201,10 +216,15 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
     return adjust(bundle, sights, more)
 
 
-def adjust(bundle: Bundle, sights: Sequence[Sight], more: float) -> AdjustedBundle:
-    """Return the least squares, each point weighted by its covariance and ``more`` variance."""
+def adjust(
+    bundle: Bundle, sights: Sequence[Sight], more: float, gain: float = SETTLED
+) -> AdjustedBundle:
+    """Return the least squares, each point weighted by its covariance and ``more`` variance.
+
+    ``gain``: part of the weighted squares by which the last step still lowers them.
+    """
     normal_at = BundleEquations(bundle, sights, more).normal
-    bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=SETTLED)
+    bundle, normal = minimize(bundle, normal_at, Bundle.moved, gain=gain)
     count = 2 * sum(len(sight.view.ids) for sight in sights)
     seen = len({sight.pose for sight in sights})
     return AdjustedBundle(
@@ -223,33 +243,57 @@ class LeftOut(NamedTuple):
     pose: int
     bundle: Bundle  # the cameras and the sheet, without its views
     residuals: list[Array]  # of each of its views (N, 2), pixels; the pose alone is fitted to them
+    # of the cameras' unknowns without its views, were each point's error its own: inverse normal
+    # matrix, of variance 1
+    by_noise: Array
 
 
-def held_out(
-    adjusted: AdjustedBundle, sights: Sequence[Sight], poses: Sequence[int]
-) -> Iterator[LeftOut]:
-    """Yield some poses, each left out once; where there are few the fit is done anew."""
+def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut]:
+    """Return each pose that is seen left out once; where one step does not do, fitted anew."""
     # At the solution the normal equations without a pose are all less its own, both with their
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
     # without the pose. What it leaves is of second order in how far the pose pulls the others.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), section 2.2.
     matrix, right, _, _ = adjusted.normal.reduced()
+    count, found = adjusted.bundle.of_cameras, []
+    poses = sorted({one.pose for one in sights})
     for pose in poses:
         own = [one._replace(pose=0) for one in sights if one.pose == pose]
-        without = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
-        if len(poses) > FEW:
-            part = (
-                BundleEquations(without, own, adjusted.more, prior=False).normal(without).reduced()
-            )
-            step = solve_scaled(matrix - part[0], right - part[1])
-            without = without.moved(step, part[3] - part[2] @ step)
-        else:
-            others = [one for one in sights if one.pose != pose]
-            anew = adjust(adjusted.bundle, others, adjusted.more).bundle
-            without = dataclasses.replace(anew, poses=without.poses)
-            at = adjust(without.known(), own, adjusted.more).bundle.poses
-            without = dataclasses.replace(without, poses=at)
-        yield LeftOut(pose, without, residuals(without, own))
+        whole = dataclasses.replace(adjusted.bundle, poses=adjusted.bundle.poses.taken([pose]))
+        equations = BundleEquations(whole, own, adjusted.more, prior=False)
+        at = equations.normal(whole)
+        part = at.reduced()
+        wanted = np.column_stack([right - part[1], np.eye(len(right), count)])
+        step, by_noise = np.split(solve_scaled(matrix - part[0], wanted), [1], axis=1)
+        shared = step[:, 0]
+        without = whole.moved(shared, part[3] - part[2] @ shared)
+        squares = at.cost - float((at.own_right * part[3]).sum()) - 2.0 * part[1] @ shared
+        squares += float(shared @ part[0] @ shared)
+        if len(poses) <= FEW or not equations.normal(without).cost <= BENT * squares:
+            without = _fitted_without(adjusted, sights, pose, own)
+        found.append(LeftOut(pose, without, residuals(without, own), by_noise[:count]))
+    return found
+
+
+def _fitted_without(
+    adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int, own: Sequence[Sight]
+) -> Bundle:
+    """Return the cameras as they are fitted to all views but a pose' own, and its pose to these."""
+    others = [one for one in sights if one.pose != pose]
+    anew = adjust(adjusted.bundle, others, adjusted.more, ANEW).bundle
+    without = dataclasses.replace(anew, poses=adjusted.bundle.poses.taken([pose]))
+    at = adjust(without.known(), own, adjusted.more).bundle.poses
+    return dataclasses.replace(without, poses=at)
+
+
+def camera_covariance(adjusted: AdjustedBundle, left_out: Sequence[LeftOut]) -> Array:
+    """Return the covariance of the cameras' unknowns, as the views scatter.
+
+    ``left_out``: all poses, each once.
+    """
+    changes = [adjusted.bundle.camera_changes(one.bundle) for one in left_out]
+    spreads = np.array([one.by_noise for one in left_out])
+    return weighed_jackknife(np.array(changes), spreads, adjusted.by_noise)
 
 
 def free_points(sights: Sequence[Sight]) -> int:
@@ -284,11 +328,10 @@ def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
 
 
 class BundleEquations:
-    """What does not change while a bundle is adjusted.
+    """The parts of a bundle's equations that stay the same while the bundle is adjusted.
 
     ``prior``: whether free points are held where they were meant to be, as far as LOOSE and TIGHT
-    say. ``smooth``: with further unknowns of each camera, the last of all: any
-    :func:`~smartcam.calibration._lens.projection.smooth_changes` of its image.
+    say.
     """
 
     def __init__(
@@ -298,19 +341,16 @@ class BundleEquations:
         more: float,
         *,
         prior: bool = True,
-        smooth: bool = False,
     ) -> None:
         sides = ([one for one in sights if one.camera == k] for k in range(len(bundle.cameras)))
         self._groups = [_group(k, some, more) for k, some in enumerate(sides) if some]
         self._unseen = ~np.isin(np.arange(bundle.poses.size), [one.pose for one in sights])
         self._meant = sights[0].view.target.points
-        self._smooth = SMOOTH if smooth else 0
         self._prior = _prior(self._meant) if prior and bundle.free else None
 
     def normal(self, bundle: Bundle) -> Normal:
         """Return the normal equations."""
-        shared = bundle.shared + self._smooth * len(bundle.cameras)
-        found, cost = Normal.nothing(shared, bundle.poses.size, 6), 0.0
+        found, cost = Normal.nothing(bundle.shared, bundle.poses.size, 6), 0.0
         found.own[self._unseen] = np.eye(6)  # poses that nothing moves stay
         matrix, right = found.shared, found.shared_right
         for group in self._groups:
@@ -345,7 +385,7 @@ class BundleEquations:
         return found._replace(cost=cost if math.isfinite(cost) else math.inf)
 
     def _columns(self, bundle: Bundle, group: _Group) -> tuple[Indices, Array, Array]:
-        """Return which of the shared unknowns a camera has, and the derivatives of what it sees.
+        """Return the indices of a camera's shared unknowns, and the derivatives of what it sees.
 
         Whitened, (N, 2, ...): by the pose, by these unknowns, and the residuals in one; by the
         points on the target (N, 2, 3).
@@ -363,16 +403,13 @@ class BundleEquations:
         if number and not bundle.rigid:
             own.append(bundle.lens_columns[-1].stop + 6 * (number - 1) + np.arange(6))
             parts.append(pose_changes(seen.by_point, there))
-        if self._smooth:
-            own.append(bundle.shared + self._smooth * number + np.arange(self._smooth))
-            parts.append(smooth_changes(seen.pixels, bundle.cameras[number].size))
         parts.append((group.pixels - seen.pixels)[..., None])
         by_point = group.white @ (by_near @ rotation[group.pose]) if bundle.free else by_near
         return np.concatenate(own), group.white @ np.concatenate(parts, axis=2), by_point
 
 
 def residuals(bundle: Bundle, sights: Iterable[Sight]) -> list[Array]:
-    """Return those of each view (N, 2), seen minus projected, pixels."""
+    """Return the residuals of each view (N, 2), seen minus projected, pixels."""
     found = []
     for number, pose, view in sights:
         points = view.object_points if bundle.points is None else bundle.points[view.ids]

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import IDENTITY
+from smartcam._argument_checks import a_number, an_integer, each, or_none, takes
 from smartcam.calibration._lens.field import (
     LEAST,
     SHAPE,
@@ -21,27 +19,25 @@ from smartcam.calibration._lens.field import (
     sensitivity,
 )
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.uncertainty import MapFigures, figures
-from smartcam.calibration._optional_imports import load
 from smartcam.calibration._statistics import Noise
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code, Transform
+from smartcam.geometry._inside import IDENTITY
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rigid import Rigid
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array, Rigid
 
 CELLS: Final = (6, 8)
 """Rows and columns of an image's cells, by which is told where both have seen the target."""
 
 LEVEL: Final = 0.01
-"""How seldom noise alone may make two calibrations differ as much."""
+"""Probability with which noise alone may make two calibrations differ as much."""
 
 SMALLEST: Final = 1e-9
 """A chance that is less is not told: the noise is not as normal as that."""
 
 STEPS: Final = 50
-"""Of the motion's fit; it takes five."""
+"""The fit of the motion takes at most this many steps; it usually takes five."""
 
 SETTLED: Final = 1e-9
 """Pixels: a step that moves nothing by more is the last."""
@@ -51,47 +47,49 @@ TINY: Final = 1e-3
 
 
 class Lens(NamedTuple):
-    """What is known of a lens, where one calibration is compared with another.
+    """A lens and its uncertainty, for the comparison of one calibration with another.
 
     Attributes:
         camera: the lens.
-        covariance: (4 + K, 4 + K), of its values; None: not known.
+        covariance: (4 + K, 4 + K), covariance of the lens' values; None: not known.
         points: (N, 3), where the target was seen before the camera, metres; None: not known.
+        views: count of views from which ``covariance`` is an estimate.
     """
 
     camera: CameraModel
     covariance: Array | None = None
     points: Array | None = None
+    views: int = 1
 
     @classmethod
     def of(cls, one: IntrinsicCalibration | CameraModel) -> Lens:
-        """Return that of a calibration, or of a bare lens; ``SHAPE``: neither."""
+        """Return the lens of a calibration, or a bare lens; ``SHAPE``: neither."""
         if isinstance(one, IntrinsicCalibration):
-            return cls(one.camera, one.covariance, one.target_points)
+            views = sum(fit.used for fit in one.views)
+            return cls(one.camera, one.covariance, one.target_points, views)
         if isinstance(one, CameraModel):
             return cls(one)
-        raise CalibrationError(
-            f"compare: expected calibrations of lenses, or camera models, got {type(one).__name__}",
-            code=Code.SHAPE,
-            expected="IntrinsicCalibration or CameraModel",
-            got=type(one).__name__,
+        raise Code.SHAPE.unexpected(
+            "compare: expected calibrations of lenses, or camera models",
+            "IntrinsicCalibration or CameraModel",
+            type(one).__name__,
         )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LensComparison:
-    """What :func:`compare` finds.
+    """The result of :func:`compare`.
 
     Attributes:
-        distance: of the points from the camera, metres; None: infinity.
+        distance: distance of the points from the camera, metres; None: infinity.
         pixels: (h, w, 2), where the first lens sees a point.
         difference: (h, w, 2), where the second one sees it, less that, after the motion; pixels;
             NaN where one of them sees none.
         expected: (h, w, 2, 2), covariance of ``difference`` that both calibrations' noise leads to;
             None where it is not known of both.
         motion: ``T_b_a``, the small motion of the camera that was taken off.
-        ratio: of the differences in units of what noise leads to, root of the mean square: about 1
-            where noise alone is at work; None without ``expected``.
+        ratio: size of the differences in units of what noise leads to, root of the mean square:
+            about 1 where noise alone is at work; None without ``expected``.
         chance: how likely noise alone makes the calibrations differ as much, 0 to 1; None without
             ``expected``.
     """
@@ -117,14 +115,14 @@ class LensComparison:
 
     @property
     def predicted(self) -> MapFigures | None:
-        """What noise leads to, in the same four numbers; None where it is not known."""
+        """Differences that noise leads to, in the same four numbers; None if they are unknown."""
         if self.expected is None:
             return None
         return figures(np.sqrt(np.trace(self.expected, axis1=2, axis2=3) / 2))
 
     @property
     def same(self) -> bool | None:
-        """Whether noise explains the difference; None where the noise is not known."""
+        """True if noise explains the difference; None where the noise is not known."""
         return None if self.chance is None else self.chance >= LEVEL
 
     @property
@@ -139,6 +137,7 @@ class LensComparison:
         return f"they differ by more than their noise explains: {noise}"
 
 
+@takes(distance=or_none(a_number), shape=each(an_integer, 2))
 def compare(
     a: IntrinsicCalibration | CameraModel,
     b: IntrinsicCalibration | CameraModel,
@@ -156,7 +155,7 @@ def compare(
     Args:
         a: the one that the differences begin at; bare lenses are compared without a prediction.
         b: the other one, for images of the same size.
-        distance: of the points, metres; None: infinity.
+        distance: distance of the points, metres; None: infinity.
         shape: rows and columns of the map, 2 to 500 each, from corner to corner.
 
     Raises:
@@ -175,12 +174,11 @@ def compare_lenses(
     check_distance(distance)
     first, second, far = a.camera, b.camera, distance is None
     if tuple(first.size) != tuple(second.size):
-        raise CalibrationError(
+        raise Code.WRONG_SIZE.refusal(
             f"compare: expected lenses of images of one size, got {first.size[0]} x "
             f"{first.size[1]} and {second.size[0]} x {second.size[1]} pixels",
-            code=Code.WRONG_SIZE,
-            expected=first.size,
-            got=second.size,
+            first.size,
+            second.size,
         )
     pixels = places(first.size, shape)
     gauge, bare = _gauge(a, b, distance)
@@ -195,7 +193,7 @@ def compare_lenses(
         of_b = sensitivity(second, moved, far=far).freed(sensitivity(second, there))
         spread = np.concatenate([of_a @ _root(a.covariance), of_b @ _root(b.covariance)], axis=2)
         difference[~np.isfinite(spread).all(axis=(1, 2))] = np.nan
-        ratio, chance = _judged(difference, spread)
+        ratio, chance = _judged(difference, spread, a.views + b.views - 2)
         expected = (spread @ spread.swapaxes(1, 2)).reshape(*shape, 2, 2)
     return LensComparison(
         distance=distance,
@@ -217,9 +215,9 @@ def rig_difference(
 
     Args:
         a: ``T_second_first`` of the one calibration.
-        b: that of the other.
-        first: of the lenses of the first camera.
-        second: of those of the second.
+        b: ``T_second_first`` of the other calibration.
+        first: comparison of the lenses of the first camera.
+        second: comparison of the lenses of the second camera.
 
     Returns:
         The turn between both, radians, and the shift, metres.
@@ -276,11 +274,10 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
         motion = motion.turned_after(step)
         if np.abs(by_motion[known] @ step).max() < SETTLED:
             return motion
-    raise CalibrationError(
+    raise Code.POOR_FIT.refusal(
         "compare: expected two calibrations of one lens, got lenses of which no motion of the "
         "camera brings the one near the other",
-        code=Code.POOR_FIT,
-        expected="two calibrations of one lens",
+        "two calibrations of one lens",
     )
 
 
@@ -297,65 +294,30 @@ def _root(covariance: Array) -> Array:
     return root
 
 
-class _Judged(NamedTuple):
-    ratio: float
-    chance: float
+def _judged(difference: Array, spread: Array, views: int) -> tuple[float, float]:
+    """Return the ratio of differences (N, 2) to what is expected of them, and its chance.
 
-
-def _judged(difference: Array, spread: Array) -> _Judged:
-    """Return the ratio of differences (N, 2) to what noise leads to, and its chance.
-
-    Two tests, of which the more surprised one counts: whether the lenses' values differ, each
-    combination of them by its own noise, and whether the places do, whatever moved them.
+    ``spread`` (N, 2, K): S with S S^T their covariance. ``views``: that both estimates of it are
+    from, less one of each.
     """
-    known = np.isfinite(difference).all(axis=1)
-    if not known.any():
-        raise CalibrationError(
-            "compare: expected lenses that reach the same places of the image, got none",
-            code=Code.OUT_OF_FIELD,
-            got=0,
-        )
-    off, moves = difference[known], spread[known]
-    tests = (_by_values(off, moves), _by_places(off, moves))
-    likelier, least = max(tests, key=lambda one: one.chance), min(tests, key=lambda one: one.chance)
-    # the least of two chances is below c with a chance of 2 c at most (Bonferroni)
-    return _Judged(
-        (least if 2 * least.chance < 1.0 else likelier).ratio, min(1.0, 2 * least.chance)
-    )
-
-
-def _by_values(off: Array, moves: Array) -> _Judged:
-    """Test along the directions in which values of the lenses move the places together."""
-    # With C = S S^T = U L U^T the components U^T e have the variances l, and the sum of
-    # (u^T e)^2 / l is distributed as chi^2. Directions that move the places by less than TINY rms
-    # are not told from what the linearization leaves.
-    flat = moves.reshape(-1, moves.shape[2])
-    values, vectors = np.linalg.eigh(flat.T @ flat)
-    floor = TINY**2 * len(flat)
-    counted = values > floor
-    if not counted.any():
-        return _Judged(0.0, 1.0)
-    along = (flat @ vectors[:, counted]).T @ off.reshape(-1) / np.sqrt(values[counted])
-    squares = float((along**2 / (values[counted] + floor)).sum())
-    count = int(np.count_nonzero(counted))
-    return _Judged(math.sqrt(squares / count), Noise(1.0).chance(squares, count))
-
-
-def _by_places(off: Array, moves: Array) -> _Judged:
-    """Test the sum of the squares of all places, each by its own covariance."""
     # With D the covariances of the places by themselves, Q = sum of e^T D^-1 e has the mean 2 N and
     # is distributed as the sum of l times chi^2 of 1, l the eigenvalues of D^-1/2 S S^T D^-1/2,
-    # which are those of S^T D^-1 S: places move together, since a lens has some ten values. What
-    # no values of the lenses explain is in Q, too. Its distribution by three moments: Imhof,
-    # Computing the distribution of quadratic forms in normal variables (1961), after Pearson.
+    # which are those of S^T D^-1 S: places move together, since a lens has some ten values. So
+    # Q / (2 N) is as chi^2 over its freedom, (sum l)^2 / sum l^2 (Satterthwaite, An Approximate
+    # Distribution of Estimates of Variance Components, 1946); and as D is an estimate itself, it is
+    # F. Half of the views count: some tell far more than others.
+    known = np.isfinite(difference).all(axis=1)
+    if not known.any():
+        raise Code.OUT_OF_FIELD.refusal(
+            "compare: expected lenses that reach the same places of the image, got none", got=0
+        )
+    off, moves = difference[known], spread[known]
     back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + TINY**2 * np.eye(2))
-    squares = float(np.einsum("ni,nij,nj->", off, back, off))
-    ratio = math.sqrt(squares / (2 * len(off)))
+    squares = float(np.einsum("ni,nij,nj->", off, back, off)) / (2 * len(off))
     gram = np.einsum("nip,nij,njq->pq", moves, back, moves)
-    values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
-    first, second, third = (float((values**power).sum()) for power in (1, 2, 3))
-    if third <= 0.0:  # nothing of either lens was fitted
-        return _Judged(ratio, float(ratio <= 1.0))
-    freedom = second**3 / third**2
-    reached = (squares - first) * math.sqrt(freedom / second) + freedom
-    return _Judged(ratio, float(load("scipy.special").chdtrc(freedom, max(reached, 0.0))))
+    total, power = float(np.trace(gram)), float((gram**2).sum())
+    if power <= 0.0:  # nothing of either lens was fitted
+        return math.sqrt(squares), float(squares <= 1.0)
+    known_to = Noise(1.0, max(views // 2, 1))
+    freedom = total**2 / power
+    return math.sqrt(squares), known_to.chance(freedom * squares, freedom)

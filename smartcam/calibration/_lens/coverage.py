@@ -1,4 +1,4 @@
-"""Where and how the target was shown: whether the views can tell a lens well."""
+"""Check whether views show the target in enough places and ways to calibrate a lens well."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 ENOUGH: Final[dict[str, float]] = {"x": 0.7, "y": 0.7, "size": 0.4, "skew": 0.5}
 """Range of each quantity that is good enough.
@@ -25,8 +25,8 @@ class Coverage(NamedTuple):
     Attributes:
         x: places from left to right.
         y: places from top to bottom.
-        size: from far to near.
-        skew: from head-on to tilted.
+        size: sizes from far to near.
+        skew: tilts from head-on to tilted.
     """
 
     x: float

@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._lens.projection import linearize, pose_changes
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
 SHAPE: Final = (25, 33)
 """Rows and columns of a map: odd numbers, so that the middle is one of its places."""
@@ -40,7 +39,7 @@ LEAST: Final = 6
 
 
 class Sensitivity(NamedTuple):
-    """How pixels of points (N) move with a lens' values, and with the camera."""
+    """The derivatives of projected points (N) by a lens' values and by the camera's motion."""
 
     by_lens: Array  # (N, 2, 4 + K)
     by_motion: Array  # (N, 2, 6), a turn and a shift; the latter is 0 for points at infinity
@@ -61,11 +60,10 @@ class Sensitivity(NamedTuple):
 def check_distance(distance: float | None) -> None:
     """Refuse a distance that is none; None means infinity. Raises ``NOT_FINITE``."""
     if distance is not None and not (math.isfinite(distance) and distance > 0.0):
-        raise CalibrationError(
-            f"distance: expected a positive number of metres, or None for infinity, got {distance}",
-            code=Code.NOT_FINITE,
-            expected="a positive number",
-            got=distance,
+        raise Code.NOT_FINITE.unexpected(
+            "distance: expected a positive number of metres, or None for infinity",
+            "a positive number",
+            distance,
         )
 
 
@@ -75,11 +73,8 @@ def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
     Raises ``SHAPE``: fewer than 2 rows or columns, or more than 500.
     """
     if len(shape) != 2 or not all(2 <= one <= MOST for one in shape):
-        raise CalibrationError(
-            f"shape of a map: expected rows and columns, each from 2 to {MOST}, got {shape}",
-            code=Code.SHAPE,
-            expected=(2, MOST),
-            got=shape,
+        raise Code.SHAPE.unexpected(
+            f"shape of a map: expected rows and columns, each from 2 to {MOST}", (2, MOST), shape
         )
     rows, columns = (
         np.linspace(0.0, side - 1.0, count) for side, count in zip(size[::-1], shape, strict=True)
@@ -88,7 +83,7 @@ def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
 
 
 def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Array:
-    """Return what a lens sees at pixels (N, 2) at a distance, (N, 3); at infinity directions.
+    """Return the points (N, 3) that pixels (N, 2) show at a distance; at infinity directions.
 
     NaN where no direction leads to a pixel: a lens' model may end before the image does, and the
     iteration that inverts it then ends elsewhere.
@@ -102,9 +97,9 @@ def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Arr
 
 
 def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sensitivity:
-    """Return how points (N, 3) of the camera's frame move in the image; NaN where they are NaN.
+    """Return the derivatives of the pixels of points (N, 3); NaN where a point is NaN.
 
-    ``far``: they are directions to points at infinity.
+    ``far``: the points, in the camera's frame, are directions to points at infinity.
     """
     known = np.isfinite(points).all(axis=1, keepdims=True)
     there = np.where(known, points, [0.0, 0.0, 1.0])
@@ -117,14 +112,13 @@ def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sen
 
 
 def known_points(points: Array) -> Array:
-    """Return those of points (N, 3) that a motion may be fitted to; ``OUT_OF_FIELD``: too few."""
+    """Return the points of (N, 3) that a motion may be fitted to; ``OUT_OF_FIELD``: too few."""
     known = points[np.isfinite(points).all(axis=1)]
     if len(known) < LEAST:
-        raise CalibrationError(
+        raise Code.OUT_OF_FIELD.refusal(
             f"field of the lens: expected {LEAST} places or more that its model reaches, "
             f"got {len(known)} of {len(points)}",
-            code=Code.OUT_OF_FIELD,
-            expected=LEAST,
-            got=len(known),
+            LEAST,
+            len(known),
         )
     return known

@@ -1,4 +1,4 @@
-"""Which view of the target comes next: the one after which the lens is surest over its field.
+"""Suggest the next view of the target: the one that makes the lens surest over its field.
 
 Of many views that could be taken it is worked out how sure the lens would be with each, from what
 the calibration's covariance says and what the view would add, which takes no image.
@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam._argument_checks import a_number, a_target, of_class, or_none, takes
+from smartcam.calibration._least_squares import inverse_scaled
+from smartcam.calibration._lens.bundle import Bundle, BundleEquations, Sight
 from smartcam.calibration._lens.field import (
     check_distance,
     known_points,
@@ -23,25 +24,27 @@ from smartcam.calibration._lens.field import (
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
 from smartcam.calibration._lens.projection import NEGLIGIBLE, pose_changes
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Rigid, exp_rotation
 
 if TYPE_CHECKING:
     from typing import TypeAlias
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Target
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
     Mask: TypeAlias = NDArray[np.bool_]
 
 COLUMNS: Final = {0.0: "left", 0.5: "middle", 1.0: "right"}
 ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
-"""Where the target goes, in parts of the way that it has in the image."""
+"""Rows to bring the target to, in parts of the way that it has in the image."""
 
 FILLS: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
-"""How much of the image's width or height the target takes."""
+"""Parts of the image's width or height that the target may take."""
 
 TILT: Final = 35.0
 """Degrees: more tells little more, and is hard to see."""
@@ -50,20 +53,16 @@ SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "
 """The target's side that is farther away, and about which axis of the camera it is tilted."""
 
 MARGIN: Final = 0.02
-"""Of the image, that stays free beside the target."""
+"""At each side of the image, this part of it stays free beside the target."""
 
 TURNS: Final = 12
-"""In which a target is brought to its place; most are there after five."""
+"""A target is brought to its place in this many steps; most are there after five."""
 
 MAP: Final = (9, 12)
 """Rows and columns of the field over which the uncertainty is counted."""
 
-DETERMINED: Final = 1e-12
-"""Part of the largest variance, in comparable units, below which a value counts as held fixed."""
-
-
 SAME_RAY: Final = 1e-3
-"""Between a point's direction and that of its pixel, radians: else the lens' model folds."""
+"""Angle between a point and the ray of its pixel, radians, beyond which the lens' model folds."""
 
 
 class NextView(NamedTuple):
@@ -73,9 +72,9 @@ class NextView(NamedTuple):
         text: where and how the target is to be held, for people.
         transform: ``T_camera_target``.
         outline: (4, 2), the target's corners as they would be seen, pixels.
-        mean: uncertainty over the field with this view taken, of a coordinate, root of the mean
+        mean: uncertainty of a coordinate over the field with this view taken, root of the mean
             square, pixels.
-        present: the same without it.
+        present: uncertainty of a coordinate over the field without this view, likewise, pixels.
     """
 
     text: str
@@ -93,6 +92,12 @@ class CandidateViews(NamedTuple):
     outlines: Array  # (C, 4, 2), pixels
 
 
+@takes(
+    calibration=of_class("IntrinsicCalibration"),
+    distance=or_none(a_number),
+    roll=a_number,
+    target=or_none(a_target),
+)
 def suggest_views(
     calibration: IntrinsicCalibration,
     *,
@@ -107,10 +112,10 @@ def suggest_views(
     target's points. What counts is :meth:`IntrinsicCalibration.uncertainty`, its mean.
 
     Args:
-        calibration: from the views so far.
-        distance: at which the lens is to be sure, metres; None: infinity.
-        roll: of the target about the line of sight, radians; 0: upright.
-        target: which is held; None: that of the views.
+        calibration: calibration from the views so far.
+        distance: distance at which the lens is to be sure, metres; None: infinity.
+        roll: turn of the target about the line of sight, radians; 0: upright.
+        target: target that is held; None: the target of the views.
 
     Raises:
         CalibrationError: ``NOT_FINITE``: no such distance.
@@ -119,9 +124,11 @@ def suggest_views(
     camera = calibration.camera
     shown = target or calibration.views[0].view.target
     found = candidates(camera, shown, roll)
-    basis, start = _determined(calibration.covariance)
+    basis = _fitted(calibration.covariance)
+    start, times = _known(calibration, basis)
     weight = basis.T @ _criterion(calibration, distance) @ basis
-    added = _informations(camera, found.poses, shown.points, basis) / _variance(calibration)
+    added = _informations(camera, found.poses, shown.points, basis)
+    added = added / (_variance(calibration) * times)
     after = np.linalg.inv(np.linalg.inv(start) + added)
     means = np.sqrt(np.maximum(np.einsum("cij,ji->c", after, weight), 0.0) / 2)
     present = math.sqrt(max(float(np.einsum("ij,ji->", start, weight)), 0.0) / 2)
@@ -143,16 +150,36 @@ def _variance(calibration: IntrinsicCalibration) -> float:
     return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, NEGLIGIBLE**2)
 
 
-def _determined(covariance: Array) -> tuple[Array, Array]:
-    """Return the basis (4 + K, F) of the values that were fitted, and its covariance (F, F).
+def _fitted(covariance: Array) -> Array:
+    """Return by how much each value changes with each of those that were fitted (4 + K, F)."""
+    columns, held = np.eye(len(covariance)), np.diag(covariance) <= 0.0
+    if not held[0] and np.allclose(covariance[0], covariance[1], rtol=1e-9):  # fx and fy are one
+        columns[1, 0], held[1] = 1.0, True
+    fitted: Array = columns[:, ~held]
+    return fitted
 
-    Values that were held, or tied to others, are not in it.
+
+def _known(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, float]:
+    """Return the covariance of the fitted values (F, F), and times how much of noise alone it is.
+
+    As V views tell no more than V directions of the values, it is theirs by V / (V + F), and else
+    what the noise of points leads to, that many times.
     """
-    scales = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    safe = np.where(scales > 0.0, scales, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
-    fitted = values > DETERMINED * max(float(values.max(initial=0.0)), 1.0)
-    return safe[:, None] * vectors[:, fitted], np.diag(values[fitted])
+    used = [one for one in calibration.views if one.used]
+    points = None
+    if calibration.sheet is not None:
+        points = used[0].view.target.points + calibration.sheet
+    poses = Rigid.stacked(one.transform.rigid for one in used)
+    bundle = Bundle.single(calibration.camera, poses, basis, points)
+    sights = [Sight(0, number, one.view) for number, one in enumerate(used)]
+    equations = BundleEquations(bundle, sights, calibration.sigma**2)
+    information = equations.normal(bundle).reduced()[0]
+    back = np.linalg.pinv(basis)
+    scattered, count = back @ calibration.covariance @ back.T, len(information)
+    times = float(np.trace(information @ scattered)) / max(count, 1)
+    part = len(used) / (len(used) + count)
+    by_noise = times * inverse_scaled(information)
+    return part * scattered + (1.0 - part) * by_noise, max(times, 1e-12)
 
 
 def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Array:
@@ -166,7 +193,7 @@ def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Arr
 
 
 def _informations(camera: CameraModel, poses: Rigid, points: Array, basis: Array) -> Array:
-    """Return what each view tells of the fitted values (C, F, F), at a variance of 1 pixel^2."""
+    """Return each view's information on the fitted values (C, F, F), at a variance of 1 pixel^2."""
     # The pose is unknown, too: what is left of B^T B is B^T B - B^T A (A^T A)^-1 A^T B.
     shape = (poses.size, 2 * len(points), -1)
     turned = points @ poses.rotation.swapaxes(1, 2)
@@ -211,7 +238,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
 
 
 def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> Array:
-    """Return where targets' middles are (C, 3) so that they are seen where they are to be.
+    """Return the middles of targets (C, 3) that make them appear where they are to be.
 
     ``turned`` (C, 8, 3): their rims about their middles, in the camera's axes. ``fills`` (C,) and
     ``parts`` (C, 2): how large, and where of the way that is left beside them.
@@ -235,7 +262,7 @@ def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> A
 
 
 def _visible(camera: CameraModel, points: Array) -> Mask:
-    """Return whether all points (C, N, 3) are in the image, and where the lens' model leads."""
+    """Return a mask of views whose points (C, N, 3) are in the image and on their pixels' rays."""
     flat = points.reshape(-1, 3)
     seen = camera.project(flat)
     inside = ((seen >= 0.0) & (seen <= np.array(camera.size) - 1.0)).all(axis=1, keepdims=True)

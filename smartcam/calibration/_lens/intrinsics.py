@@ -11,15 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, get_args
 import numpy as np
 from pydantic import Field
 
-from smartcam.calibration._codes import Code, Remark
+from smartcam._argument_checks import each, of_class, takes
+from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid
-from smartcam.calibration._geometry.rotations import Array
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, held_out
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, camera_covariance
 from smartcam.calibration._lens.coverage import Coverage, coverage
-from smartcam.calibration._lens.field import SHAPE
-from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.field import SHAPE, places, points_at
 from smartcam.calibration._lens.poses import (
     CAMERA,
     TARGET,
@@ -33,35 +30,39 @@ from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
 from smartcam.calibration._lens.start import fit_lens, parameter_names
 from smartcam.calibration._lens.suspicions import examined
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
-from smartcam.calibration._views import TargetView, as_list, as_views, check_choice, label
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._views import TargetView, as_list, as_views, label
+from smartcam.geometry import CameraModel, Code, Remark, Transform
+from smartcam.geometry._inside import Array, Rigid, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from smartcam.calibration._lens.bundle import AdjustedBundle
-    from smartcam.calibration._lens.model import DistortionModel
+    from smartcam.geometry._inside import DistortionModel
 
 Bar = Annotated[storage.NonNegative, Field(le=1)]
 BARS = storage.row(tuple[Bar, Bar, Bar, Bar], Coverage._make)
 
-LEAST_VIEWS: Final = 3
+MIN_VIEWS: Final = 3
 """Two tell a lens without noise; one more tells of noise."""
 
-LEAST_TILT: Final = math.radians(5.0)
-"""Between the steepest two planes; parallel ones leave the focal length open."""
+MIN_TILT_RADIANS: Final = math.radians(5.0)
+"""Least angle between the steepest two planes; parallel ones leave the focal length open."""
 
-LEAST_MOTION: Final = 0.02
-"""Of the image's longer side: views whose points are closer are one view."""
+MIN_MOTION_SHARE: Final = 0.02
+"""Views whose points are closer together than this part of the image's longer side are one view."""
 
-LEAST_FOCAL: Final = 0.1
+MAX_FOCAL_SIGMA_RATIO: Final = 0.1
 """Standard deviation of the focal length over itself, beyond which it is not determined."""
 
 BAD: Final = 3.0
 """Weighted rms of a view over the median of the others: healthy ones reach 1.6 (measured)."""
 
-MOST_BAD: Final = 1 / 3
-"""Of the views that may be left out."""
+MAX_BAD_VIEW_SHARE: Final = 1 / 3
+"""At most this part of the views may be left out."""
+
+MIN_REACHED_SHARE: Final = 0.9
+"""Part of the image that the lens' model reaches without a word: wide lenses may miss corners."""
 
 POOR: Final = 1.0
 """Pixels rms, beyond which the model of the lens, or the sheet, is not what it should be."""
@@ -69,16 +70,16 @@ POOR: Final = 1.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewFit(storage.Stored):
-    """What one view has to do with a lens.
+    """The fit of a lens to one view.
 
     Attributes:
-        view: as it was given, without points that a remark ``OUTLIER`` says were not used.
+        view: the view as given, without points that a remark ``OUTLIER`` says were not used.
         used: whether the lens is fitted to it; False for a bad view.
         transform: ``T_camera_target``.
         residuals: (N, 2), seen minus projected, pixels.
-        rms: of a coordinate of ``residuals``, pixels, their freedom taken off.
-        held_out: the same for a lens that was fitted without this view, where the pose alone is
-            fitted to it; NaN where there were too few others.
+        rms: rms of a coordinate of ``residuals``, pixels, their freedom taken off.
+        held_out: rms of a coordinate for a lens that was fitted without this view, where the pose
+            alone is fitted to it, pixels; NaN where there were too few other views.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -93,16 +94,17 @@ class ViewFit(storage.Stored):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class IntrinsicCalibration(storage.SavedCalibration):
-    """What :func:`calibrate_intrinsics` finds.
+    """The result of :func:`calibrate_intrinsics`.
 
     Attributes:
         camera: the lens.
-        covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients: as the points'
-            covariance and ``sigma`` lead to, and the sheet's where its points were adjusted; 0 for
-            what was not fitted.
+        covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients, from how much each view
+            changes them (a jackknife): what a view has wrong as a whole is in it, as where the
+            sheet bends anew. 0 for what was not fitted. Of V views it has the rank V at most, and
+            of few it is rough: of ten by a quarter.
         views: one for each given view, in their order.
-        rms: of the residuals of the used views, their freedom taken off: the standard deviation of
-            a coordinate, pixels. It is no accuracy: see ``held_out``.
+        rms: rms of the residuals of the used views, their freedom taken off: the standard deviation
+            of a coordinate, pixels. It is no accuracy: see ``held_out``.
         sigma: what the residuals show beside the points' covariance, standard deviation of a
             coordinate, pixels: the lens or the sheet is not quite as modelled, or the points have
             more noise than they say.
@@ -153,7 +155,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def uncertainty(
         self, *, distance: float | None = None, shape: tuple[int, int] = SHAPE
     ) -> ProjectionUncertainty:
-        """Return how sure the lens is of where it projects, as a map over its field.
+        """Return the uncertainty of where the lens projects, as a map over its field.
 
         It is what ``covariance`` leads to for a point that does not move, without the small motion
         of the camera that fits best to the target's points where they were seen: every pose that
@@ -162,7 +164,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
         covariance knows whether a model fits there.
 
         Args:
-            distance: of the points from the camera, metres; None: infinity.
+            distance: distance of the points from the camera, metres; None: infinity.
             shape: rows and columns of the map, 2 to 500 each, from corner to corner.
 
         Raises:
@@ -186,7 +188,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
         to each, as for :attr:`ViewFit.held_out`.
 
         Args:
-            views: of any target; of the same one where its points were adjusted (``sheet``).
+            views: views of any target; of the same one where its points were adjusted (``sheet``).
 
         Returns:
             Of each view (N, 2), seen minus projected, pixels: 2 N - 6 of them are free.
@@ -200,12 +202,11 @@ class IntrinsicCalibration(storage.SavedCalibration):
     def _errors(self, view: TargetView) -> Array:
         meant = self.views[0].view.target
         if self.sheet is not None and view.target != meant:
-            raise CalibrationError(
+            raise Code.DIFFERENT_TARGETS.refusal(
                 f"point_errors: expected views of {meant}, whose points were adjusted, got one of "
                 f"{view.target}",
-                code=Code.DIFFERENT_TARGETS,
-                expected=meant,
-                got=view.target,
+                meant,
+                view.target,
             )
         near = Rigid.stacked([locate(view, self.camera).transform.rigid])
         points = None if self.sheet is None else meant.points + self.sheet
@@ -221,35 +222,43 @@ class IntrinsicCalibration(storage.SavedCalibration):
             storage.check_shape(self.sheet, found["target"].points.shape, called, "sheet")
 
 
+@takes(
+    views=each(of_class("TargetView")),
+    distortion_model=check_text,
+    fixed=each(check_text),
+    sheet=check_text,
+    drop_bad=check_flag,
+)
 def calibrate_intrinsics(
     views: Sequence[TargetView],
     *,
     distortion_model: DistortionModel = "plumb_bob",
     fixed: Iterable[str] = (),
-    sheet: Sheet = "exact",
+    sheet: Sheet = "auto",
     drop_bad: bool = True,
 ) -> IntrinsicCalibration:
     """Return the lens that shows the target's points where the views have them.
 
     The reprojection error is made least, each point weighted by its covariance and by what the
     residuals show beside it. The order of the views does not matter. Points that are far from where
-    the others of their view have them are left out and named (``OUTLIER``).
+    the others of their view have them are left out and named (``OUTLIER``). From which end a view
+    numbers a target that looks the same after half a turn does not matter.
 
     Where *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
     does, nothing tells: the lens is that of the flipped pictures, and right for those alone.
 
     Args:
-        views: of one target, 3 or more, of images of one size; tilted in several directions, near
-            and far, out to the corners.
+        views: views of one target, 3 or more, of images of one size; tilted in several directions,
+            near and far, out to the corners.
         distortion_model: ``plumb_bob`` for most lenses, ``rational_polynomial`` for wide ones,
             ``equidistant`` for fisheyes.
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
-        sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
-            adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
-            ``auto``: they are adjusted where the residuals show more than chance, or any smooth
-            error of the lens, can be, and the held-out error is not larger for it. Where they are
-            not adjusted although the residuals show it, ``SHEET_NOT_EXACT`` among the warnings
-            says so. Targets of more than 1000 points are taken as exact, untested.
+        sheet: ``auto``: whether the target's points are adjusted, too, is chosen by the held-out
+            error, and they are where it is less by more than chance between views is; printers
+            stretch, and paper bends. As far as few views tell of them they stay where they were
+            meant to be. ``exact``: they are there. ``free``: they are adjusted. Where the held-out
+            error denies that they are where they were meant to be, ``SHEET_NOT_EXACT`` among the
+            warnings says so. Targets of more than 1000 points are taken as exact, untested.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named.
 
@@ -258,12 +267,12 @@ def calibrate_intrinsics(
             ``WRONG_SIZE``: images of several sizes; ``DIFFERENT_TARGETS``; ``POSES_TOO_SIMILAR``:
             the views are nearly the same; ``INSUFFICIENT_ROTATION``: the target was never tilted,
             or so little that the focal length stays open; ``SHAPE``: no such coefficient, no such
-            model, or something else than views; ``NOT_FINITE`` pixels; ``MIRRORED``: pictures that
-            are flipped; ``POOR_FIT``: no lens of this model shows them.
+            model, or something else than views; ``NOT_FINITE`` pixels; ``MIRRORED``: a view as in a
+            mirror; ``POOR_FIT``: no lens of this model shows them.
     """
     given = as_views(views, "intrinsics")
     check_choice(sheet, get_args(Sheet), "sheet")
-    check_views(given, "intrinsics", LEAST_VIEWS)
+    check_views(given, "intrinsics", MIN_VIEWS)
     _check_motion(given)
     held = tuple(as_list(fixed, str, "fixed: name"))
     used = list(range(len(given)))
@@ -271,7 +280,7 @@ def calibrate_intrinsics(
         adjusted = fit_lens([given[number] for number in used], distortion_model, held)
         worst, ratio = worst_view([given[number] for number in used], adjusted)
         dropped = len(given) - len(used) + 1
-        enough = len(used) > LEAST_VIEWS and dropped <= MOST_BAD * len(given)
+        enough = len(used) > MIN_VIEWS and dropped <= MAX_BAD_VIEW_SHARE * len(given)
         if ratio <= BAD or not (drop_bad and enough):
             break
         del used[worst]
@@ -299,27 +308,21 @@ def check_views(
     ``TOO_FEW``, ``COLLINEAR``, ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``NOT_FINITE``.
     """
     if len(views) < least:
-        raise CalibrationError(
-            f"{what}: expected {least} views or more, got {len(views)}",
-            code=Code.TOO_FEW,
-            expected=least,
-            got=len(views),
-        )
+        raise Code.TOO_FEW.unexpected(f"{what}: expected {least} views or more", least, len(views))
     for number, view in enumerate(views):
         if view.target != views[0].target:
-            raise CalibrationError(
+            raise Code.DIFFERENT_TARGETS.refusal(
                 f"{what}: expected views of one target, {views[0].target}, got {view.target} in "
                 f"{label(view, number)}",
-                code=Code.DIFFERENT_TARGETS,
-                expected=views[0].target,
-                got=view.target,
+                views[0].target,
+                view.target,
             )
         check_view(view, size or views[0].size)
 
 
 def _check_motion(views: Sequence[TargetView]) -> None:
     """Refuse views that are all nearly the same."""
-    least, largest = LEAST_MOTION * max(views[0].size), 0.0
+    least, largest = MIN_MOTION_SHARE * max(views[0].size), 0.0
     for one in views[1:]:
         common, first, second = np.intersect1d(views[0].ids, one.ids, return_indices=True)
         if not len(common):
@@ -327,12 +330,11 @@ def _check_motion(views: Sequence[TargetView]) -> None:
         off = views[0].points[first] - one.points[second]
         largest = max(largest, float(np.linalg.norm(off, axis=1).max()))
     if largest < least:
-        raise CalibrationError(
+        raise Code.POSES_TOO_SIMILAR.refusal(
             f"intrinsics: expected views in which the target moves by {least:.3g} pixels or more, "
             f"got {len(views)} that differ by {largest:.3g}",
-            code=Code.POSES_TOO_SIMILAR,
-            expected=least,
-            got=largest,
+            least,
+            largest,
         )
 
 
@@ -344,27 +346,26 @@ def check_tilts(adjusted: AdjustedBundle, what: str) -> None:
     normals = adjusted.bundle.poses.rotation[:, :, 2]
     sines = np.linalg.norm(np.cross(normals[:, None], normals), axis=2)
     tilt = math.asin(min(1.0, float(sines.max())))
-    if tilt < LEAST_TILT:
-        raise CalibrationError(
-            f"{what}: expected the target tilted by {math.degrees(LEAST_TILT):.0f} degrees or "
-            f"more between two views, got {math.degrees(tilt):.2g}: parallel planes leave the "
+    if tilt < MIN_TILT_RADIANS:
+        raise Code.INSUFFICIENT_ROTATION.refusal(
+            f"{what}: expected the target tilted by {math.degrees(MIN_TILT_RADIANS):.0f} degrees "
+            f"or more between two views, got {math.degrees(tilt):.2g}: parallel planes leave the "
             "focal length open",
-            code=Code.INSUFFICIENT_ROTATION,
-            expected=LEAST_TILT,
-            got=tilt,
+            MIN_TILT_RADIANS,
+            tilt,
         )
     # values = basis times unknowns, so their covariance is B C B^T
-    spread = adjusted.bundle.basis[0] @ adjusted.covariance @ adjusted.bundle.basis[0].T
+    spread = adjusted.bundle.basis[0] @ adjusted.by_noise @ adjusted.bundle.basis[0].T
     length = float(adjusted.bundle.cameras[0].matrix[0, 0])
     relative = math.sqrt(max(float(spread[0, 0]), 0.0)) / length
-    if relative > LEAST_FOCAL:
-        raise CalibrationError(
-            f"{what}: expected views that tell the focal length to {LEAST_FOCAL:.0%}, got "
-            f"{length:.5g} pixels with a standard deviation of {relative:.2g} of it: tilt the "
+    if relative > MAX_FOCAL_SIGMA_RATIO:
+        raise Code.INSUFFICIENT_ROTATION.refusal(
+            f"{what}: expected views that tell the focal length to "
+            f"{MAX_FOCAL_SIGMA_RATIO:.0%}, got {length:.5g} pixels with a standard deviation of "
+            f"{relative:.2g} of it: tilt the "
             "target more, and show it nearer",
-            code=Code.INSUFFICIENT_ROTATION,
-            expected=LEAST_FOCAL,
-            got=relative,
+            MAX_FOCAL_SIGMA_RATIO,
+            relative,
         )
 
 
@@ -385,15 +386,6 @@ def weighted_rms(view: TargetView, residuals: Array, more: float) -> float:
     return math.sqrt(float((weighted**2).mean()))
 
 
-def _held_out(adjusted: AdjustedBundle, views: Sequence[TargetView]) -> list[float]:
-    """Return the rms of each view under a lens that was fitted to the others."""
-    if len(views) <= LEAST_VIEWS:
-        return [math.nan] * len(views)
-    sights = [Sight(0, number, view) for number, view in enumerate(views)]
-    left_out = held_out(adjusted, sights, range(len(views)))
-    return [view_rms(residuals) for _, _, (residuals,) in left_out]
-
-
 def _together(errors: Sequence[float], views: Sequence[TargetView]) -> float:
     freedom = [2 * len(view.ids) - 6 for view in views]
     return math.sqrt(float(np.average(np.square(errors), weights=freedom)))
@@ -407,13 +399,11 @@ def _summary(
     sheet: Sheet,
 ) -> IntrinsicCalibration:
     of_used = [views[number] for number in used]
-    shape, errors = choose_shape(
-        adjusted,
-        [Sight(0, number, view) for number, view in enumerate(of_used)],
-        sheet,
-        lambda fitted: _held_out(fitted, of_used),
-        lambda errors: _together(errors, of_used),
-    )
+    sights = [Sight(0, number, view) for number, view in enumerate(of_used)]
+    shape = choose_shape(adjusted, sights, sheet)
+    errors = [
+        view_rms(one.residuals[0]) if len(used) > MIN_VIEWS else math.nan for one in shape.left_out
+    ]
     adjusted, bundle = shape.adjusted, shape.adjusted.bundle
     camera, basis = bundle.cameras[0], bundle.basis[0]
     without = dict(zip(used, errors, strict=True))
@@ -425,7 +415,7 @@ def _summary(
     ]
     calibration = IntrinsicCalibration(
         camera=camera,
-        covariance=basis @ adjusted.covariance @ basis.T,
+        covariance=basis @ camera_covariance(adjusted, shape.left_out) @ basis.T,
         views=tuple(fits),
         rms=adjusted.rms,
         sigma=math.sqrt(adjusted.more),
@@ -476,30 +466,39 @@ def _outline(fit: ViewFit, camera: CameraModel) -> Array:
 def _remarks(
     calibration: IntrinsicCalibration, bad: list[int], of_sheet: list[Remark]
 ) -> Iterator[Remark]:
+    for number, fit in enumerate(calibration.views):
+        for code, text in fit.view.warnings:
+            yield Remark(code, f"{label(fit.view, number)}: {text}")
     for number in bad:
         fit = calibration.views[number]
         done = "was not used" if not fit.used else "is used all the same"
-        yield Remark(
-            Code.BAD_VIEW,
+        yield Code.BAD_VIEW.remark(
             f"{label(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
-            f"{calibration.rms:.3g} in all: it {done}",
+            f"{calibration.rms:.3g} in all: it {done}"
         )
     if calibration.rms > POOR:
-        yield Remark(
-            Code.POOR_FIT,
+        yield Code.POOR_FIT.remark(
             f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR:g} at most: the lens "
             f"is not of the model {calibration.camera.distortion_model}, the sheet is not flat, or "
-            "points were taken for others",
+            "points were taken for others"
         )
     yield from of_sheet
+    camera = calibration.camera
+    seen = points_at(camera, places(camera.size, SHAPE).reshape(-1, 2), None)
+    reached = float(np.isfinite(seen[:, 0]).mean())
+    if reached < MIN_REACHED_SHARE:
+        yield Code.OUT_OF_FIELD.remark(
+            f"the model {camera.distortion_model} ends before the image does: no direction leads "
+            f"to {1 - reached:.0%} of it, of which nothing is known; show the target there, or "
+            "take another model"
+        )
     if lacking := calibration.coverage.lacking:
         bars = ", ".join(f"{name} {getattr(calibration.coverage, name):.0%}" for name in lacking)
-        yield Remark(
-            Code.POOR_COVERAGE, f"the views cover too little: {bars} of what is good enough"
+        yield Code.POOR_COVERAGE.remark(
+            f"the views cover too little: {bars} of what is good enough"
         )
     if math.isnan(calibration.held_out):
-        yield Remark(
-            Code.NOT_HELD_OUT,
+        yield Code.NOT_HELD_OUT.remark(
             f"{sum(one.used for one in calibration.views)} views are no more than a lens has need "
-            "of: none can be left out to see how good it is",
+            "of: none can be left out to see how good it is"
         )

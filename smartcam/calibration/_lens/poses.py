@@ -1,28 +1,27 @@
-"""Where a target lies before a camera of known lens."""
+"""Locate a target before a camera of known lens."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
 from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight, adjust
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.projection import excess
-from smartcam.calibration._optional_imports import load
 from smartcam.calibration._views import TargetView, checked
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code, Transform
+from smartcam.geometry._inside import Rigid, exp_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._targets import Target
+    from smartcam.geometry._inside import Array
 
 CAMERA: Final = "camera"
 """Name of the camera's frame."""
@@ -33,20 +32,21 @@ TARGET: Final = "target"
 # T_camera_target
 PoseInCamera = Annotated[Transform, storage.motion(lambda _: (CAMERA, TARGET))]
 
-LEAST_POINTS: Final = 4
+MIN_POINTS: Final = 4
 """A plane's pose has need of four of its points."""
 
-LEAST_SPREAD: Final = 1e-3
-"""Of the points across their longest direction, in parts of that: less is a line."""
+MIN_SPREAD_RATIO: Final = 1e-3
+"""Points are on a line if their spread across it is less than this part of the spread along it."""
 
 OUTSIDE: Final = 0.1
 """Part of the image's sides by which a point may lie outside of it."""
 
-LEAST_AGREEMENT: Final = 0.5
-"""Of a view's points with those of the target; views of steep sheets and of fisheyes have 0.8."""
+MIN_AGREEMENT: Final = 0.5
+"""A view's agreement with its target must be below minus this; above plus this the view shows the
+sheet in a mirror. Views of steep sheets and of fisheyes have -0.8."""
 
 NUDGE: Final = 1e-9
-"""Of rays, parts of the focal length, to keep a solver from rounding errors."""
+"""Rays are moved by at most this part of the focal length to keep a solver from rounding errors."""
 
 UNSURE: Final = 4.0
 """Squares of residuals of one pose over those of the other, up to which both are refined first."""
@@ -57,7 +57,7 @@ SAME: Final = 1e-3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TargetPose:
-    """What :func:`locate` finds.
+    """The result of :func:`locate`.
 
     Attributes:
         transform: ``T_camera_target``.
@@ -65,11 +65,10 @@ class TargetPose:
             the rotation is ``exp([turn]x) R``. As the points' covariance leads to, and larger where
             the residuals are larger than that explains. Errors of the lens are not in it.
         residuals: (N, 2), seen minus projected, pixels.
-        rms: of the residuals' lengths over sqrt(2), their freedom taken off: the standard deviation
-            of a coordinate, pixels.
-        ambiguity: of a plane that is far away or seen head-on two poses look nearly the same: rms
-            of this one over that of the other, near 1 where the points cannot tell which is
-            right; 0 where there is no other.
+        rms: rms of the residuals' lengths over sqrt(2), their freedom taken off: the standard
+            deviation of a coordinate, pixels.
+        ambiguity: rms of this pose over that of the other one that a plane far away or seen head-on
+            may have: near 1 where the points cannot tell which is right; 0 where there is no other.
         other: the other pose; None where there is none.
     """
 
@@ -88,7 +87,7 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     weighted by its covariance and by what the residuals show beside it; the better one counts.
 
     Args:
-        view: at least 4 points of the target that are not on a line.
+        view: view of at least 4 points of the target that are not on a line.
         camera: the lens, for images of the same size.
 
     Raises:
@@ -107,11 +106,10 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         (one for one in found if math.isfinite(one.weighted)), key=lambda one: one.weighted
     )
     if not found:
-        raise CalibrationError(
+        raise Code.POOR_FIT.refusal(
             f"pose of the target{_of(view)}: expected one before the camera that shows its "
             f"{len(view.ids)} points where they are, got none",
-            code=Code.POOR_FIT,
-            expected="a pose before the camera",
+            "a pose before the camera",
         )
     more = excess(found[0].residuals[0], view.covariance, found[0].freedom)
     if more:
@@ -146,28 +144,23 @@ def check_view(view: TargetView, size: tuple[int, int]) -> None:
     """
     called = f"pose of the target{_of(checked(view, TargetView, 'pose of the target'))}"
     count = len(view.ids)
-    if count < LEAST_POINTS:
-        raise CalibrationError(
-            f"{called}: expected {LEAST_POINTS} points or more, got {count}",
-            code=Code.TOO_FEW,
-            expected=LEAST_POINTS,
-            got=count,
+    if count < MIN_POINTS:
+        raise Code.TOO_FEW.unexpected(
+            f"{called}: expected {MIN_POINTS} points or more", MIN_POINTS, count
         )
     if tuple(view.size) != tuple(size):
-        raise CalibrationError(
+        raise Code.WRONG_SIZE.refusal(
             f"{called}: expected an image of {size[0]} x {size[1]} pixels, got {view.size[0]} x "
             f"{view.size[1]}",
-            code=Code.WRONG_SIZE,
-            expected=size,
-            got=view.size,
+            size,
+            view.size,
         )
     _check_inside(view, called)
     plane = view.object_points[:, :2]
     spread = np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)
-    if spread[1] < LEAST_SPREAD * spread[0]:
-        raise CalibrationError(
+    if spread[1] < MIN_SPREAD_RATIO * spread[0]:
+        raise Code.COLLINEAR.refusal(
             f"{called}: expected points that are not on one line, got {count} on one",
-            code=Code.COLLINEAR,
             got=view.ids.tolist(),
         )
     _check_sides(view, called)
@@ -180,34 +173,44 @@ def _check_inside(view: TargetView, called: str) -> None:
     row = int(np.argmax(off))
     if off[row] > OUTSIDE:
         got = view.points[row].tolist()
-        raise CalibrationError(
+        raise Code.WRONG_SIZE.refusal(
             f"{called}: expected points in the image of {sides[0]} x {sides[1]} pixels, got {got} "
             f"in row {row}",
-            code=Code.WRONG_SIZE,
-            expected=view.size,
-            got=got,
+            view.size,
+            got,
         )
 
 
 def _check_sides(view: TargetView, called: str) -> None:
     """Refuse the sheet in a mirror (``MIRRORED``), and points taken for others (``POOR_FIT``)."""
     turn = view.agreement
-    if turn > LEAST_AGREEMENT:
-        raise CalibrationError(
+    if turn > MIN_AGREEMENT:
+        raise Code.MIRRORED.refusal(
             f"{called}: expected its x to turn left to its y as one reads the sheet, got a view as "
             "in a mirror: was the picture flipped, or are u and v exchanged?",
-            code=Code.MIRRORED,
-            expected="y to the left of x",
-            got=turn,
+            "y to the left of x",
+            turn,
         )
-    if turn > -LEAST_AGREEMENT:
-        raise CalibrationError(
+    if turn > -MIN_AGREEMENT:
+        raise Code.POOR_FIT.refusal(
             f"{called}: expected points with the numbers that they have on {view.target}, got an "
             f"order that agrees with it by {-turn:.2g} of 1 only",
-            code=Code.POOR_FIT,
-            expected=LEAST_AGREEMENT,
-            got=-turn,
+            MIN_AGREEMENT,
+            -turn,
         )
+
+
+def half_turn(target: Target) -> Rigid:
+    """Return the half turn of a target, in its own frame, after which it looks the same."""
+    return Rigid(np.diag([-1.0, -1.0, 1.0]), target.points[0] + target.points[-1])
+
+
+def half_turned(view: TargetView) -> TargetView:
+    """Return a view whose points are numbered from the target's other end."""
+    ids = len(view.target.points) - 1 - view.ids[::-1]
+    return dataclasses.replace(
+        view, ids=ids, points=view.points[::-1], covariance=view.covariance[::-1]
+    )
 
 
 def _of(view: TargetView) -> str:

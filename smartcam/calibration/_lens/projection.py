@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 from smartcam.calibration._statistics import Noise
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
 NEGLIGIBLE = 1e-4
 """Pixels: standard deviations are not taken smaller, so that views without noise have weights."""
 
 LEVEL = 0.01
-"""How seldom noise alone may pass for an error beside it."""
+"""Probability with which noise alone may pass for an error beside it."""
 
 
 DEGREE = 5
-"""Of the polynomials of a place in the image that stand for any smooth error of a lens."""
+"""Polynomials of the place in the image up to this degree stand for any smooth error of a lens."""
 
 SMOOTH = (DEGREE + 1) * (DEGREE + 2)
-"""Their number, for both coordinates."""
+"""Number of terms of these polynomials, for both coordinates."""
 
 
 class Projection(NamedTuple):

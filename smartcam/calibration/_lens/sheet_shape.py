@@ -1,4 +1,4 @@
-"""What is printed is not quite what was meant: the points of a sheet as the views show them.
+"""Estimate the points of a printed sheet from the views, since printing is not exact.
 
 Printers stretch, paper bends. Where many views show the same points off in the same way, the sheet
 is off, and a lens that is fitted to the points as they were meant takes the blame. Then the points
@@ -10,86 +10,89 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._codes import Code, Remark
-from smartcam.calibration._geometry.rigid import Rigid
-from smartcam.calibration._least_squares import inverse_scaled, solve_scaled
-from smartcam.calibration._lens.bundle import BundleEquations, adjust_weighted, free_points
-from smartcam.calibration._lens.projection import SMOOTH
-from smartcam.calibration._statistics import Noise
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._lens.bundle import (
+    adjust_weighted,
+    leave_out,
+)
+from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import Rigid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, Sight
-
-Errors = TypeVar("Errors")
+    from smartcam.calibration._lens.bundle import AdjustedBundle, Bundle, LeftOut, Sight
+    from smartcam.geometry._inside import Array
 
 Sheet: TypeAlias = Literal["auto", "exact", "free"]
-"""Whether a sheet's points are where they were meant to be."""
+"""Assumption about a sheet's points: where they were meant to be, free, or chosen by the fit."""
 
-CHANCE: Final = 1e-3
-"""How seldom noise alone may pass for a sheet that is not as it was meant to be."""
+MIN_POSES: Final = 4
+"""Fewest views of which one can be left out, and the others still tell of chance."""
 
-
-MOST_POINTS: Final = 1000
-"""Of a target that may be free: the equations of more would take gigabytes."""
+MAX_FREE_POINTS: Final = 1000
+"""A target with free points has at most this many: the equations of more take gigabytes."""
 
 
 class Shape(NamedTuple):
-    """Which points a fit has, and what says that they are not as they were meant to be."""
+    """The points of a fit, and the evidence that they are not where they were meant to be."""
 
     adjusted: AdjustedBundle
+    left_out: list[LeftOut]  # each pose
     off: Array | None  # (T, 3), metres, by how much they are adjusted
     remarks: list[Remark]
 
 
-def choose_shape(
-    adjusted: AdjustedBundle,
-    sights: Sequence[Sight],
-    sheet: Sheet,
-    held_out: Callable[[AdjustedBundle], Errors],
-    rms: Callable[[Errors], float],
-) -> tuple[Shape, Errors]:
-    """Return the fit with the target's points as meant or as seen, and its held-out errors.
+def choose_shape(adjusted: AdjustedBundle, sights: Sequence[Sight], sheet: Sheet) -> Shape:
+    """Return the fit with the target's points as meant or as seen.
 
-    ``adjusted`` has the points as they were meant. ``sheet``: ``auto``: adjusted where the
-    residuals show that they are not, and the held-out error is not larger with them. ``held_out``
-    gives the held-out errors of a fit, ``rms`` is of these; NaN where there are none.
+    ``adjusted`` has the points as they were meant. ``sheet``: ``auto``: adjusted where views that
+    were left out are shown better with them, by more than chance between views is.
 
     Raises ``SHAPE``: more points than may be free.
     """
     count = len(sights[0].view.target.points)
-    if sheet == "free" and count > MOST_POINTS:
-        raise CalibrationError(
-            f"sheet: expected a target of {MOST_POINTS} points at most that are free, got {count}",
-            code=Code.SHAPE,
-            expected=MOST_POINTS,
-            got=count,
+    if sheet == "free" and count > MAX_FREE_POINTS:
+        raise Code.SHAPE.unexpected(
+            f"sheet: expected a target of {MAX_FREE_POINTS} points at most that are free",
+            MAX_FREE_POINTS,
+            count,
         )
-    doubt, errors = shape_doubt(adjusted, sights), held_out(adjusted)
-    if sheet == "free" or (sheet == "auto" and doubt is not None):
-        free = adjust_shape(adjusted.bundle, sights, adjusted.more)
-        seen = held_out(free)
-        if free.bundle.points is not None and (sheet == "free" or rms(seen) <= rms(errors)):
-            off = free.bundle.points - sights[0].view.target.points
-            return Shape(free, off, [_remark(off, "the print or the board is not exact")]), seen
-    done = "it is taken as exact all the same, which sheet='free' does not"
-    return Shape(adjusted, None, [] if doubt is None else [_remark(doubt, done)]), errors
+    exact = Shape(adjusted, leave_out(adjusted, sights), None, [])
+    if count > MAX_FREE_POINTS or (sheet != "free" and len(exact.left_out) < MIN_POSES):
+        return exact
+    free = adjust_shape(adjusted.bundle, sights, adjusted.more)
+    left_out, off = leave_out(free, sights), _off(free.bundle, sights[0].view.target.points)
+    # the simpler one, unless the other is better by more than one standard error: Breiman,
+    # Friedman, Olshen and Stone, Classification and Regression Trees (1984), section 3.4
+    gains = _squares(exact.left_out) - _squares(left_out)
+    better = math.isfinite(free.weighted) and gains.sum() > math.sqrt(len(gains)) * gains.std(
+        ddof=1
+    )
+    if sheet == "free" or (sheet == "auto" and better):
+        remarks = [_remark(off, "the print or the board is not exact")] if better else []
+        return Shape(free, left_out, off, remarks)
+    done = "it is taken as exact all the same, which sheet='auto' does not"
+    return exact._replace(remarks=[_remark(off, done)] if better else [])
+
+
+def _off(bundle: Bundle, meant: Array) -> Array:
+    return np.zeros(meant.shape) if bundle.points is None else bundle.points - meant
+
+
+def _squares(left_out: Sequence[LeftOut]) -> Array:
+    return np.array([sum(float((some**2).sum()) for some in one.residuals) for one in left_out])
 
 
 def _remark(off: Array, what: str) -> Remark:
     rms = 1e3 * math.sqrt(float((off**2).sum(axis=1).mean()))
     most = 1e3 * float(np.linalg.norm(off, axis=1).max())
-    return Remark(
-        Code.SHEET_NOT_EXACT,
+    return Code.SHEET_NOT_EXACT.remark(
         f"the sheet's points are {rms:.2g} mm rms from where they were meant to be, {most:.2g} mm "
-        f"at most: {what}",
+        f"at most: {what}"
     )
 
 
@@ -105,39 +108,6 @@ def adjust_shape(bundle: Bundle, sights: Sequence[Sight], more: float) -> Adjust
     free = dataclasses.replace(bundle, points=points, free=True)
     adjusted = adjust_weighted(free, sights, more)
     return dataclasses.replace(adjusted, bundle=_as_meant(adjusted.bundle, meant))
-
-
-def shape_doubt(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> Array | None:
-    """Return by how much (T, 3) the target's points seem off, metres; None where chance may be it.
-
-    ``adjusted`` has them as they were meant. An F-test of what one joint step with the points free
-    takes off the weighted squares, beside what any smooth error of the lenses would take.
-    """
-    # With all else eliminated (Schur's complement, see Normal.reduced) the points' equations are
-    # M d = r, and their step takes r^T M^+ r off the squares. Of noise alone it is chi-square, and
-    # its mean over that of what remains is F.
-    # Source: Seber and Lee, Linear Regression Analysis, 2nd edition (2003), section 4.3.
-    meant, count = sights[0].view.target.points, free_points(sights)
-    freedom = adjusted.freedom - SMOOTH * len(adjusted.bundle.cameras) - count
-    if len(meant) > MOST_POINTS or freedom <= 0:
-        return None
-    bundle = dataclasses.replace(adjusted.bundle, points=meant, free=True)
-    normal = BundleEquations(bundle, sights, adjusted.more, smooth=True).normal(bundle)
-    matrix, right, _, alone = normal.reduced()
-    points = np.zeros(len(right), dtype=bool)
-    points[bundle.of_cameras : bundle.shared] = True
-    others = inverse_scaled(matrix[np.ix_(~points, ~points)])
-    between = matrix[np.ix_(points, ~points)] @ others
-    before = right[~points] @ others @ right[~points] + (normal.own_right * alone).sum()
-    step_right = right[points] - between @ right[~points]
-    off = solve_scaled(
-        matrix[np.ix_(points, points)] - between @ matrix[np.ix_(~points, points)], step_right
-    )
-    taken = float(step_right @ off)
-    left = normal.cost - float(before) - taken
-    if left <= 0 or Noise(left / freedom, freedom).chance(taken, count) >= CHANCE:
-        return None
-    return off.reshape(-1, 3)
 
 
 def _as_meant(bundle: Bundle, meant: Array) -> Bundle:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._lens.bundle import (
     Bundle,
     Sight,
@@ -14,22 +14,21 @@ from smartcam.calibration._lens.bundle import (
     lens_values,
     with_lens,
 )
-from smartcam.calibration._lens.model import COEFFICIENTS, CameraModel, coefficient_names
 from smartcam.calibration._lens.poses import likeliest_poses
-from smartcam.calibration._optional_imports import load
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code
+from smartcam.geometry._inside import COEFFICIENTS, coefficient_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.bundle import AdjustedBundle
-    from smartcam.calibration._lens.model import DistortionModel
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry._inside import Array, DistortionModel
 
 FOCAL_LENGTHS: Final = (None, 1.0, 0.4, 2.0, 0.65, 4.0)
-"""Where OpenCV begins, in parts of the image's longer side: None where its own closed form says,
-then fields of view of 53, 103, 28, 75 and 14 degrees."""
+"""Focal lengths that OpenCV begins with, in parts of the image's longer side: None where its own
+closed form says, then fields of view of 53, 103, 28, 75 and 14 degrees."""
 
 ENOUGH: Final = 20
 """Views that OpenCV is given; all are adjusted afterwards."""
@@ -55,12 +54,11 @@ def lens_basis(model: DistortionModel, fixed: Iterable[str] = ()) -> Array:
     names, own, held = parameter_names(model), coefficient_names(model), set(fixed)
     unknown = sorted(held.difference(own, {"aspect"}))
     if unknown:
-        raise CalibrationError(
+        raise Code.SHAPE.refusal(
             f"fixed: expected coefficients of {model} ({', '.join(own)}) or aspect, got "
             f"{', '.join(unknown)}",
-            code=Code.SHAPE,
-            expected=[*own, "aspect"],
-            got=unknown,
+            [*own, "aspect"],
+            unknown,
         )
     columns = np.eye(len(names))
     if "aspect" in held:
@@ -89,11 +87,10 @@ def fit_lens(
         if found[-1].rms <= GOOD:
             break
     if not found:
-        raise CalibrationError(
+        raise Code.POOR_FIT.refusal(
             f"intrinsics: expected a lens that shows the {len(views)} views as they are, got none "
             f"from focal lengths of {min(FOCAL_LENGTHS[1:])} to {max(FOCAL_LENGTHS[1:])} image "
-            "widths",
-            code=Code.POOR_FIT,
+            "widths"
         )
     return min(found, key=lambda one: one.rms)
 
@@ -107,7 +104,7 @@ def _fit(
     sights = [Sight(0, number, view) for number, view in enumerate(views)]
     adjusted = adjust_weighted(Bundle.single(lens, likeliest_poses(views, lens), basis), sights)
     if not np.isfinite(adjusted.weighted):
-        raise CalibrationError("points behind the camera", code=Code.POOR_FIT)
+        raise Code.POOR_FIT.refusal("points behind the camera")
     return adjusted
 
 

@@ -1,4 +1,4 @@
-"""How sure a calibrated lens is of where it projects, over its field: a map."""
+"""Map the uncertainty of a calibrated lens' projection over its field."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from smartcam.calibration._lens.field import (
 )
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
 
 class MapFigures(NamedTuple):
     """A map in four numbers, of a coordinate; NaN where the lens' model does not reach.
 
     Attributes:
-        centre: in the middle of the image.
-        corners: the mean of the four corners (root of the mean square).
+        centre: value in the middle of the image.
+        corners: the mean of the four corners (root of the mean square), or of those of them that
+            the model reaches.
         worst: the largest.
         mean: over the field (root of the mean square).
     """
@@ -40,11 +41,11 @@ class MapFigures(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ProjectionUncertainty:
-    """How sure a lens is of where it projects a fixed point of the world.
+    """The uncertainty with which a lens projects a fixed point of the world.
 
     Attributes:
         size: width and height of the images, pixels.
-        distance: of the points from the camera, metres; None: infinity.
+        distance: distance of the points from the camera, metres; None: infinity.
         pixels: (h, w, 2), the places.
         covariance: (h, w, 2, 2), of where a point is projected that is truly seen there, pixels^2;
             NaN where no direction leads to a pixel.
@@ -92,10 +93,14 @@ def figures(sigma: Array) -> MapFigures:
     known = sigma[np.isfinite(sigma)]
     return MapFigures(
         float(sigma[rows // 2, columns // 2]),
-        math.sqrt(float((corners**2).mean())),
+        _mean(corners[np.isfinite(corners)]),
         float(known.max()) if len(known) else math.nan,
-        math.sqrt(float((known**2).mean())) if len(known) else math.nan,
+        _mean(known),
     )
+
+
+def _mean(values: Array) -> float:
+    return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 
 def uncertainty(

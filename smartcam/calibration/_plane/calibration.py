@@ -15,17 +15,24 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, overload
 
 import numpy as np
 from pydantic import StrictBool
 
-from smartcam.calibration._codes import Code, Remark
+from smartcam._argument_checks import numbers, or_none, takes
+from smartcam._arguments import check_flag, check_text, shown
+from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.homography import element_derivatives
-from smartcam.calibration._geometry.rotations import Array, as_points, as_vector
-from smartcam.calibration._plane.diagnostics import Evidence, check_side, findings
+from smartcam.calibration._homography import element_derivatives
+from smartcam.calibration._plane.diagnostics import (
+    MAX_SIGMA,
+    TYPICAL_SIGMA,
+    Evidence,
+    check_side,
+    findings,
+    sigma_of,
+)
 from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
 from smartcam.calibration._plane.mapping import PlaneMap
 from smartcam.calibration._plane.model_selection import NEGLIGIBLE, Candidates, rms, squares
@@ -34,18 +41,25 @@ from smartcam.calibration._plane.validation import (
     check_lever,
     check_positive,
     check_samples,
+    distinct,
+    extent,
     lever,
     normalize,
     read_pairs,
 )
 from smartcam.calibration._statistics import Noise, normal_deviations
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._verdict import Allowed, judge
+from smartcam.exceptions import ConfigurationError
+from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import Array, as_points, as_vector
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from numpy.typing import ArrayLike, NDArray
+
+    from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 
 KIND = "plane"
 
@@ -54,22 +68,29 @@ PlaneModel: TypeAlias = Literal["auto", "rigid", "similarity", "affine", "homogr
 CHUNK = 16_384
 """Points whose covariances are worked out at once: 5 MB in between."""
 
-LEAST_AXIS = 1e-9
+ENOUGH: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
+"""Points that a verdict takes: fewer fit a map of the model even where two of them are wrong, with
+one and the same mistake (shown by simulation)."""
+
+TOUCHES_APART = 4.0
+"""Sigmas of a touch from the mean of the touches of its point: noise does it once in a thousand."""
+
+MIN_DIRECTION_LENGTH = 1e-9
 """Length of a direction below which it is none."""
 
 STALE_LEVEL = 0.01
-"""How seldom a calibration that still holds is called stale."""
+"""Probability with which a calibration that still holds is called stale."""
 
 
 class Drift(NamedTuple):
-    """How points touched again compare with the calibration.
+    """The comparison of points touched again with the calibration.
 
     Attributes:
         offsets: touched minus expected (K, 3), metres.
         expected: rms length of an offset that touches and calibration explain, metres.
-        chance: how likely they alone give offsets as large as these, 0 to 1.
-        z: the same in standard deviations of a normal distribution.
-        stale: whether that is less likely than the level asked for.
+        chance: how likely touches and calibration alone give offsets as large as these, 0 to 1.
+        z: ``chance`` in standard deviations of a normal distribution.
+        stale: True if ``chance`` is less than the level asked for.
     """
 
     offsets: Array
@@ -81,7 +102,7 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlaneCalibration(storage.SavedCalibration):
-    """What :func:`fit_plane` finds; immutable.
+    """The result of :func:`fit_plane`; immutable.
 
     ``==`` asks for one and the same object; compare :meth:`to_data` for the same contents.
 
@@ -101,25 +122,28 @@ class PlaneCalibration(storage.SavedCalibration):
             NaN where the others alone give none. The point's own touch is part of it. Of a point
             left out it is the residual.
         freedom: coordinates of the points that count, minus parameters.
-        touch_sigma: of one coordinate of a touch of weight 1, metres: as given or, where
+        touch_sigma: sigma of one coordinate of a touch of weight 1, metres: as given or, where
             ``sigma_given`` is false, estimated from the residuals; None where there is no telling.
         sigma_given: whether it was given.
-        candidates: rms held-out error of each model that was compared, metres; None where a model
-            has none.
+        candidates: rms held-out error of each compared model, metres; None where a model has none.
         nominal_scale: metres for each unit of the camera's points as the user expects them.
         tool_z: (3,), direction of the tool's axis into the plane; None where it is not known.
-        height: of the plane over the touched one, metres; see :meth:`at_height`.
+        height: height of the plane over the touched one, metres; see :meth:`at_height`.
         robot_frame: name of the frame that poses are given in.
         camera_frame: name of the frame that they must come in; None for any.
         y_down: whether the camera's y axis pointed down and was turned up before the points came,
             as :func:`smartcam.connect` does with ``y_down``; None: not known.
+        allowed_error: the largest error of 95 of 100 points that the user allows, metres; None:
+            :attr:`verdict` takes a hundredth of the touched field.
         warnings: what one should know before using it; their texts number the points from 1, as
             pictures and wizards do.
     """
 
     kind: ClassVar[str] = KIND
     _called: ClassVar[str] = "plane calibration"
-    _later: ClassVar[frozenset[str]] = frozenset({"tool_z", "height", "camera_frame", "y_down"})
+    _later: ClassVar[frozenset[str]] = frozenset(
+        {"tool_z", "height", "camera_frame", "y_down", "allowed_error"}
+    )
 
     model: ModelName | Literal["touches"]
     camera_points: Annotated[Array, storage.rows(storage.Pair, 2, least=3)]
@@ -140,6 +164,7 @@ class PlaneCalibration(storage.SavedCalibration):
     robot_frame: str = "robot"
     camera_frame: str | None = None
     y_down: StrictBool | None = None
+    allowed_error: storage.Positive | None = None
     warnings: storage.Remarks = ()
 
     def __post_init__(self) -> None:
@@ -170,7 +195,7 @@ class PlaneCalibration(storage.SavedCalibration):
 
     @property
     def origin(self) -> Array:
-        """Where the camera's (0, 0) lies (3,), metres."""
+        """Position (3,) of the camera's (0, 0), metres."""
         origin: Array = self.transform([[0.0, 0.0]])[0]
         return origin
 
@@ -199,6 +224,37 @@ class PlaneCalibration(storage.SavedCalibration):
         held_out = not np.isnan(self.leave_one_out).any()
         errors = self.leave_one_out if held_out else self.residuals
         return int(np.argmax(self.weights * (errors**2).sum(axis=1)))
+
+    @property
+    def verdict(self) -> CalibrationVerdict:
+        """Verdict on the calibration's quality, the millimetres it is good for, and the cure."""
+        return self.judged().verdict
+
+    def judged(self, predicted: float | None = None, where: str = "") -> Judgement:
+        """Return the verdict and what is advisable.
+
+        ``predicted``: rms error to expect, metres; None: at the points. ``where``: of what the
+        promise is, for people.
+        """
+        counted, out = self.weights > 0.0, [1 + index for index in self.outliers]
+        if predicted is None and self.touch_sigma is not None:
+            at_points = self.predicted_error(self.camera_points[counted])
+            predicted = math.sqrt(float((at_points**2).mean()))
+        without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
+        held_out, more = self.held_out_error, "touch more points"
+        points = len(np.unique(self.camera_points[counted], axis=0))
+        if points < (least := ENOUGH.get(self.model, 0)):
+            held_out = None
+            more = f"two wrong ones of {points} points can look right: touch {least} or more"
+        return judge(
+            None if held_out is None else 1e3 * held_out,
+            [one for one in self.warnings if not (out and one.code == Code.OUTLIER)],
+            worst=1 + self.worst,
+            predicted=None if predicted is None else 1e3 * predicted,
+            allowed=Allowed.of(self.allowed_error, extent(self.robot_points[counted])),
+            more=more,
+            where=f"{where}{without}",
+        )
 
     def transform(self, points: ArrayLike, out: Array | None = None) -> Array:
         """Map points of the camera to the robot's space.
@@ -246,7 +302,7 @@ class PlaneCalibration(storage.SavedCalibration):
         frame; number and time stay.
 
         Args:
-            localizations: of the camera, one or many.
+            localizations: localizations of the camera, one or many.
             tool_flip: turn each by pi about its own x, so that z points into the plane, as a
                 tool's does that picks it.
 
@@ -296,11 +352,10 @@ class PlaneCalibration(storage.SavedCalibration):
     @property
     def _variance(self) -> float:
         if self.touch_sigma is None:
-            raise CalibrationError(
+            raise Code.UNVERIFIED.refusal(
                 "predicted error: expected touch_sigma, or more points than the "
                 f"{np.count_nonzero(self.weights)} that {self.model} has need of",
-                code=Code.UNVERIFIED,
-                expected="touch_sigma",
+                "touch_sigma",
             )
         return self.touch_sigma**2
 
@@ -322,7 +377,7 @@ class PlaneCalibration(storage.SavedCalibration):
     def check(
         self, camera_points: ArrayLike, robot_points: ArrayLike, *, level: float = STALE_LEVEL
     ) -> Drift:
-        """Return whether points touched again still lie where the calibration says.
+        """Return the drift of points touched again from where the calibration expects them.
 
         Offsets are compared with their covariance: that of the new touches, and that of the
         calibration, which the points have in common. Of several points both all offsets are
@@ -338,21 +393,16 @@ class PlaneCalibration(storage.SavedCalibration):
             CalibrationError: as :meth:`covariance_at`; NOT_FINITE: no such level.
         """
         if not 0.0 < level < 1.0:
-            raise CalibrationError(
-                f"level: expected a number between 0 and 1, got {level}",
-                code=Code.NOT_FINITE,
-                expected="a number between 0 and 1",
-                got=level,
+            raise Code.NOT_FINITE.unexpected(
+                "level: expected a number between 0 and 1", "a number between 0 and 1", level
             )
         seen = as_points(np.atleast_2d(camera_points), 2, "camera points")
         touched = as_points(np.atleast_2d(robot_points), 3, "robot points")
         if len(seen) != len(touched) or not len(seen):
-            raise CalibrationError(
-                f"expected as many robot points as camera points ({len(seen)}), one at least, "
-                f"got {len(touched)}",
-                code=Code.SHAPE,
-                expected=len(seen),
-                got=len(touched),
+            raise Code.SHAPE.unexpected(
+                f"expected as many robot points as camera points ({len(seen)}), one at least",
+                len(seen),
+                len(touched),
             )
         offsets = touched - self.transform(seen)
         rows = self._rows(seen).reshape(-1, 12)
@@ -388,11 +438,10 @@ class PlaneCalibration(storage.SavedCalibration):
         camera = as_vector(camera_position, 3, "camera position")
         distance = abs(float((camera - self._map.origin) @ self.normal))
         if not (math.isfinite(height) and distance > max(height, 0.0)):
-            raise CalibrationError(
+            raise Code.OUT_OF_FIELD.refusal(
                 f"expected a height below the camera's ({distance:.6g} m), got {height:.6g} m",
-                code=Code.OUT_OF_FIELD,
-                expected=distance,
-                got=height,
+                distance,
+                height,
             )
         part = height / distance
         matrix = self.matrix.copy()
@@ -416,6 +465,12 @@ class PlaneCalibration(storage.SavedCalibration):
         _ = self._map  # refused here, not with the first part
 
 
+@takes(
+    model=check_text,
+    weights=or_none(numbers),
+    tool_z=or_none(numbers),
+    robust=check_flag,
+)
 def fit_plane(
     camera_points: ArrayLike,
     robot_points: ArrayLike,
@@ -429,6 +484,7 @@ def fit_plane(
     robot_frame: str = "robot",
     camera_frame: str | None = None,
     y_down: bool | None = None,
+    allowed_error: float | None = None,
 ) -> PlaneCalibration:
     """Return the map from the camera's plane to the robot, fitted to points that both have seen.
 
@@ -441,7 +497,9 @@ def fit_plane(
             better than noise alone explains in 99 of 100 cases. ``rigid`` takes part where
             ``nominal_scale`` is given.
         touch_sigma: standard deviation of one coordinate of a touch, robot and camera together,
-            metres; None: estimated from the residuals.
+            metres; None: estimated from the residuals. Where these have fewer than 6 degrees of
+            freedom, 0.2 mm stand for the missing ones; residuals that speak of more than 0.5 mm and
+            a thousandth of the field are called POOR_FIT, as mistakes may cause them.
         weights: (N,), one over the relative variance of each touch.
         nominal_scale: metres for each unit of the camera's points, as it should be.
         tool_z: (3,) or (N, 3), direction of the tool's axis, into the plane, when it touched. Three
@@ -455,6 +513,11 @@ def fit_plane(
         camera_frame: name of the frame that localizations must come in; None for any.
         y_down: whether the camera's y axis points down and was turned up before the points came;
             None: not known. Kept, and compared where the calibration is used; nothing is turned.
+        allowed_error: the largest error of 95 of 100 points that is good enough, metres; None: a
+            hundredth of the touched field. See :attr:`PlaneCalibration.verdict`.
+
+    Touches of one and the same point of the camera, or with one and the same pose of the robot
+    close to each other, count as one, their mean: what is wrong with the point is in all of them.
 
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
@@ -465,17 +528,24 @@ def fit_plane(
         ValueError: no model has that name.
     """
     if model != "auto" and model not in MODELS:
-        raise ValueError(f"model: expected auto, {', '.join(MODELS)}, got {model!r}")
+        raise ConfigurationError(
+            f"fit_plane: model: expected auto, {', '.join(MODELS)}, got {shown(model)}"
+        )
     camera, robot, parts = read_pairs(camera_points, robot_points, weights)
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
-    kept = np.arange(len(camera))
-    if robust:
-        kept = np.flatnonzero(agreeing(camera, robot, parts, touch_sigma))
+    check_positive(allowed_error, "allowed_error", "metres")
+    once = distinct(camera, robot, parts)
+    marks, touched = once.camera, once.robot
+    kept = np.arange(len(marks))
     least = MODELS["similarity" if model == "auto" else model].least
-    check_samples(camera[kept], robot[kept], least, touch_sigma)
+    if len(marks) < len(camera):  # that they are the same is to be said of the points as they came
+        check_samples(camera, robot, least, touch_sigma)
+    if robust:
+        kept = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
+    check_samples(marks[kept], touched[kept], least, touch_sigma)
     side = None if tool_z is None else mean_axis(tool_z, len(camera))
-    place, pairs = normalize(camera[kept], robot[kept], parts[kept])
+    place, pairs = normalize(marks[kept], touched[kept], once.weights[kept])
     sigma = None if touch_sigma is None else touch_sigma / place.robot_size
     unit = place.camera_size / place.robot_size
     nominal = 1.0 if nominal_scale is None and model == "rigid" else nominal_scale
@@ -486,6 +556,7 @@ def fit_plane(
     held_out = candidates.held_out(fitted)
     matrix = place.outward(fitted.matrix)
     plane = PlaneMap(matrix, place.camera)
+    most = MAX_SIGMA.of(extent(touched[kept])) if touch_sigma is None else touch_sigma
     evidence = Evidence(
         pairs=pairs,
         fitted=fitted,
@@ -494,28 +565,30 @@ def fit_plane(
         asked=model != "auto",
         held_out=held_out,
         sigma=sigma,
+        most=most / place.robot_size,
         place=place,
         nominal_scale=nominal,
         side=None if side is None else check_side(plane.frame[:, 2], side),
-        numbers=1 + kept,
+        numbers=1 + once.first[kept],
     )
-    estimate = _estimated(fitted, pairs.weights)
+    estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA / place.robot_size)
     if robust and touch_sigma is None and estimate is not None:
-        check_lever(lever(robot[kept]), place.robot_size * estimate)
-    off = np.setdiff1d(np.arange(len(camera)), kept)
-    missed = np.zeros_like(robot)
-    missed[off] = robot[off] - plane.transform(camera[off])
+        check_lever(lever(touched[kept]), place.robot_size * estimate)
+    off = np.setdiff1d(np.arange(len(marks)), kept)
+    missed = np.zeros_like(touched)
+    missed[off] = touched[off] - plane.transform(marks[off])
+    beside = robot - touched[once.number]
     compared: list[ModelName] = [*candidates.names] if model == "auto" else [fitted.model]
     found = PlaneCalibration(
         model=fitted.model,
         camera_points=camera,
         robot_points=robot,
-        weights=_put(np.zeros(len(camera)), kept, parts[kept]),
+        weights=np.where(np.isin(once.number, kept), parts, 0.0),
         matrix=matrix,
         place=place,
         unit_covariance=fitted.unit_covariance / place.robot_size**2,
-        residuals=_put(missed, kept, place.robot_size * fitted.residuals),
-        leave_one_out=_put(missed, kept, place.robot_size * held_out),
+        residuals=_put(missed, kept, place.robot_size * fitted.residuals)[once.number] + beside,
+        leave_one_out=_put(missed, kept, place.robot_size * held_out)[once.number] + beside,
         freedom=fitted.freedom,
         touch_sigma=touch_sigma
         if estimate is None or touch_sigma is not None
@@ -530,9 +603,14 @@ def fit_plane(
         robot_frame=robot_frame,
         camera_frame=camera_frame,
         y_down=y_down,
+        allowed_error=allowed_error,
         warnings=findings(evidence),
     )
     remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
+    apart = np.linalg.norm(beside, axis=1)
+    if apart.max() > TOUCHES_APART * most:
+        text = f"point {1 + int(apart.argmax())} was touched {1e3 * float(apart.max()):.3g} mm from"
+        remarks.append(Code.OUTLIER.remark(f"{text} the mean of its touches"))
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings))
 
 
@@ -544,22 +622,21 @@ def _put(whole: Array, at: NDArray[np.intp], values: Array) -> Array:
 
 
 def _left_out(found: PlaneCalibration, index: int, weight: float) -> Remark:
-    """Say how far off a point lies that was left out, and how far touching explains."""
+    """Return the remark on a point left out: how far off it lies, and how far touching explains."""
     distance = float(np.linalg.norm(found.residuals[index]))
     variance = 3.0 / weight * (found.touch_sigma or 0.0) ** 2
     variance += float(found.predicted_error(found.camera_points[index : index + 1])[0]) ** 2
-    return Remark(
-        Code.OUTLIER,
+    return Code.OUTLIER.remark(
         f"point {1 + index} is left out: it lies {1e3 * distance:.3g} mm from where the others "
-        f"say, where touching explains {1e3 * math.sqrt(variance):.3g} mm rms",
+        f"say, where touching explains {1e3 * math.sqrt(variance):.3g} mm rms"
     )
 
 
-def _estimated(fitted: Fit, weights: Array) -> float | None:
+def _estimated(fitted: Fit, weights: Array, typical: float) -> float | None:
     """Return the sigma that the residuals speak of, None without a degree of freedom."""
     if not fitted.freedom:
         return None
-    return math.sqrt(squares(fitted.residuals, weights) / fitted.freedom)
+    return sigma_of(squares(fitted.residuals, weights), fitted.freedom, typical)
 
 
 def mean_axis(tool_z: ArrayLike, count: int) -> Array:
@@ -574,11 +651,8 @@ def mean_axis(tool_z: ArrayLike, count: int) -> Array:
         given = (axes / np.linalg.norm(axes, axis=1, keepdims=True)).mean(axis=0)
     axis = as_vector(given, 3, "tool axis")
     length = float(np.linalg.norm(axis))
-    if not length > LEAST_AXIS:
-        raise CalibrationError(
-            f"tool axis: expected a direction, got {axis.tolist()}",
-            code=Code.COINCIDENT,
-            expected="a direction",
-            got=axis.tolist(),
+    if not length > MIN_DIRECTION_LENGTH:
+        raise Code.COINCIDENT.unexpected(
+            "tool axis: expected a direction", "a direction", axis.tolist()
         )
     return axis / length

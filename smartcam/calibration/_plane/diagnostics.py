@@ -1,48 +1,77 @@
-"""What one should know of a calibration that could be made: the tests behind its warnings.
+"""Test a calibration that could be made for what its user should know: its warnings.
 
 Each test calls a healthy calibration suspicious in at most one of 100 cases.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code, Remark
-from smartcam.calibration._plane.model_selection import squares, touch_noise
+from smartcam.calibration._plane.fitting import fit
+from smartcam.calibration._plane.model_selection import NEGLIGIBLE, squares, touch_noise
+from smartcam.calibration._plane.order import better_order
+from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.fitting import Fit, ModelName, Normalization, Pairs
     from smartcam.calibration._plane.model_selection import Candidates
+    from smartcam.geometry._inside import Array
 
 LEVEL = 0.01
-"""How seldom noise alone may cause a warning."""
+"""Probability with which noise alone may cause a warning."""
 
 SCALE_TOLERANCE = 0.005
-"""Of the nominal scale: what printers and heights of parts are allowed."""
+"""A scale may be off the nominal one by this part, as printers and heights of parts make it."""
 
 SCALE_LIMIT = 0.1
-"""Of the nominal scale: beyond it, units or sheets were mixed up."""
+"""A scale off the nominal one by more than this part comes of mixed-up units or sheets."""
 
-LEAST_COSINE = 0.17
-"""Between tool and normal: closer to a right angle the tool's axis does not tell the side."""
+MIN_TOOL_COSINE = 0.17
+"""Cosine between tool and normal below which the tool's axis does not tell the side."""
 
-LEAST_FREEDOM = 6
+MAX_POINTS_FOR_PAIRS = 25
+"""Points up to which it is tried what two of them explain; of more, two hardly move the map."""
+
+MIN_POINTS_LEFT = 3
+"""More points must be left where some are left out: three fit a similarity nearly always."""
+
+MIN_DEGREES_OF_FREEDOM = 6
 """An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
+
+TYPICAL_SIGMA = 0.0002
+"""Metres: sigma of a careful touch, for as many degrees of freedom as an estimate of it lacks."""
+
+
+class Limit(NamedTuple):
+    """The most that a coordinate of a touch may be off where nobody says: a standard deviation."""
+
+    touch: float  # of the robot's tip, metres
+    part: float  # of the camera, a part of the field
+
+    def of(self, field: float) -> float:
+        """Return the limit for a field of some metres."""
+        return math.hypot(self.touch, self.part * field)
+
+
+MAX_SIGMA = Limit(0.0005, 0.001)
+"""Residuals that speak of more may be mistakes: a robot that is led by hand and a camera of 640 x
+480 pixels stay within it."""
 
 _TINY = 1e-8
 
 
 class Evidence(NamedTuple):
-    """What the tests look at; lengths in units of ``place``."""
+    """The evidence that the tests look at; lengths in units of ``place``."""
 
     pairs: Pairs
     fitted: Fit  # the fit that was chosen
@@ -51,6 +80,7 @@ class Evidence(NamedTuple):
     asked: bool  # whether the user named the model
     held_out: Array  # (N, 3), of the chosen fit
     sigma: float | None  # of a touch; None where it was not given
+    most: float  # the same where it was given, else the most that it may be
     place: Normalization  # centre and size of the points
     nominal_scale: float | None  # metres for each unit of the camera; None where it was not given
     # the cosine between tool and normal, None where the tool's axis was not given
@@ -60,20 +90,35 @@ class Evidence(NamedTuple):
 
 def findings(evidence: Evidence) -> tuple[Remark, ...]:
     """Return the warnings, the most serious first."""
-    tests = (_planarity, _fit, _model, _scale, _held_out, _touches, _side)
+    tests = (_order, _planarity, _fit, _wrong_instead, _model, _scale, _held_out, _touches, _side)
     return tuple(remark for test in tests for remark in test(evidence))
+
+
+def sigma_of(squared: float, freedom: int, typical: float) -> float:
+    """Return the sigma that residuals speak of, by the sum of their squares.
+
+    ``typical``: the sigma that stands for degrees of freedom that they lack; of few residuals all
+    may be small by chance.
+    """
+    missing = max(0, MIN_DEGREES_OF_FREEDOM - freedom)
+    return math.sqrt((squared + missing * typical**2) / (freedom + missing))
+
+
+def _order(evidence: Evidence) -> Iterator[Remark]:
+    found = better_order(evidence.pairs.camera, evidence.pairs.robot, evidence.most)
+    if found is not None:
+        yield found.remark(evidence.numbers, 1e3 * evidence.place.robot_size)
 
 
 def check_side(normal: Array, tool_z: Array) -> float:
     """Return the cosine between a tool's axis and the plane's normal (MIRRORED: the same side)."""
     cosine = float(normal @ tool_z) / float(np.linalg.norm(tool_z))
-    if cosine > LEAST_COSINE:
-        raise CalibrationError(
+    if cosine > MIN_TOOL_COSINE:
+        raise Code.MIRRORED.refusal(
             "expected the plane's normal to point against the tool, got one along it (cosine "
             f"{cosine:.2f}): the camera's y axis points the wrong way, or points are swapped",
-            code=Code.MIRRORED,
-            expected=-1.0,
-            got=cosine,
+            -1.0,
+            cosine,
         )
     return cosine
 
@@ -92,7 +137,7 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
     if exact or abs(off) > SCALE_LIMIT:
-        raise CalibrationError(text, code=Code.SCALE_MISMATCH, expected=nominal, got=measured)
+        raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
     return text
 
 
@@ -111,12 +156,11 @@ def _planarity(evidence: Evidence) -> Iterator[Remark]:
     noise = touch_noise(evidence.sigma, within, evidence.fitted.freedom - count)
     if noise is not None and noise.chance(squared, count) < LEVEL:
         worst, mm = int(np.argmax(weights * out**2)), 1e3 * evidence.place.robot_size
-        yield Remark(
-            Code.NOT_PLANAR,
+        yield Code.NOT_PLANAR.remark(
             f"the touched points lie {mm * math.sqrt(squared / count):.3g} mm rms out of a plane, "
             f"where touching explains {mm * math.sqrt(noise.variance):.3g} mm; "
             f"point {evidence.numbers[worst]} is the furthest, "
-            f"{mm * abs(float(out[worst])):.3g} mm",
+            f"{mm * abs(float(out[worst])):.3g} mm"
         )
 
 
@@ -128,27 +172,57 @@ def _fit(evidence: Evidence) -> Iterator[Remark]:
     worst = int(np.argmin(chances))
     if chances[worst] * len(chances) < LEVEL:
         residual = 1e3 * evidence.place.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
-        yield Remark(
-            Code.OUTLIER,
+        yield Code.OUTLIER.remark(
             f"point {evidence.numbers[worst]} fits far worse than the others: its residual of "
             f"{residual:.3g} mm comes by chance once in {1 / max(chances[worst], 1e-12):.3g} "
-            "touches",
+            "touches"
         )
         return
-    noise = touch_noise(evidence.sigma, 0.0, 0)
-    if noise is not None and fitted.freedom and noise.chance(total, fitted.freedom) < LEVEL:
-        found = evidence.place.robot_size * math.sqrt(total / fitted.freedom)
-        yield Remark(
-            Code.POOR_FIT,
-            f"the residuals speak of touches with a sigma of {1e3 * found:.3g} mm, "
-            f"where {1e3 * evidence.place.robot_size * math.sqrt(noise.variance):.3g} mm was given",
+    most = max(evidence.most, NEGLIGIBLE)
+    if fitted.freedom and Noise(most**2).chance(total, fitted.freedom) < LEVEL:
+        mm = 1e3 * evidence.place.robot_size
+        given = "was given" if evidence.sigma is not None else "is the most that is taken for noise"
+        yield Code.POOR_FIT.remark(
+            "the residuals speak of touches with a sigma of "
+            f"{mm * math.sqrt(total / fitted.freedom):.3g} mm, where {mm * most:.3g} mm {given}"
+        )
+
+
+def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
+    """Ask whether one touch or two that are wrong explain as much as a tilted camera does."""
+    fitted, pairs = evidence.fitted, evidence.pairs
+    count = len(pairs.camera)
+    if (
+        fitted.model not in {"affine", "homography"}
+        or not fitted.freedom
+        or count > MAX_POINTS_FOR_PAIRS
+    ):
+        return
+    noise = touch_noise(evidence.sigma, squares(fitted.residuals, pairs.weights), fitted.freedom)
+    found: list[tuple[float, tuple[int, ...]]] = []
+    for few in (1, 2):
+        for out in itertools.combinations(
+            range(count), few if count - few > MIN_POINTS_LEFT else 0
+        ):
+            try:
+                simple = fit("similarity", pairs.without(*out))
+            except CalibrationError:  # the others lie in a line
+                continue
+            squared = squares(simple.residuals, np.delete(pairs.weights, out))
+            found.append((0.0 if noise is None else noise.chance(squared, simple.freedom), out))
+    chance, out = max(found, default=(0.0, ()))
+    if out and chance > LEVEL:
+        points = " and ".join(str(evidence.numbers[i]) for i in out)
+        yield Code.OUTLIER.remark(
+            f"point{'s' * (len(out) > 1)} {points} may be wrong: without, one scale fits all "
+            f"others as well as the model {fitted.model} does with them"
         )
 
 
 def _chance_among(evidence: Evidence, squared: float, total: float) -> float:
     """Return the probability of one residual's square, by the others where they are enough."""
     freedom = evidence.fitted.freedom - 3
-    sigma = evidence.sigma if freedom < LEAST_FREEDOM else None
+    sigma = evidence.sigma if freedom < MIN_DEGREES_OF_FREEDOM else None
     noise = touch_noise(sigma, max(total - squared, 0.0), freedom)
     return 1.0 if noise is None else noise.chance(squared, 3)
 
@@ -176,7 +250,7 @@ def _model(evidence: Evidence) -> Iterator[Remark]:
         f"held-out error with the model {simple} {errors[0]:.3g} mm, with {preferred} "
         f"{errors[1]:.3g} mm: the camera is tilted or its lens distorts"
     )
-    yield Remark(Code.NOT_SIMILAR, f"{text}; {used} was asked for" if evidence.asked else text)
+    yield Code.NOT_SIMILAR.remark(f"{text}; {used} was asked for" if evidence.asked else text)
 
 
 def _scale(evidence: Evidence) -> Iterator[Remark]:
@@ -192,32 +266,29 @@ def _scale(evidence: Evidence) -> Iterator[Remark]:
     exact = evidence.fitted.model == "rigid"
     text = check_scale(measured, evidence.nominal_scale, uncertainty, exact=exact)
     if text is not None:
-        yield Remark(Code.SCALE_MISMATCH, text)
+        yield Code.SCALE_MISMATCH.remark(text)
 
 
 def _held_out(evidence: Evidence) -> Iterator[Remark]:
     missing = np.flatnonzero(np.isnan(evidence.held_out).any(axis=1))
     if len(missing) == len(evidence.held_out):
-        yield Remark(
-            Code.NOT_HELD_OUT,
+        yield Code.NOT_HELD_OUT.remark(
             f"{len(missing)} points are no more than {evidence.fitted.model} has need of: none can "
-            "be left out to see how good the calibration is, and the residuals do not tell",
+            "be left out to see how good the calibration is, and the residuals do not tell"
         )
     elif len(missing):
-        yield Remark(
-            Code.NOT_HELD_OUT,
+        yield Code.NOT_HELD_OUT.remark(
             f"without point {evidence.numbers[missing[0]]} the others give no calibration: "
-            "nothing checks it",
+            "nothing checks it"
         )
 
 
 def _touches(evidence: Evidence) -> Iterator[Remark]:
     freedom = evidence.fitted.freedom
-    if evidence.sigma is None and freedom < LEAST_FREEDOM:
+    if evidence.sigma is None and freedom < MIN_DEGREES_OF_FREEDOM:
         how = f"is estimated from {freedom} degrees of freedom only" if freedom else "is not known"
-        yield Remark(
-            Code.UNVERIFIED,
-            f"the touches' sigma {how}: give touch_sigma or touch more points",
+        yield Code.UNVERIFIED.remark(
+            f"the touches' sigma {how}: give touch_sigma or touch more points"
         )
 
 
@@ -230,9 +301,8 @@ def remark_side(side: float | None) -> Iterator[Remark]:
 
     ``side``: the cosine between tool and normal, None where the tool's axis was not given.
     """
-    if side is None or abs(side) <= LEAST_COSINE:
-        yield Remark(
-            Code.SIDE_UNKNOWN,
+    if side is None or abs(side) <= MIN_TOOL_COSINE:
+        yield Code.SIDE_UNKNOWN.remark(
             "the tool's axis does not tell from which side the plane is touched: that the camera's "
-            "y axis points the right way is not checked",
+            "y axis points the right way is not checked"
         )

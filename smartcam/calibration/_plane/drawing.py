@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from smartcam.calibration._svg import line, polygon, rectangle, round_down, text
+from smartcam.calibration._svg import circle, document, line, polygon, rectangle, round_down, text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
 WIDTH: Final = 900.0
-"""Of the field, pixels; the height follows from the points."""
+"""The field is drawn this wide, pixels; its height follows from the points."""
 
 BORDER: Final = 60.0
 FOOT: Final = 130.0
 """Pixels around the field, and for the legend below it."""
 
 MARGIN: Final = 0.15
-"""Of the extent of what is shown, around it."""
+"""A margin of this part of the extent of what is shown stays free around it."""
 
 COLUMNS: Final = 30
 """Cells of the heat map across; as many down as make them square, at most twice that."""
@@ -40,12 +40,13 @@ OUTLINE: Final = 24
 """Points of an ellipse."""
 
 TINY: Final = 1e-9
-"""Of the field's width: errors below it are not drawn larger."""
+"""Errors below this part of the field's width are not drawn larger."""
 
 LOW, HIGH = (240, 247, 252), (246, 196, 140)
 """Colours of the smallest and the largest predicted error."""
 
 STYLE: Final = """\
+.paper { fill: #fff }
 marker { overflow: visible } text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px }
 .camera { stroke: #777; fill: none; stroke-width: 2 } .robot { stroke: #1f5fbf; fill: none; \
 stroke-width: 2 }
@@ -60,11 +61,11 @@ HEADS: Final = "".join(
     f'markerUnits="userSpaceOnUse"><path d="M0 0 L8 4 L0 8" class="{kind}"/></marker>'
     for kind in ("camera", "robot")
 )
-"""Of the axes' arrows."""
+"""SVG markers for the heads of the axes' arrows."""
 
 
-class _View:
-    """What is shown of the camera's plane, and how it becomes pixels of the picture.
+class _DrawnPlane:
+    """The part of the camera's plane that is drawn, and its map to pixels of the picture.
 
     Args:
         shown: (N, 2), points that are in it.
@@ -110,18 +111,14 @@ def draw(
     both = np.concatenate([points, places])
     low, high = both.min(axis=0), both.max(axis=0)
     near = (np.abs(off - (low + high) / 2) < high - low).all(axis=1)
-    field = _View(np.concatenate([both, off[near]]))
+    field = _DrawnPlane(np.concatenate([both, off[near]]))
     residuals = calibration.inverse(calibration.robot_points[counted]) - points
     outlines = _outlines(calibration, both)
     sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
     largest = field.zoom * float(np.linalg.norm(sizes, axis=1).max())
     larger = round_down(0.06 * WIDTH / largest) if largest > TINY * WIDTH else 1.0
-    width, height = f"{WIDTH + 2 * BORDER:.0f}", f"{field.foot + FOOT:.0f}"
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
-        f'viewBox="0 0 {width} {height}">',
-        f"<style>{STYLE}</style><defs>{HEADS}</defs>",
-        f'<rect width="{width}" height="{height}" fill="#fff"/>',
+    shapes = [
+        f"<defs>{HEADS}</defs>",
         *_heat(calibration, field),
         *_axes(calibration, field),
         *(
@@ -131,9 +128,8 @@ def draw(
         *_touches(calibration, field, points + larger * residuals),
         *(_part(part, place) for part, place in zip(found, field.pixels(places), strict=True)),
         *_legend(calibration, field, larger, title),
-        "</svg>",
     ]
-    return "\n".join(lines) + "\n"
+    return document(WIDTH + 2 * BORDER, field.foot + FOOT, shapes, STYLE)
 
 
 def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
@@ -158,7 +154,7 @@ def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
     return seen.reshape(len(points), OUTLINE, 2) - points[:, None]
 
 
-def _heat(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
+def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the predicted error as coloured cells."""
     if calibration.touch_sigma is None:
         return
@@ -189,7 +185,7 @@ def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
     return rectangle((x, y), (wide, tall), f'fill="#{colour}"')
 
 
-def _axes(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
+def _axes(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the axes of the camera and of the robot.
 
     The camera's are at its origin where that is shown, else at a corner; the robot's, as they lie
@@ -201,7 +197,7 @@ def _axes(calibration: PlaneCalibration, field: _View) -> Iterator[str]:
     start = np.array([BORDER + WIDTH - 90, field.foot + 35])
     for axis, name in zip(calibration.rotation[:, :2], ("robot x", "y", "z"), strict=True):
         if np.linalg.norm(axis) < 0.05:  # it stands on the plane
-            yield _dot(start, 4, "robot")
+            yield circle(start, 4, "robot")
             yield _text(start, name, "robot-name", beside=(7, 15))
         else:
             yield from _axis(start, 60 * axis * [1, -1], "robot", name)
@@ -213,13 +209,13 @@ def _axis(start: Array, along: Array, kind: str, name: str) -> Iterator[str]:
     yield _text(end + 8 * along / np.linalg.norm(along), name, f"{kind}-name", beside=(0, 4))
 
 
-def _touches(calibration: PlaneCalibration, field: _View, ends: Array) -> Iterator[str]:
+def _touches(calibration: PlaneCalibration, field: _DrawnPlane, ends: Array) -> Iterator[str]:
     counted = calibration.weights > 0.0
     places = field.pixels(calibration.camera_points)
     numbers = np.flatnonzero(counted)
     for number, place, end in zip(numbers, places[counted], field.pixels(ends), strict=True):
         yield line(place, end, "residual")
-        yield _dot(place, 4, "touch")
+        yield circle(place, 4, "touch")
         yield _text(place, str(1 + number), beside=(7, -7))
     for index in calibration.outliers:
         point, place = calibration.camera_points[index], places[index]
@@ -233,11 +229,11 @@ def _part(part: Localization, place: Array) -> str:
     theta = part.pose.orientation.theta
     along = 18 * np.array([math.cos(theta), -math.sin(theta)])
     name = _text(place, part.feature_id, "part-name", beside=(10, 20))
-    return _dot(place, 7, "part") + line(place, place + along, "part") + name
+    return circle(place, 7, "part") + line(place, place + along, "part") + name
 
 
 def _legend(
-    calibration: PlaneCalibration, field: _View, larger: float, title: str
+    calibration: PlaneCalibration, field: _DrawnPlane, larger: float, title: str
 ) -> Iterator[str]:
     if title:
         yield _text((BORDER, 30), title, "title")
@@ -259,10 +255,6 @@ def _legend(
     start = end - [metres * per_metre, 0.0]
     yield line(start, end, "camera")
     yield _text(start, f"{1e3 * metres:g} mm", beside=(0, 18))
-
-
-def _dot(place: Array, radius: int, kind: str) -> str:
-    return f'<circle cx="{place[0]:.2f}" cy="{place[1]:.2f}" r="{radius}" class="{kind}"/>'
 
 
 def _text(

@@ -18,33 +18,35 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.homography import apply_homography, element_derivatives
+from smartcam.calibration._homography import apply_homography, element_derivatives
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 ModelName: TypeAlias = Literal["rigid", "similarity", "affine", "homography"]
 
-LEAST_CONDITION = 1e-4
+MIN_CONDITION = 1e-4
 """Smallest over largest singular value of a fit's column-scaled Jacobian.
 
 Healthy layouts have 0.03 and more; a parameter that is not determined gives rounding errors, below
 1e-10 (measured).
 """
 
-MOST_STEPS = 50
-"""Of the homography's refinement; it takes 3 to 8."""
+MAX_STEPS = 50
+"""The refinement of a homography takes at most this many steps; it usually takes 3 to 8."""
 
-MOST_HALVINGS = 20
-"""Of a step that makes the sum of squares larger; after them it is as small as rounding lets it."""
+MAX_HALVINGS = 20
+"""A step that makes the sum of squares larger is tried in at most this many sizes, each half of the
+one before; after them the sum is as small as rounding lets it be."""
 
 SMALLEST_STEP = 1e-13
-"""Of the matrix' elements, which are about 1; the next step would be a thousand times smaller."""
+"""The refinement ends where a step changes the matrix' elements, which are about 1, by less than
+this; the next step would be a thousand times smaller."""
 
 FULL_REFITS = 200
 """Points up to which a homography is fitted anew without each of them.
@@ -56,7 +58,7 @@ that is below 0.1 then.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Normalization(storage.Stored):
-    """Where the fit takes place: centres and sizes that bring the points near to 1."""
+    """The frames in which the fit is made: centres and sizes that bring the points near to 1."""
 
     camera: storage.Vector2  # centre of the camera's points (2,)
     camera_size: storage.Positive  # their rms distance from it, in the camera's unit
@@ -89,9 +91,9 @@ class Pairs:
     robot: Array  # (N, 3), centred, of rms length 1
     weights: Array  # (N,), one over the relative variance of each
 
-    def without(self, index: int) -> Pairs:
-        """Return all but one."""
-        keep = np.arange(len(self.camera)) != index
+    def without(self, *index: int) -> Pairs:
+        """Return all but some."""
+        keep = ~np.isin(np.arange(len(self.camera)), index)
         return Pairs(self.camera[keep], self.robot[keep], self.weights[keep])
 
     @property
@@ -146,13 +148,12 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
     lengths = np.linalg.norm(weighted, axis=0)
     left, singular, right = np.linalg.svd(weighted / lengths, full_matrices=False)
     condition = float(singular[-1] / singular[0])
-    if condition < LEAST_CONDITION:
-        raise CalibrationError(
+    if condition < MIN_CONDITION:
+        raise Code.COLLINEAR.refusal(
             f"{name}: expected points that determine all {model.parameters} parameters "
-            f"(condition at least {LEAST_CONDITION:g}), got {condition:.2g}: too many in a line",
-            code=Code.COLLINEAR,
-            expected=LEAST_CONDITION,
-            got=condition,
+            f"(condition at least {MIN_CONDITION:g}), got {condition:.2g}: too many in a line",
+            MIN_CONDITION,
+            condition,
         )
     half = tangent @ (right.T / singular / lengths[:, None])
     rows = left.reshape(-1, 3, model.parameters)
@@ -188,7 +189,7 @@ def _held_out_by_leverage(fitted: Fit, pairs: Pairs) -> Array:
     kept = fitted.blocks * pairs.weights[:, None, None]
     least = np.linalg.eigvalsh(kept)[:, 0]
     result = np.full_like(pairs.robot, np.nan)
-    known = least > LEAST_CONDITION**2
+    known = least > MIN_CONDITION**2
     result[known] = np.linalg.solve(kept[known], fitted.residuals[known][..., None])[..., 0]
     return result
 
@@ -218,7 +219,7 @@ def _held_out_of_sums(pairs: Pairs, scale: float | None) -> Array:
     axes = scaled_axes(cross, np.trace(square, axis1=1, axis2=2), scale)
     residuals: Array = p - mean_p - np.einsum("nij,nj->ni", axes, u - mean_u)
     spread = np.linalg.eigvalsh(square)
-    residuals[spread[:, 0] < (LEAST_CONDITION**2) * spread[:, 1]] = np.nan
+    residuals[spread[:, 0] < (MIN_CONDITION**2) * spread[:, 1]] = np.nan
     return residuals
 
 
@@ -263,11 +264,11 @@ def _solve_homography(pairs: Pairs, scale: float) -> Array:
     root = np.sqrt(pairs.weights)[:, None]
     residuals = root * (pairs.robot - apply_homography(matrix, pairs.camera))
     tangent = _homography_tangent(matrix)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         moves = element_derivatives(matrix, pairs.camera) @ tangent
         jacobian = (root[..., None] * moves).reshape(-1, 11)
         step = tangent @ np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
-        for halving in range(MOST_HALVINGS):
+        for halving in range(MAX_HALVINGS):
             following = matrix + 0.5**halving * step.reshape(4, 3)
             if (pairs.homogeneous @ following[3]).min() <= 0.0:  # a point beyond the horizon
                 continue
@@ -301,7 +302,7 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
     )
     solution = np.linalg.svd(equations)[2][-1].reshape(3, 3)
     w = pairs.homogeneous @ solution[2]
-    if abs(solution[2, 2]) < LEAST_CONDITION or w.min() * w.max() <= 0:
+    if abs(solution[2, 2]) < MIN_CONDITION or w.min() * w.max() <= 0:
         return _solve_affine(pairs, scale)  # a point beyond the horizon: noise, not a view
     solution = solution / solution[2, 2]
     top = axes @ solution[:2] + np.outer(mean, solution[2])
@@ -325,10 +326,6 @@ def _similarity_tangent(matrix: Array) -> Array:
     return np.column_stack([rigid_tangent(matrix), growth.ravel()])
 
 
-def _affine_tangent(_matrix: Array) -> Array:
-    return np.eye(12)[:, :9]
-
-
 def _homography_tangent(_matrix: Array) -> Array:
     return np.eye(12)[:, :11]
 
@@ -338,7 +335,7 @@ MODELS: dict[ModelName, Model] = {
     "similarity": Model(
         7, 3, lambda pairs, _scale: _solve_similarity(pairs, None), _similarity_tangent
     ),
-    "affine": Model(9, 3, _solve_affine, _affine_tangent),
+    "affine": Model(9, 3, _solve_affine, lambda _: np.eye(12)[:, :9]),
     "homography": Model(11, 4, _solve_homography, _homography_tangent),
 }
-"""From the simplest to the most general; each is a special case of the next."""
+"""Models from the simplest to the most general; each is a special case of the next."""

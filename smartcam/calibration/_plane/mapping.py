@@ -12,17 +12,16 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.homography import apply_homography, derivatives, tangent_frames
-from smartcam.calibration._geometry.rotations import (
-    LARGEST,
+from smartcam._extras import load
+from smartcam.calibration._homography import apply_homography, derivatives, tangent_frames
+from smartcam.geometry import Code
+from smartcam.geometry._inside import (
+    MAX_COORDINATE,
     as_points,
     check_finite,
     not_finite,
     quaternion_from_matrix,
 )
-from smartcam.calibration._optional_imports import load
-from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
@@ -30,7 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry._inside import Array
 
 FEW = 512
 """Points up to which numpy is faster than calling OpenCV, and no second library is loaded."""
@@ -60,7 +60,7 @@ class PlaneMap:
         self._depth: tuple[float, float, float] = tuple(matrix[3].tolist())
         self._most = 3.0 * float(np.abs(matrix).max())
         self.projective: bool = bool(matrix[3, :2].any())
-        """Whether parallel lines may meet: a homography."""
+        """True if parallel lines may meet, as under a homography."""
         with np.errstate(all="ignore"):
             self._prepare(matrix, centre)
         known = [self.origin, self.frame, self._flat, self._back]
@@ -69,7 +69,7 @@ class PlaneMap:
 
     def _prepare(self, matrix: Array, centre: Array) -> None:
         self.origin: Array = apply_homography(matrix, centre[None])[0]
-        """Where the centre lies (3,), metres."""
+        """Position (3,) of the centre, metres."""
         derivative = derivatives(matrix, centre[None])[0]
         self.scale: float = math.sqrt(np.linalg.norm(np.cross(derivative[:, 0], derivative[:, 1])))
         """Metres for each unit of the camera there."""
@@ -107,7 +107,7 @@ class PlaneMap:
             if not least > 0:
                 self._check_horizon(block)
             self._fill(source.block(begin), result[begin : begin + BLOCK])
-            if not (least > 0 and self._most * max(farthest, 1.0) / least < LARGEST):
+            if not (least > 0 and self._most * max(farthest, 1.0) / least < MAX_COORDINATE):
                 _check_mapped(block, result[begin : begin + BLOCK])
         return result
 
@@ -246,42 +246,38 @@ def _check_mapped(given: Array, result: Array) -> None:
 def _checked(out: Array, count: int) -> Array:
     fits = out.shape == (count, 3) and out.dtype == np.float64 and out.flags.c_contiguous
     if not (fits and out.flags.writeable):
-        raise CalibrationError(
+        raise Code.SHAPE.refusal(
             f"out: expected a contiguous float64 array of shape ({count}, 3), "
             f"got {out.dtype} of shape {out.shape}",
-            code=Code.SHAPE,
-            expected=(count, 3),
-            got=out.shape,
+            (count, 3),
+            out.shape,
         )
     return out
 
 
 def _header(seen: Header, robot_frame: str, camera_frame: str | None) -> Header:
     if camera_frame is not None and seen.frame_id != camera_frame:
-        raise CalibrationError(
+        raise Code.WRONG_FRAME.refusal(
             f"expected poses in the frame {camera_frame!r}, got one in {seen.frame_id!r}",
-            code=Code.WRONG_FRAME,
-            expected=camera_frame,
-            got=seen.frame_id,
+            camera_frame,
+            seen.frame_id,
         )
     header: Header = _new_tuple(Header, (seen.seq, seen.stamp, robot_frame))
     return header
 
 
 def _out_of_plane(pose: Pose) -> CalibrationError:
-    return CalibrationError(
+    return Code.OUT_OF_PLANE.refusal(
         "expected a pose in the camera's plane (z = 0, turned about z only), "
         f"got {tuple(pose.position)} turned by {tuple(pose.orientation)}",
-        code=Code.OUT_OF_PLANE,
-        expected=0.0,
-        got=pose.position.z,
+        0.0,
+        pose.position.z,
     )
 
 
 def _behind_horizon(point: list[float]) -> CalibrationError:
-    return CalibrationError(
+    return Code.OUT_OF_FIELD.refusal(
         f"expected points that the camera can see of the plane, got {point}: behind its horizon",
-        code=Code.OUT_OF_FIELD,
-        expected="a point before the horizon",
-        got=point,
+        "a point before the horizon",
+        point,
     )

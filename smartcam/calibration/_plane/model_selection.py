@@ -1,4 +1,4 @@
-"""Which model the points ask for.
+"""Choose the model that the points ask for.
 
 The rule, from the simplest model upwards: a more general one is taken if its held-out error is
 smaller, and if noise alone would reduce the sum of squared residuals by as much in fewer than three
@@ -17,16 +17,16 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.fitting import Fit, ModelName, Pairs
+    from smartcam.geometry._inside import Array
 
 LEVEL = 0.003
-"""How seldom noise alone may make a more general model the choice. Of nine touches in the middle
-third of a field it makes the error 4 % larger at 0.01, 1 % here; a camera that is tilted by a
-degree is told from one that is not either way (measured in simulation)."""
+"""Chance at which noise alone may make a more general model the choice. Of nine touches in the
+middle third of a field it makes the error 4 % larger at 0.01, 1 % here; a camera that is tilted by
+a degree is told from one that is not either way (measured in simulation)."""
 
 NEGLIGIBLE = 1e-9
-"""Of the points' extent: residuals below it are rounding, not noise."""
+"""Residuals below this part of the points' extent are rounding, not noise."""
 
 
 def squares(residuals: Array, weights: Array) -> float:
@@ -120,7 +120,7 @@ class Candidates:
 
 
 def better(simple: Fit, general: Fit, weights: Array, sigma: float | None) -> bool:
-    """Return whether noise alone would hardly make ``general`` fit that much better."""
+    """Return True if noise alone would hardly make ``general`` fit that much better."""
     before, after = squares(simple.residuals, weights), squares(general.residuals, weights)
     noise = touch_noise(sigma, after, general.freedom)
     if noise is None:

@@ -20,18 +20,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.rotations import as_points
-from smartcam.calibration._geometry.solvers import Chain, Poses, Solver
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._solvers import Chain, Poses, Solver
+from smartcam.geometry import Code
+from smartcam.geometry._inside import as_points
 
 if TYPE_CHECKING:
     from datetime import datetime
 
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
 
 
 @dataclass(eq=False)
@@ -75,11 +74,8 @@ class MovingCamera:
     ) -> None:
         points = as_points(field, 3, "moving camera: points of the field")
         if len(points) < 3:
-            raise CalibrationError(
-                f"moving camera: expected 3 points of the field or more, got {len(points)}",
-                code=Code.TOO_FEW,
-                expected=3,
-                got=len(points),
+            raise Code.TOO_FEW.unexpected(
+                "moving camera: expected 3 points of the field or more", 3, len(points)
             )
         self._static = static
         self._calibrated_at = calibrated_at
@@ -88,10 +84,9 @@ class MovingCamera:
         self._centre: Array = points.mean(axis=0)
         _, spread, axes = np.linalg.svd(points - self._centre)
         if not spread[1] > 1e-6 * spread[0]:
-            raise CalibrationError(
+            raise Code.COLLINEAR.refusal(
                 "moving camera: expected points of the field that are not on one line, got "
                 f"{spread[1]:.3g} m across it",
-                code=Code.COLLINEAR,
                 got=float(spread[1]),
             )
         self._normal: Array = axes[2]
@@ -131,36 +126,32 @@ class MovingCamera:
     def _check_frames(self, pose: Transform) -> None:
         wanted = self._calibrated_at
         if (pose.target, pose.source) != (wanted.target, wanted.source):
-            raise CalibrationError(
-                f"moving camera: expected {wanted.label}, as it was calibrated, got {pose.label}",
-                code=Code.WRONG_FRAME,
-                expected=wanted.label,
-                got=pose.label,
+            raise Code.WRONG_FRAME.unexpected(
+                f"moving camera: expected {wanted.label}, as it was calibrated",
+                wanted.label,
+                pose.label,
             )
 
     def _check_time(self, pose: Transform, image_at: datetime) -> None:
         if pose.at is None:
-            raise CalibrationError(
+            raise Code.NOT_SIMULTANEOUS.refusal(
                 f"moving camera: expected the time of {pose.label}, to compare it with the "
                 "image's, got none",
-                code=Code.NOT_SIMULTANEOUS,
-                expected=image_at,
+                image_at,
             )
         if image_at.tzinfo is None:
-            raise CalibrationError(
-                f"moving camera: expected an image's time with its time zone, got {image_at}",
-                code=Code.BAD_TIME,
-                expected="a time with its time zone",
-                got=image_at,
+            raise Code.BAD_TIME.unexpected(
+                "moving camera: expected an image's time with its time zone",
+                "a time with its time zone",
+                image_at,
             )
         lag = abs(pose.at - image_at)
         if lag > self._max_lag:
-            raise CalibrationError(
+            raise Code.NOT_SIMULTANEOUS.refusal(
                 f"moving camera: expected a pose within {1e3 * self._max_lag.total_seconds():g} ms "
                 f"of the image, got one {1e3 * lag.total_seconds():g} ms from it",
-                code=Code.NOT_SIMULTANEOUS,
-                expected=self._max_lag,
-                got=lag,
+                self._max_lag,
+                lag,
             )
 
     def _check_plane(self, motion: Transform) -> None:
@@ -172,12 +163,11 @@ class MovingCamera:
         rise = abs(float((motion.apply(self._centre) - self._centre) @ self._normal))
         sine = float(np.linalg.norm(np.cross(motion.rotation @ self._normal, self._normal)))
         tilt = math.degrees(math.atan2(sine, cosine))
-        raise CalibrationError(
+        raise Code.PLANE_MOVED.refusal(
             f"moving camera: expected a motion that keeps the plane of the parts within "
             f"{1e3 * self._tolerance:g} mm, got one that shifts it by {1e3 * rise:.2f} mm along "
             f"its normal and tilts it by {tilt:.2f} deg: {1e3 * off:.2f} mm at the worst point of "
             "the field. A camera that is raised or tilted needs a calibration of its own there",
-            code=Code.PLANE_MOVED,
-            expected=self._tolerance,
-            got=off,
+            self._tolerance,
+            off,
         )

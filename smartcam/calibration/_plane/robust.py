@@ -1,4 +1,4 @@
-"""Which touches agree with one another, where some are wrong.
+"""Find the touches that agree with one another, where some are wrong.
 
 A touch of the wrong mark, or of two marks swapped, lies many sigmas off, and least squares spread
 it over all the others. Here every small subset of the points proposes a map (MSAC): what it costs
@@ -22,9 +22,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.homography import apply_homography, element_derivatives
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
+from smartcam.calibration._homography import apply_homography, element_derivatives
 from smartcam.calibration._plane.fitting import (
     MODELS,
     Fit,
@@ -36,20 +35,21 @@ from smartcam.calibration._plane.fitting import (
 from smartcam.calibration._plane.model_selection import NEGLIGIBLE, squares, touch_noise
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
     Mask = NDArray[np.bool_]
 
-LEAST_POINTS = 6
-"""Below it the points that agree are hardly more than a map has need of."""
+MIN_POINTS = 6
+"""Points below which those that agree are hardly more than a map has need of."""
 
-MOST_SUBSETS = 500
+MAX_SUBSETS_TRIED = 500
 """Subsets that propose a map; of up to 12 points that is each one.
 
 With half of the points wrong, all of 500 subsets of four hold a wrong one in 1 of 10^14 cases.
@@ -58,27 +58,27 @@ With half of the points wrong, all of 500 subsets of four hold a wrong one in 1 
 BEST = 5
 """Proposals that are fitted to the points that agree with them."""
 
-MOST_ROUNDS = 10
-"""Of fitting and judging anew; it takes 2 or 3."""
+MAX_ROUNDS = 10
+"""Fitting and judging take turns at most this many times; they usually take 2 or 3."""
 
 LEVEL = 0.01
-"""How seldom noise alone may leave out a point of a calibration, or ask for a homography."""
+"""Probability with which noise alone may leave out a point, or ask for a homography."""
 
 PRICE = 0.5
-"""Of the threshold: what a point left out costs where a similarity and a homography are compared.
+"""Part of the threshold that a left-out point costs where similarity and homography are compared.
 
 A homography that only goes through one wrong point more is not chosen then: with 1, two wrong ones
 of six gave one that did so in 7 of 400 cases (measured).
 """
 
 SEED = 7
-"""Of the subsets that are drawn."""
+"""Subsets are drawn by random numbers from this seed, so that results repeat."""
 
 MEDIAN_SQUARE = 2.366
 """Median of the squared length of a residual in three dimensions with a variance of 1 (derived)."""
 
-LEAST_SHAPE = 0.02
-"""Of a subset: its smallest triangle over its largest; below it the map says nothing."""
+MIN_TRIANGLE_RATIO = 0.02
+"""A subset's smallest triangle is larger than this part of its largest, or its map says nothing."""
 
 TINY = 1e-8
 """Part of a residual's variance below which a point cannot be judged: the map goes through it."""
@@ -93,7 +93,7 @@ class _Agreement(NamedTuple):
 
     @property
     def least(self) -> int:
-        """How many must agree: more than half, and one more than the model has need of."""
+        """Fewest touches that must agree: more than half, and one more than the model needs."""
         return max(len(self.mask) // 2, MODELS[self.fitted.model].least) + 1
 
 
@@ -112,12 +112,9 @@ def agreeing(
     MissingExtraError: SciPy is not installed.
     """
     count = len(camera)
-    if count < LEAST_POINTS:
-        raise CalibrationError(
-            f"robust: expected at least {LEAST_POINTS} points, got {count}",
-            code=Code.TOO_FEW,
-            expected=LEAST_POINTS,
-            got=count,
+    if count < MIN_POINTS:
+        raise Code.TOO_FEW.unexpected(
+            f"robust: expected at least {MIN_POINTS} points", MIN_POINTS, count
         )
     order = np.lexsort((weights, *robot.T, *camera.T))
     pairs, size = _about_median(camera[order], robot[order], weights[order])
@@ -127,11 +124,8 @@ def agreeing(
         return np.ones(count, dtype=np.bool_)
     least, agree = found.least, int(found.mask.sum())
     if agree < least:
-        raise CalibrationError(
-            f"expected at least {least} of {count} points that agree with one map, got {agree}",
-            code=Code.OUTLIER,
-            expected=least,
-            got=agree,
+        raise Code.OUTLIER.unexpected(
+            f"expected at least {least} of {count} points that agree with one map", least, agree
         )
     mask = np.empty(count, dtype=np.bool_)
     mask[order] = found.mask
@@ -192,7 +186,7 @@ def _settle(
 ) -> _Agreement | None:
     """Fit and judge in turns, until the points that agree are those that were fitted."""
     fitted = None
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         if int(mask.sum()) < MODELS[name].least:
             return None
         try:
@@ -271,9 +265,9 @@ def _scale(squared: Array, least: int) -> float:
 
 def _subsets(count: int, least: int) -> NDArray[np.intp]:
     """Return all subsets of ``least`` points, or as many drawn ones as are allowed."""
-    if math.comb(count, least) <= MOST_SUBSETS:
+    if math.comb(count, least) <= MAX_SUBSETS_TRIED:
         return np.array(list(itertools.combinations(range(count), least)), dtype=np.intp)
-    random = np.random.default_rng(SEED).random((MOST_SUBSETS, count))
+    random = np.random.default_rng(SEED).random((MAX_SUBSETS_TRIED, count))
     return np.sort(np.argpartition(random, least, axis=1)[:, :least], axis=1)
 
 
@@ -285,7 +279,7 @@ def _proposals(name: ModelName, pairs: Pairs) -> Array:
 
 
 def _shapely(points: Array) -> Mask:
-    """Return whether no three points of a subset lie nearly in a line (S,)."""
+    """Return True for each subset (S,) without three points nearly in a line."""
     areas = []
     for triple in itertools.combinations(range(points.shape[1]), 3):
         first, second = (points[:, one] - points[:, triple[0]] for one in triple[1:])
@@ -293,7 +287,7 @@ def _shapely(points: Array) -> Mask:
         lengths = (first**2).sum(axis=1) * (second**2).sum(axis=1)
         areas.append(np.sqrt(np.maximum(lengths - inner**2, 0.0)))
     largest = np.maximum((np.ptp(points, axis=1) ** 2).sum(axis=1), np.max(areas, axis=0))
-    return np.asarray((largest > 0.0) & (np.min(areas, axis=0) > LEAST_SHAPE * largest))
+    return np.asarray((largest > 0.0) & (np.min(areas, axis=0) > MIN_TRIANGLE_RATIO * largest))
 
 
 def _similarities(camera: Array, robot: Array) -> Array:
@@ -335,7 +329,7 @@ PROPOSALS: dict[ModelName, Callable[[Array, Array], Array]] = {
     "similarity": _similarities,
     "homography": _homographies,
 }
-"""What gives maps of subsets (S, least, 2) and (S, least, 3)."""
+"""Functions that give maps of subsets (S, least, 2) and (S, least, 3)."""
 
 
 def _squared(matrices: Array, pairs: Pairs) -> Array:

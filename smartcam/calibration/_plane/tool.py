@@ -1,4 +1,4 @@
-"""Where a tool really is: its tip from touches of one point, its axis from turns before a camera.
+"""Measure a tool: its tip from touches of one point, its axis from turns before a camera.
 
 A tip that is taken for somewhere else than it is moves every touch by the same vector *in the
 flange's frame*. It cancels only as long as the flange always has the same orientation: an error of
@@ -11,18 +11,17 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import as_motion
 from smartcam.calibration._views import as_list
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+from smartcam.geometry._inside import as_motion
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
 _TURN: Final = 0.17
@@ -30,7 +29,7 @@ _TURN: Final = 0.17
 
 
 class ToolTip(NamedTuple):
-    """Where a tool's tip is on the flange.
+    """The position of a tool's tip on the flange.
 
     Attributes:
         tip: (3,), in the flange's frame, metres. Along ``blind`` it is 0.
@@ -66,12 +65,7 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
         for number, one in enumerate(as_list(flanges, object, "tool tip: pose"))
     ]
     if len(flanges) < 2:
-        raise CalibrationError(
-            f"tool tip: expected two touches or more, got {len(flanges)}",
-            code=Code.TOO_FEW,
-            expected=2,
-            got=len(flanges),
-        )
+        raise Code.TOO_FEW.unexpected("tool tip: expected two touches or more", 2, len(flanges))
     _check_same([flange.label for flange in flanges], "tool tip: expected poses")
     turns = np.array([flange.rotation for flange in flanges])
     places = np.array([flange.translation for flange in flanges])
@@ -80,12 +74,11 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
     _, values, axes = np.linalg.svd(matrix / np.sqrt(len(flanges)), full_matrices=False)
     seen = int((values > _TURN).sum())
     if seen < 2:  # a turn about one axis has two alike
-        raise CalibrationError(
+        raise Code.INSUFFICIENT_ROTATION.refusal(
             f"tool tip: expected the flange at orientations that differ, got a spread of "
             f"{values[1]:.3g}, which must be above {_TURN:g}",
-            code=Code.INSUFFICIENT_ROTATION,
-            expected=_TURN,
-            got=float(values[1]),
+            _TURN,
+            float(values[1]),
         )
     right = -(places - mean_place).reshape(-1)
     scaled = (axes[:seen] @ (matrix.T @ right)) / (values[:seen] ** 2 * len(flanges))
@@ -96,7 +89,7 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
 
 
 class RotationCentre(NamedTuple):
-    """What a held part turns about, as the camera sees it.
+    """The point that a held part turns about, as the camera sees it.
 
     Attributes:
         centre: (2,), in the camera's unit.
@@ -117,7 +110,7 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     plane.
 
     Args:
-        parts: the same part at each turn, in the camera's frame.
+        parts: localizations of one part, one at each turn, in the camera's frame.
 
     Raises:
         CalibrationError: ``TOO_FEW``: fewer than two; ``WRONG_FRAME``: in different frames;
@@ -125,12 +118,7 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     """
     poses = [part.pose for part in parts]
     if len(poses) < 2:
-        raise CalibrationError(
-            f"rotation centre: expected two sights or more, got {len(poses)}",
-            code=Code.TOO_FEW,
-            expected=2,
-            got=len(poses),
-        )
+        raise Code.TOO_FEW.unexpected("rotation centre: expected two sights or more", 2, len(poses))
     _check_same([pose.header.frame_id for pose in poses], "rotation centre: expected sights")
     # as complex numbers, where a turn is a product
     places = np.array([complex(pose.position.x, pose.position.y) for pose in poses])
@@ -138,12 +126,11 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     near = turns - turns.mean()
     spread = float(np.sqrt(np.mean(np.abs(near) ** 2)))
     if not spread > _TURN:
-        raise CalibrationError(
+        raise Code.INSUFFICIENT_ROTATION.refusal(
             f"rotation centre: expected angles that differ, got a spread of {spread:.3g}, which "
             f"must be above {_TURN:g}",
-            code=Code.INSUFFICIENT_ROTATION,
-            expected=_TURN,
-            got=spread,
+            _TURN,
+            spread,
         )
     arm = np.vdot(near, places) / np.vdot(near, near)
     centre = places.mean() - arm * turns.mean()
@@ -153,11 +140,10 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
 def _check_same(frames: Sequence[str], what: str) -> None:
     others = [frame for frame in frames if frame != frames[0]]
     if others:
-        raise CalibrationError(
+        raise Code.WRONG_FRAME.refusal(
             f"{what} of one and the same frame, got {frames[0]} and {others[0]}",
-            code=Code.WRONG_FRAME,
-            expected=frames[0],
-            got=others[0],
+            frames[0],
+            others[0],
         )
 
 

@@ -15,27 +15,27 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code, Remark
-from smartcam.calibration._geometry.rotations import as_points, frame_from_axes, rotate_ccw
+from smartcam._argument_checks import a_number, numbers, of_class, or_none, takes
 from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
-from smartcam.calibration._plane.diagnostics import check_side, remark_side
+from smartcam.calibration._plane.diagnostics import TYPICAL_SIGMA, check_side, remark_side, sigma_of
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import NEGLIGIBLE
 from smartcam.calibration._plane.validation import check_lever, check_positive
 from smartcam.calibration._statistics import Noise
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Remark
+from smartcam.geometry._inside import as_points, frame_from_axes, rotate_ccw
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
-MOST_STEPS = 50
-"""Of the fit; it takes 3 to 6."""
+MAX_STEPS = 50
+"""The fit takes at most this many steps; it usually takes 3 to 6."""
 
 LEVEL = 0.01
-"""How seldom noise alone may cause a warning."""
+"""Probability with which noise alone may cause a warning."""
 
 
 class _FittedRays(NamedTuple):
@@ -48,6 +48,15 @@ class _FittedRays(NamedTuple):
     covariance: Array  # (6, 6), of shift and turn, for touches with a variance of 1 m^2
 
 
+@takes(
+    origin=of_class("Localization"),
+    o=numbers,
+    a=numbers,
+    b=numbers,
+    nominal_scale=a_number,
+    theta_sigma=a_number,
+    tool_z=or_none(numbers),
+)
 def fit_touches(
     origin: Localization,
     o: ArrayLike,
@@ -94,11 +103,10 @@ def fit_touches(
     check_positive(touch_sigma, "touch_sigma", "metres")
     check_positive(nominal_scale, "nominal_scale", "metres for each unit of the camera")
     if not (math.isfinite(theta_sigma) and theta_sigma >= 0.0):
-        raise CalibrationError(
-            f"theta_sigma: expected a number of radians that is not negative, got {theta_sigma}",
-            code=Code.NOT_FINITE,
-            expected="a number that is not negative",
-            got=theta_sigma,
+        raise Code.NOT_FINITE.unexpected(
+            "theta_sigma: expected a number of radians that is not negative",
+            "a number that is not negative",
+            theta_sigma,
         )
     groups = [
         _touches(touches, name) for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
@@ -112,7 +120,7 @@ def fit_touches(
     axis = None if tool_z is None else mean_axis(tool_z, len(touched))
     side = None if axis is None else check_side(sheet.frame[:, 2], axis)
     freedom = 3 * len(groups[0]) + 2 * len(groups[1]) + 2 * len(groups[2]) - 6
-    sigma = math.sqrt(float((sheet.residuals**2).sum()) / freedom)
+    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA)
     centre = np.array([origin.pose.position.x, origin.pose.position.y])
     theta = origin.pose.orientation.theta
     size = math.sqrt(float(np.mean(np.square(levers))))
@@ -154,12 +162,7 @@ def fit_touches(
 def _touches(values: ArrayLike, name: str) -> Array:
     touches = as_points(np.atleast_2d(np.asarray(values)), 3, f"touches of {name}")
     if not len(touches):
-        raise CalibrationError(
-            f"touches of {name}: expected one or more, got none",
-            code=Code.TOO_FEW,
-            expected=1,
-            got=0,
-        )
+        raise Code.TOO_FEW.refusal(f"touches of {name}: expected one or more, got none", 1, 0)
     return touches
 
 
@@ -169,7 +172,7 @@ def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
     # takes 6 ms (measured).
     origin = touched[ray == 0].mean(axis=0)
     frame = frame_from_axes(*(touched[ray == one].mean(axis=0) - origin for one in (1, 2)))
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         along, residuals, jacobian = _linear(touched, ray, origin, frame)
         step = np.linalg.lstsq(jacobian, residuals.ravel(), rcond=None)[0]
         origin = origin + step[:3]
@@ -209,31 +212,27 @@ def _remarks(
     squared = float((sheet.residuals**2).sum())
     if touch_sigma is None:
         found.append(
-            Remark(
-                Code.UNVERIFIED,
+            Code.UNVERIFIED.remark(
                 f"the touches' sigma is estimated from {freedom} degrees of freedom only: "
-                "give touch_sigma",
+                "give touch_sigma"
             )
         )
     elif Noise(touch_sigma**2).chance(squared, freedom) < LEVEL:
         found.append(
-            Remark(
-                Code.POOR_FIT,
+            Code.POOR_FIT.remark(
                 f"the touches lie {1e3 * math.sqrt(squared / len(sheet.along)):.3g} mm rms beside "
-                f"rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was given",
+                f"rays at right angles, where a sigma of {1e3 * touch_sigma:.3g} mm was given"
             )
         )
     found.append(
-        Remark(
-            Code.SCALE_ASSUMED,
-            f"{scale:.6g} m for each unit of the camera was taken as given: no touch measures it",
+        Code.SCALE_ASSUMED.remark(
+            f"{scale:.6g} m for each unit of the camera was taken as given: no touch measures it"
         )
     )
     found.append(
-        Remark(
-            Code.NOT_HELD_OUT,
+        Code.NOT_HELD_OUT.remark(
             "no touch can be left out to see how good the calibration is, "
-            "and the residuals do not tell",
+            "and the residuals do not tell"
         )
     )
     return (*found, *remark_side(side))

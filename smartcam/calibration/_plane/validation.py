@@ -1,36 +1,40 @@
-"""Whether points can give a calibration at all, before a number is made of them."""
+"""Check whether points can give a calibration at all, before a number is made of them."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.rotations import as_points
+from smartcam._arguments import plain, shown
 from smartcam.calibration._plane.fitting import Normalization, Pairs
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+from smartcam.geometry._inside import as_points
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    from numpy.typing import ArrayLike, NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
-LEAST_LEVER = 20.0
+MIN_EXTENT_IN_SIGMAS = 20.0
 """Extent of the touched points across their longest direction, in sigmas of a touch."""
 
-LEAST_WIDTH = 0.1
+MIN_WIDTH_RATIO = 0.1
 """Extent across over extent along the longest direction; both rms.
 
 Three points whose legs are 10 degrees apart have 0.15.
 """
 
-MOST_THICKNESS = 0.2
+MAX_THICKNESS_RATIO = 0.2
 """Extent out of the plane over extent across the longest direction, both rms."""
 
+NEAR = 0.01
+"""Part of the points' extent: points of one touch that are closer together show one mark."""
+
 SAME = 1e-9
-"""Of the points' extent: what is closer together counts as the same."""
+"""Points that are closer together than this part of the extent of all points count as the same."""
 
 SMALLEST = 1e-100
 """Difference of two coordinates below which they are the same: the square of it is a number."""
@@ -46,33 +50,73 @@ def read_pairs(
     camera = as_points(camera_points, 2, "camera points").copy()
     robot = as_points(robot_points, 3, "robot points").copy()
     if len(camera) != len(robot):
-        raise CalibrationError(
-            f"expected as many robot points as camera points ({len(camera)}), got {len(robot)}",
-            code=Code.SHAPE,
-            expected=len(camera),
-            got=len(robot),
+        raise Code.SHAPE.unexpected(
+            f"expected as many robot points as camera points ({len(camera)})",
+            len(camera),
+            len(robot),
         )
     if weights is None:
         return camera, robot, np.ones(len(camera))
     given = as_points(np.reshape(weights, (-1, 1)), 1, "weights")[:, 0].copy()
     if given.shape != (len(camera),) or (given <= 0).any():
-        raise CalibrationError(
+        raise Code.SHAPE.refusal(
             f"weights: expected {len(camera)} positive numbers, got {given.tolist()[:8]}",
-            code=Code.SHAPE,
-            expected=len(camera),
-            got=given.tolist(),
+            len(camera),
+            given.tolist(),
         )
     return camera, robot, given
 
 
+class Distinct(NamedTuple):
+    """Points of which each counts once, however often it was touched."""
+
+    camera: Array  # (M, 2)
+    robot: Array  # (M, 3)
+    weights: Array  # (M,): that of one touch, since what is wrong with a point is in all of them
+    number: NDArray[np.intp]  # (N,), which of these a given point is
+    first: NDArray[np.intp]  # (M,), index of the first of the given points
+
+
+def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
+    """Return points with the means of those that are no points of their own.
+
+    Such are touches of one and the same point of the camera, and one and the same touch of points
+    that are close together: pictures of one mark.
+    """
+    number = np.unique(camera, axis=0, return_inverse=True)[1].ravel()
+    touch = np.unique(robot, axis=0, return_inverse=True)[1].ravel()
+    if len(camera) in {number.max(initial=-1) + 1, 0} and touch.max(initial=-1) + 1 == len(camera):
+        each = np.arange(len(camera), dtype=np.intp)
+        return Distinct(camera, robot, weights, each, each)
+    near = NEAR * float(np.linalg.norm(np.ptp(camera, axis=0)))
+    for one in np.flatnonzero(np.bincount(touch) > 1):
+        same = np.flatnonzero(touch == one)
+        if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < near:
+            number[np.isin(number, number[same])] = number[same[0]]
+    first, number = np.unique(number, return_index=True, return_inverse=True)[1:]
+    order = np.argsort(first)  # as they came
+    first, number = first[order], np.argsort(order)[number.ravel()]
+    share = weights / np.bincount(number, weights)[number]
+    means = [
+        np.column_stack([np.bincount(number, share * axis) for axis in points.T]).astype(float)
+        for points in (camera, robot)
+    ]
+    most = np.zeros(len(first))
+    np.maximum.at(most, number, weights)
+    return Distinct(means[0], means[1], most, number, first)
+
+
 def check_positive(value: float | None, name: str, unit: str) -> None:
     """Raise (NOT_FINITE) where an option is neither None nor a positive number."""
-    if value is not None and not (math.isfinite(value) and value > 0):
-        raise CalibrationError(
-            f"{name}: expected a positive number of {unit}, got {value}",
-            code=Code.NOT_FINITE,
-            expected="a positive number",
-            got=value,
+    if value is None:
+        return
+    number: object = plain(value)
+    known = isinstance(number, (int, float)) and not isinstance(number, bool)
+    if not (known and 0 < value <= sys.float_info.max):
+        raise Code.NOT_FINITE.refusal(
+            f"{name}: expected a positive number of {unit}, got {shown(value)}",
+            "a positive number",
+            value,
         )
 
 
@@ -84,23 +128,17 @@ def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | 
     COLLINEAR, NOT_PLANAR or SHORT_LEVER.
     """
     if len(camera) < least:
-        raise CalibrationError(
-            f"expected at least {least} points, got {len(camera)}",
-            code=Code.TOO_FEW,
-            expected=least,
-            got=len(camera),
-        )
+        raise Code.TOO_FEW.unexpected(f"expected at least {least} points", least, len(camera))
     for points, what in ((camera, "camera points"), (robot, "robot points")):
         _check_distinct(points, what, least)
         _check_width(points, what)
     extents = _extents(robot)
-    if extents[2] > MOST_THICKNESS * extents[1]:
-        raise CalibrationError(
+    if extents[2] > MAX_THICKNESS_RATIO * extents[1]:
+        raise Code.NOT_PLANAR.refusal(
             f"robot points: expected a plane, got {1e3 * extents[2]:.3g} mm rms out of it and "
             f"{1e3 * extents[1]:.3g} mm rms across",
-            code=Code.NOT_PLANAR,
-            expected=float(MOST_THICKNESS * extents[1]),
-            got=float(extents[2]),
+            float(MAX_THICKNESS_RATIO * extents[1]),
+            float(extents[2]),
         )
     if touch_sigma is not None:
         check_lever(lever(robot), touch_sigma)
@@ -111,19 +149,23 @@ def lever(robot: Array) -> float:
     return float(np.ptp(_turned(robot)[:, 1]))
 
 
+def extent(points: Array) -> float:
+    """Return the diagonal of the field that touched points (N, 3) span, metres."""
+    return float(np.linalg.norm(np.ptp(_turned(points)[:, :2], axis=0)))
+
+
 def check_lever(found: float, touch_sigma: float) -> None:
     """Raise (SHORT_LEVER) where points lie too close together for how well they are touched.
 
     ``found``: how far they reach, metres. ``touch_sigma``: of one coordinate, metres.
     """
-    if found < LEAST_LEVER * touch_sigma:
-        raise CalibrationError(
-            f"robot points: expected at least {LEAST_LEVER:g} sigmas of a touch "
-            f"({1e3 * LEAST_LEVER * touch_sigma:.3g} mm) in each direction, "
+    if found < MIN_EXTENT_IN_SIGMAS * touch_sigma:
+        raise Code.SHORT_LEVER.refusal(
+            f"robot points: expected at least {MIN_EXTENT_IN_SIGMAS:g} sigmas of a touch "
+            f"({1e3 * MIN_EXTENT_IN_SIGMAS * touch_sigma:.3g} mm) in each direction, "
             f"got {1e3 * found:.3g} mm: they lie too close together, or are in another unit",
-            code=Code.SHORT_LEVER,
-            expected=LEAST_LEVER * touch_sigma,
-            got=found,
+            MIN_EXTENT_IN_SIGMAS * touch_sigma,
+            found,
         )
 
 
@@ -157,21 +199,17 @@ def _check_distinct(points: Array, what: str, least: int) -> None:
     grain = max(SAME * extent, 4.0 * rounding, SMALLEST)
     distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
     if distinct < least:
-        raise CalibrationError(
-            f"{what}: expected at least {least} different ones, got {distinct}",
-            code=Code.COINCIDENT,
-            expected=least,
-            got=distinct,
+        raise Code.COINCIDENT.unexpected(
+            f"{what}: expected at least {least} different ones", least, distinct
         )
 
 
 def _check_width(points: Array, what: str) -> None:
     along, across = _extents(points)[:2]
-    if across < LEAST_WIDTH * along:
-        raise CalibrationError(
-            f"{what}: expected an extent across of at least {LEAST_WIDTH:g} of that along, "
+    if across < MIN_WIDTH_RATIO * along:
+        raise Code.COLLINEAR.refusal(
+            f"{what}: expected an extent across of at least {MIN_WIDTH_RATIO:g} of that along, "
             f"got {across / along:.2g}: they lie nearly in a line",
-            code=Code.COLLINEAR,
-            expected=LEAST_WIDTH,
-            got=float(across / along),
+            MIN_WIDTH_RATIO,
+            float(across / along),
         )

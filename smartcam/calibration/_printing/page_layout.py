@@ -1,4 +1,4 @@
-"""Where a target, its rays, rulers and texts stand on a page; all lengths are millimetres.
+"""Place a target, its rays, rulers and texts on a page; all lengths are millimetres.
 
 The target stands at the lower left, so the rays A and B are as long as the page allows. Rulers
 stand left of it and below it, texts above it, right of the ray B.
@@ -29,8 +29,8 @@ MOVE: Final = 5.0
 
 QUIET: Final = 0.2
 """White around a target, of a square's side or of the distance of two dots."""
-LEAST_QUIET, MOST_QUIET = 2.0, 6.0
-"""Its bounds."""
+MIN_MARGIN_SQUARES, MAX_MARGIN_SQUARES = 2.0, 6.0
+"""Bounds of the white around a target."""
 
 SHORTEST_RAY: Final = 8.0
 RAY_WIDTH: Final = 0.4
@@ -51,7 +51,7 @@ TEXT, LINE = 2.6, 3.4
 RULE: Final = 0.2
 """Thickness of the line that a text stands on: letters that hang together are no dots either."""
 TEXT_LEFT: Final = HEAD[1] + LETTER + 2
-"""From the ray B to the texts right of its letter."""
+"""Distance from the ray B to the texts right of its letter."""
 FEWEST_LETTERS: Final = 20
 """Letters of a line at least, on however small a page."""
 GLYPH: Final = 0.6
@@ -61,25 +61,25 @@ AREA_REACH: Final = AREA_DISTANCE + AREA_DIAMETER / 2
 """Reach of the areas outside of a checkerboard's outer corners, sides of a square."""
 
 AREA_GAP: Final = 1.0
-"""Between such an area and what stands beyond it."""
+"""Distance between a white area outside of a checkerboard and what stands beyond it."""
 
 
 class PageLayout:
-    """Where things stand on a page.
+    """The places of all things on a page.
 
     Args:
-        box: what the target's pattern takes.
+        box: rectangle that the target's pattern takes.
         pitch: a square's side, or the distance of two dots.
         areas: how far areas that are to stay white reach outside of the pattern's corners, an
             origin mark among them.
-        texts: what is said.
-        width: of the page.
-        height: of the page.
+        texts: lines of text to print.
+        width: width of the page.
+        height: height of the page.
 
     Attributes:
         origin: the target's origin from the page's lower left corner.
-        needed_width: of a page on which all of it fits.
-        needed_height: the same.
+        needed_width: width of a page on which all of the layout fits.
+        needed_height: height of a page on which all of the layout fits.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class PageLayout:
         self._box = box
         self.width = width
         self.height = height
-        self._quiet = min(max(QUIET * pitch, LEAST_QUIET), MOST_QUIET)
+        self._quiet = min(max(QUIET * pitch, MIN_MARGIN_SQUARES), MAX_MARGIN_SQUARES)
         self._areas = areas
         ray = max(self._quiet + SHORTEST_RAY, self._areas)
         x, needed_width = _along((box.left, box.right), (self._ruler_band(box.high), ray), width)

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.calibration._detection.charucos import charuco_board
-from smartcam.calibration._optional_imports import load
+from smartcam.calibration._detection.marker_grids import marker_patterns
 from smartcam.calibration._printing.page import Disc, Polygon, rectangle
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
+from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, MarkerGrid
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,6 +48,8 @@ def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
             return tuple(_charuco(target, box)), box
         case CircleGrid():
             return _dots(target)
+        case MarkerGrid():
+            return tuple(_markers(target)), _marker_box(target)
 
 
 def _board(columns: int, rows: int, square: float) -> Box:
@@ -85,6 +88,28 @@ def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
             yield Polygon(
                 tuple((left + inset + x * module, low + inset + y * module) for x, y in loop)
             )
+
+
+def _marker_box(target: MarkerGrid) -> Box:
+    around = MM * target.gap if target.kalibr else 0.0
+    right, high = (MM * target.points[-1, :2]).tolist()
+    return Box(-around, -around, right + around, high + around)
+
+
+def _markers(target: MarkerGrid) -> Iterator[Polygon]:
+    """Yield markers, and of Kalibr's the squares between their corners."""
+    side, gap = MM * target.marker, MM * target.gap
+    patterns = marker_patterns(target)
+    module = side / len(patterns[0])
+    for numbers, pattern in zip(target.corners, patterns, strict=True):
+        left, low = (MM * target.points[numbers, :2].min(axis=0)).tolist()
+        for loop in outlines(pattern):
+            yield Polygon(tuple((left + x * module, low + y * module) for x, y in loop))
+    if target.kalibr:
+        for row in range(-1, target.rows):
+            for column in range(-1, target.columns):
+                left, low = (count * (side + gap) + side for count in (column, row))
+                yield rectangle(left, low, gap, gap)
 
 
 def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:

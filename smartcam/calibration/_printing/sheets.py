@@ -22,7 +22,8 @@ import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 
-from smartcam.calibration._codes import Code
+from smartcam._argument_checks import a_number, each, takes
+from smartcam._arguments import check_text
 from smartcam.calibration._printing.page import (
     Disc,
     Polygon,
@@ -36,16 +37,19 @@ from smartcam.calibration._targets import (
     Charuco,
     Checkerboard,
     CircleGrid,
+    MarkerGrid,
+    resized,
     target_from_data,
 )
 from smartcam.calibration._views import checked
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from smartcam.calibration._printing.page import Shape
     from smartcam.calibration._targets import Target
+    from smartcam.exceptions import CalibrationError
 
 PAGES: Final[Mapping[str, tuple[float, float]]] = {
     "A5": (148.0, 210.0),
@@ -78,8 +82,8 @@ class Rays:
     """Rays and an origin mark alone: for a camera that localizes the mark by itself.
 
     Attributes:
-        diameter: of the origin mark, metres; it has two black quarters, which meet in the origin,
-            and a white dot in the one between the rays.
+        diameter: diameter of the origin mark, metres; the mark has two black quarters, which meet
+            in the origin, and a white dot in the one between the rays.
     """
 
     kind: ClassVar[str] = "rays"
@@ -89,15 +93,14 @@ class Rays:
     def __post_init__(self) -> None:
         number = isinstance(self.diameter, int | float) and not isinstance(self.diameter, bool)
         if not (number and math.isfinite(self.diameter) and self.diameter > 0):
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 f"rays: expected diameter to be a length in metres, got {self.diameter!r}",
-                code=Code.SHAPE,
-                expected="metres",
-                got=self.diameter,
+                "metres",
+                self.diameter,
             )
 
 
-T = TypeVar("T", bound=Checkerboard | Charuco | CircleGrid | Rays)
+T = TypeVar("T", bound=Checkerboard | Charuco | CircleGrid | MarkerGrid | Rays)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,8 +109,8 @@ class Sheet:
 
     Attributes:
         target: what is on it.
-        width: of the page, mm.
-        height: of the page, mm.
+        width: width of the page, mm.
+        height: height of the page, mm.
         origin: the target's origin from the page's lower left corner, mm; x and y are those of the
             page.
         shapes: what is printed.
@@ -148,6 +151,7 @@ class Sheet:
         return PrintedPage(self.width, self.height, self.title, description, self.shapes)
 
 
+@takes(page=check_text)
 def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     """Lay out a sheet.
 
@@ -200,13 +204,12 @@ def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> Calibrat
     ]
     text = f"{size[0]:g} x {size[1]:g} mm"
     named = f"{page} ({text})" if page in PAGES else text
-    return CalibrationError(
+    return Code.PAGE_TOO_SMALL.refusal(
         f"{_title(target).partition(': ')[2]}: does not fit on {named}: with rays, rulers and a "
         f"border of {BORDER:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
         f"{' and '.join(over)}",
-        code=Code.PAGE_TOO_SMALL,
-        expected=needed,
-        got=size,
+        needed,
+        size,
     )
 
 
@@ -224,21 +227,21 @@ def page_size(page: str) -> tuple[float, float]:
     sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
     size = (float(sides[1]), float(sides[2])) if sides else (0.0, 0.0)
     if not 0 < min(size) <= max(size) <= MAX_PAGE:
-        raise CalibrationError(
+        raise Code.SHAPE.refusal(
             f"page: expected one of {', '.join(PAGES)}, or width and height in mm up to "
             f"{MAX_PAGE:g}, such as 300x200, got {page[:64]!r}",
-            code=Code.SHAPE,
-            expected=list(PAGES),
-            got=page[:64],
+            list(PAGES),
+            page[:64],
         )
     return size
 
 
+@takes(measured_ruler=each(a_number, 2))
 def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     """Return a target with the lengths that it has on paper.
 
     Args:
-        target: as it was to be printed.
+        target: the target as it was to be printed.
         measured_ruler: how long the printed rulers along x and along y are, mm. A target has one
             scale, the mean of both: what makes them differ by more than half a percent is no
             scale, but a printer that pulls the paper unevenly.
@@ -250,30 +253,21 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     factors = [length / RULER for length in measured_ruler]
     for axis, factor in zip("xy", factors, strict=True):
         if not abs(factor - 1) <= LARGEST_CHANGE:
-            raise CalibrationError(
+            raise Code.SCALE_MISMATCH.refusal(
                 f"ruler along {axis}: expected {RULER:g} mm within {LARGEST_CHANGE:.0%}, "
                 f"got {RULER * factor:g} mm; print at 100 %, not fitted to the page",
-                code=Code.SCALE_MISMATCH,
-                expected=RULER,
-                got=RULER * factor,
+                RULER,
+                RULER * factor,
             )
     if abs(factors[0] - factors[1]) > UNEQUAL:
-        raise CalibrationError(
+        raise Code.SCALE_MISMATCH.refusal(
             f"rulers: expected the same length along x and y within {UNEQUAL:.1%}, "
             f"got {measured_ruler[0]:g} and {measured_ruler[1]:g} mm; measure again, or print "
             "with another printer",
-            code=Code.SCALE_MISMATCH,
-            expected=UNEQUAL,
-            got=tuple(measured_ruler),
+            UNEQUAL,
+            tuple(measured_ruler),
         )
-    scale = sum(factors) / 2
-    lengths = {
-        one.name: round(scale * value, DIGITS)
-        for one in dataclasses.fields(target)
-        if one.name not in {"columns", "rows"}
-        and not isinstance(value := getattr(target, one.name), bool | str | None)
-    }
-    return dataclasses.replace(target, **lengths)
+    return resized(target, sum(factors) / 2, DIGITS)
 
 
 # ---------------------------------------------------------------------- what is said
@@ -310,6 +304,12 @@ def _title(target: Target | Rays) -> str:
                 f"{kind}, {target.columns} x {target.rows}, {_mm(target.spacing)} apart, "
                 f"diameter {_mm(target.diameter)}{larger}"
             )
+        case MarkerGrid():
+            kind = "AprilGrid of Kalibr" if target.kalibr else "grid of markers"
+            about = (
+                f"{kind}, {target.columns} x {target.rows} of {_mm(target.marker)}, "
+                f"{_mm(target.gap)} apart, {target.dictionary} from {target.first_id}"
+            )
         case Rays():
             about = f"rays A and B, origin mark of {_mm(target.diameter)}"
     return f"smartcam sheet {_identity(target)}: {about}"
@@ -319,6 +319,7 @@ ORIGINS: Final[Mapping[type[Target | Rays], str]] = {
     Checkerboard: "the corner of four squares",
     Charuco: "the corner of four squares",
     CircleGrid: "the middle of the dot",
+    MarkerGrid: "the corner of the marker",
     Rays: "the point",
 }
 ADVICE: Final = (
@@ -335,7 +336,7 @@ def _mm(metres: float) -> str:
 
 
 def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    checked(target, (Checkerboard, Charuco, CircleGrid, Rays), "make_sheet: target")
+    checked(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
     if isinstance(target, Rays):
         return quartered(MM * target.diameter / 2)
     return ink(target)
@@ -348,6 +349,8 @@ def _pitch(target: Target | Rays) -> float:
             return MM * target.square
         case CircleGrid():
             return MM * target.spacing
+        case MarkerGrid():
+            return MM * (target.marker + target.gap)
         case Rays():
             return MM * target.diameter
 

@@ -13,21 +13,22 @@ The robot touches corners of the sheet, or its rays; the camera need not find wh
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, overload
 
 import numpy as np
 
-from smartcam.calibration._codes import Code, Remark
+from smartcam._argument_checks import a_target, an_integer, each, numbers, of_class, or_none, takes
+from smartcam._arguments import check_flag
+from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.homography import derivatives
-from smartcam.calibration._geometry.rotations import Array
-from smartcam.calibration._geometry.solvers import Chain, Poses, chain_of, check_frames
-from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._homography import derivatives
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
+from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
+from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 from smartcam.calibration._views import TargetView
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code, Remark
+from smartcam.geometry._inside import Array
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
 
 KIND = "sheet"
-"""What the files of these calibrations are called in the store."""
+"""Name of these calibrations' files in the store."""
 
 UNEXPLAINED = {True: 0.3, False: 0.1}
 """Pixels beside the points' noise from which on it is told, with a lens and without: what print,
@@ -57,7 +58,7 @@ PLANE = storage.Form(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SheetCalibration(storage.SavedCalibration):
-    """What :func:`calibrate_sheet` finds; immutable.
+    """The result of :func:`calibrate_sheet`; immutable.
 
     It takes localizations in pixels whose y axis was turned up (y is -v), as
     :func:`smartcam.connect` gives them with ``y_down=True``, and refuses to be used otherwise:
@@ -65,10 +66,9 @@ class SheetCalibration(storage.SavedCalibration):
 
     Attributes:
         view: the target as the camera saw it.
-        sheet: from pixels to the sheet.
-        plane: from the sheet's metres to the robot.
-        rms: standard deviation of a coordinate of the view's points about where the sheet has them,
-            pixels.
+        sheet: map from pixels to the sheet.
+        plane: map from the sheet's metres to the robot.
+        rms: standard deviation of a coordinate of the view's points about the sheet's, pixels.
         camera_frame: name of the frame that localizations must come in; None for any.
         remarks: what one should know of the view.
     """
@@ -116,13 +116,30 @@ class SheetCalibration(storage.SavedCalibration):
 
     @property
     def model(self) -> str:
-        """Of the way from the sheet to the robot."""
+        """Model of the way from the sheet to the robot."""
         return self.plane.model
 
     @property
     def warnings(self) -> tuple[Remark, ...]:
-        """What one should know before using it: of the view, then of the touches."""
+        """Remarks to know before the calibration is used: on the view, then on the touches."""
         return (*self.remarks, *self.plane.warnings)
+
+    @property
+    def verdict(self) -> CalibrationVerdict:
+        """Verdict on the calibration's quality, the millimetres it is good for, and the cure."""
+        return self.judged().verdict
+
+    def judged(self) -> Judgement:
+        """Return the verdict, of what the target covers in the image, and what is advisable."""
+        if any(one.code == Code.POOR_FIT for one in self.remarks):
+            lens = "another lens" if self.camera else "a lens: --lens"
+            text = f"Not good enough: the picture wants {lens}, or a flat sheet"
+            return Judgement(CalibrationVerdict("poor", text), option="more")
+        predicted = None
+        if self.plane.touch_sigma is not None:
+            errors = self.predicted_error(self.view.points)
+            predicted = float(np.sqrt((errors**2).mean()))
+        return self.plane.judged(predicted, " where the sheet lay")
 
     @cached_property
     def chain(self) -> Chain:
@@ -176,8 +193,8 @@ class SheetCalibration(storage.SavedCalibration):
         """Return localizations with their poses in the robot's space.
 
         Args:
-            localizations: of the camera, one or many: pixels, with y turned up.
-            tool_flip: as of :meth:`PlaneCalibration.to_robot`.
+            localizations: localizations of the camera, one or many: pixels, with y turned up.
+            tool_flip: flip of the tool, as of :meth:`PlaneCalibration.to_robot`.
 
         Raises:
             CalibrationError: WRONG_FRAME, OUT_OF_PLANE, OUT_OF_FIELD.
@@ -220,6 +237,11 @@ class SheetCalibration(storage.SavedCalibration):
         return error
 
 
+@takes(
+    view=of_class("TargetView"),
+    plane=of_class("PlaneCalibration"),
+    camera=or_none(of_class("CameraModel")),
+)
 def calibrate_sheet(
     view: TargetView,
     plane: PlaneCalibration,
@@ -231,7 +253,7 @@ def calibrate_sheet(
 
     Args:
         view: the target, as the camera sees it while the sheet lies where it is touched.
-        plane: from the sheet's metres to the robot: of :func:`fit_corners`, or of
+        plane: map from the sheet's metres to the robot: of :func:`fit_corners`, or of
             :func:`~smartcam.calibration.fit_touches` with the origin at (0, 0).
         camera: the lens, for images of the same size; None: a homography of the view's points.
         camera_frame: name of the frame that localizations must come in; None for any.
@@ -244,19 +266,17 @@ def calibrate_sheet(
     remarks: list[Remark] = []
     if camera is None:
         remarks.append(
-            Remark(
-                Code.LENS_UNKNOWN,
+            Code.LENS_UNKNOWN.remark(
                 "no lens was given: the tilt of the camera is corrected, the distortion of its "
-                "lens is not, and grows outside of the target's points",
+                "lens is not, and grows outside of the target's points"
             )
         )
     if found.unexplained > UNEXPLAINED[camera is not None]:
         whose = "the lens distorts" if camera is None else "the lens is another one"
         remarks.append(
-            Remark(
-                Code.POOR_FIT,
+            Code.POOR_FIT.remark(
                 f"the target's points lie {found.rms:.2g} px beside a plane, of which noise does "
-                f"not explain {found.unexplained:.2g} px: {whose}, or the sheet is not flat",
+                f"not explain {found.unexplained:.2g} px: {whose}, or the sheet is not flat"
             )
         )
     return SheetCalibration(
@@ -269,6 +289,12 @@ def calibrate_sheet(
     )
 
 
+@takes(
+    target=a_target,
+    ids=each(an_integer),
+    tool_z=or_none(numbers),
+    robust=check_flag,
+)
 def fit_corners(
     target: Target,
     ids: Sequence[int],
@@ -287,12 +313,14 @@ def fit_corners(
 
     Args:
         target: with the lengths that it has on paper.
-        ids: (N,), numbers of its points that were touched, three at least.
+        ids: (N,), numbers of the target's points that were touched, three at least.
         touches: (N, 3), where the robot's tip was, metres.
-        touch_sigma: as of :func:`~smartcam.calibration.fit_plane`.
-        tool_z: the same.
-        robust: the same.
-        robot_frame: the same.
+        touch_sigma: standard deviation of one coordinate of a touch, metres, as in
+            :func:`~smartcam.calibration.fit_plane`.
+        tool_z: direction of the tool's axis, as in :func:`~smartcam.calibration.fit_plane`.
+        robust: leave out touches that do not agree with the others, as in
+            :func:`~smartcam.calibration.fit_plane`.
+        robot_frame: name of the robot's frame, in which poses will be given.
 
     Raises:
         CalibrationError: SHAPE: a number that the target does not have; SCALE_MISMATCH: more than
@@ -301,11 +329,10 @@ def fit_corners(
     points = target.points[:, :2]
     wrong = [one for one in ids if not 0 <= one < len(points)]
     if wrong:
-        raise CalibrationError(
-            f"touched points: expected numbers from 0 to {len(points) - 1}, got {wrong[0]}",
-            code=Code.SHAPE,
-            expected=len(points) - 1,
-            got=wrong[0],
+        raise Code.SHAPE.unexpected(
+            f"touched points: expected numbers from 0 to {len(points) - 1}",
+            len(points) - 1,
+            wrong[0],
         )
     seen = points[np.asarray(ids, dtype=np.intp)]
 

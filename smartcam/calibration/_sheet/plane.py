@@ -12,35 +12,35 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.homography import (
+from smartcam.calibration._homography import (
     apply_homography,
     derivatives,
     element_derivatives,
     fit_homography,
 )
-from smartcam.calibration._geometry.rigid import cross_matrix
-from smartcam.calibration._geometry.rotations import (
-    as_points,
-    check_finite,
-    not_finite,
-    quaternion_about_z,
-)
-from smartcam.calibration._geometry.solvers import Poses
 from smartcam.calibration._least_squares import inverse_scaled, unit_diagonal
 from smartcam.calibration._lens.poses import check_view, locate
 from smartcam.calibration._lens.projection import excess, whitening
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._solvers import Poses
+from smartcam.geometry import Code
+from smartcam.geometry._inside import (
+    as_points,
+    check_finite,
+    cross_matrix,
+    not_finite,
+    quaternion_about_z,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._views import TargetView
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
 STEPS = 20
-"""Of the homography's fit; it takes 2 or 3."""
+"""The fit of the homography takes at most this many steps; it usually takes 2 or 3."""
 
 SETTLED = 1e-6
 """Standard deviations by which an element of the homography still changes in the last step, with
@@ -125,10 +125,9 @@ class SheetPlane:
         """
         x, y, z, w = poses.quaternions.T
         if poses.points[:, 2].any() or x.any() or y.any():
-            raise CalibrationError(
+            raise Code.OUT_OF_PLANE.refusal(
                 "sheet: expected poses in the image, turned about its z only, got some with a "
-                "height or a tilt",
-                code=Code.OUT_OF_PLANE,
+                "height or a tilt"
             )
         pixels = self._seen(poses.points[:, :2] * [1.0, -1.0])
         ahead = np.column_stack([w * w - z * z, -2.0 * z * w])
@@ -148,11 +147,8 @@ class SheetPlane:
         outside = ((given < -HALF) | (given > [width - HALF, height - HALF])).any(axis=1)
         if outside.any():
             at = given[int(np.argmax(outside))].tolist()
-            raise CalibrationError(
-                f"sheet: expected pixels of an image of {width} x {height}, v down, got {at}",
-                code=Code.OUT_OF_FIELD,
-                expected=self.size,
-                got=at,
+            raise Code.OUT_OF_FIELD.unexpected(
+                f"sheet: expected pixels of an image of {width} x {height}, v down", self.size, at
             )
         return given
 
@@ -163,10 +159,8 @@ class SheetPlane:
         mapped = straight @ self._back[:, :2].T + self._back[:, 2]
         if not (mapped[:, 2] > 0).all():
             at = pixels[int(np.argmin(mapped[:, 2]))].tolist()
-            raise CalibrationError(
-                f"sheet: expected pixels that show its plane, got {at}: behind its horizon",
-                code=Code.OUT_OF_FIELD,
-                got=at,
+            raise Code.OUT_OF_FIELD.refusal(
+                f"sheet: expected pixels that show its plane, got {at}: behind its horizon", got=at
             )
         with np.errstate(all="ignore"):
             flat: Array = mapped[:, :2] / mapped[:, 2:]
@@ -184,7 +178,7 @@ def _inverse(matrix: Array) -> Array:
 
 
 class PlaneView(NamedTuple):
-    """What :func:`look_at_sheet` finds."""
+    """The result of :func:`look_at_sheet`."""
 
     plane: SheetPlane
     # standard deviation of a coordinate of the target's points about where the plane has them,
@@ -230,11 +224,8 @@ def _by_homography(view: TargetView, start: Array) -> PlaneView:
     flat, pixels = view.object_points[:, :2], view.points
     freedom = 2 * len(flat) - 8
     if freedom <= 0:
-        raise CalibrationError(
-            f"sheet: expected 5 points or more without a lens, got {len(flat)}",
-            code=Code.TOO_FEW,
-            expected=5,
-            got=len(flat),
+        raise Code.TOO_FEW.unexpected(
+            "sheet: expected 5 points or more without a lens", 5, len(flat)
         )
     to_flat = _scaling(flat)
     source = apply_homography(to_flat, flat)
@@ -282,8 +273,7 @@ def _scaling(points: Array) -> Array:
 
 
 def _no_fit(view: TargetView) -> CalibrationError:
-    return CalibrationError(
+    return Code.POOR_FIT.refusal(
         f"sheet: expected a plane that shows its {len(view.ids)} points where they are, got none",
-        code=Code.POOR_FIT,
-        expected="a plane before the camera",
+        "a plane before the camera",
     )

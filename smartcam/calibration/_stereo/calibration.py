@@ -10,20 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, g
 
 import numpy as np
 
-from smartcam.calibration._codes import Code, Remark
+from smartcam._argument_checks import a_list, each, takes
+from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rotations import Array, as_points
-from smartcam.calibration._lens.bundle import Bundle, Sight, adjust_weighted, held_out
+from smartcam.calibration._lens.bundle import Bundle, Sight, adjust_weighted, camera_covariance
 from smartcam.calibration._lens.intrinsics import (
     BAD,
-    LEAST_VIEWS,
-    MOST_BAD,
+    MAX_BAD_VIEW_SHARE,
+    MIN_VIEWS,
     POOR,
     worst_view,
 )
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._lens.poses import TARGET, check_view
+from smartcam.calibration._lens.poses import TARGET, check_view, half_turned
 from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
 from smartcam.calibration._stereo import triangulation
 from smartcam.calibration._stereo.checks import check_fit, check_pairs, examined, remark_sides
@@ -36,43 +34,44 @@ from smartcam.calibration._stereo.start import (
     Lenses,
     Moment,
     as_moments,
-    half_turned,
     start,
 )
 from smartcam.calibration._stereo.triangulation import CameraPair
-from smartcam.calibration._views import TargetView, as_covariances, as_list, check_choice, label
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._views import TargetView, as_covariances, as_list, label
+from smartcam.geometry import CameraModel, Code, Remark, Transform
+from smartcam.geometry._inside import Array, as_points, check_choice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration._lens.bundle import AdjustedBundle
-    from smartcam.calibration._lens.model import DistortionModel
+    from smartcam.calibration._lens.bundle import AdjustedBundle, LeftOut
     from smartcam.calibration._targets import Target
+    from smartcam.geometry._inside import DistortionModel
 
 PoseInLeft = Annotated[Transform, storage.motion(lambda _: (LEFT, TARGET))]
 LeftInRight = Annotated[Transform, storage.motion(lambda _: (RIGHT, LEFT))]
 
-LEAST_PAIRS: Final = 2
-"""For lenses that are known; one tells the transform, another that it is right."""
+MIN_PAIRS: Final = 2
+"""Pairs needed for known lenses: one tells the transform, another that it is right."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairFit(storage.Stored):
-    """What one pair of views has to do with two cameras.
+    """The fit of two cameras to one pair of views.
 
     Attributes:
-        left: as it was given.
-        right: the same; numbered from the other end where the target looks the same when turned.
-        used: of each side, whether the cameras are fitted to it; False for a bad or missing view.
+        left: view of the left camera, as it was given.
+        right: view of the right camera, as it was given; numbered from the other end where the
+            target looks the same when turned.
+        used: for each side, True if the cameras are fitted to it; False for a bad or missing view.
         transform: ``T_left_target``; None where neither view is used.
-        rms: of each side's residuals, a coordinate, pixels; NaN where it is not used.
-        held_out: of cameras that were fitted without this pair: rms of the distances between
+        rms: rms of each side's residuals, a coordinate, pixels; NaN where it is not used.
+        held_out: rms, for cameras that were fitted without this pair, of the distances between
             neighbouring points as both see them, less the true ones, metres; NaN where one view is
             missing or bad, or where there are too few pairs.
-        epipolar: of the same cameras, rms distance from the epipolar lines, pixels; NaN likewise.
+        epipolar: rms distance from the epipolar lines of the same cameras, pixels; NaN likewise.
     """
 
     _keys: ClassVar[storage.Keys] = {"transform": "pose"}
@@ -88,23 +87,24 @@ class PairFit(storage.Stored):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StereoCalibration(storage.SavedCalibration):
-    """What :func:`calibrate_stereo` finds.
+    """The result of :func:`calibrate_stereo`.
 
     Attributes:
-        left: its lens.
-        right: its lens.
+        left: lens of the left camera.
+        right: lens of the right camera.
         transform: ``T_right_left``.
         covariance: (6, 6), of a small turn (rad) and shift (m) of the left camera in the right
-            one's frame; the sheet's is in it where its points were adjusted.
+            one's frame, from how much each pair changes it (a jackknife): what a pair has wrong
+            as a whole is in it.
         pairs: one for each given pair, in their order.
-        rms: of the residuals of all used views, their freedom taken off: the standard deviation of
-            a coordinate, pixels. It is no accuracy: see ``held_out``.
+        rms: rms of the residuals of all used views, their freedom taken off: the standard deviation
+            of a coordinate, pixels. It is no accuracy: see ``held_out``.
         sigma: what the residuals show beside the points' covariance, pixels.
         epipolar: rms distance of the used points from their epipolar lines, pixels.
         held_out: held-out error by leaving one pair out: rms over all pairs of the distances
             between neighbouring points of the target, as triangulated, less those that were meant,
             metres. NaN where there were too few pairs.
-        held_out_epipolar: rms distance from epipolar lines of cameras that never saw the pair,
+        held_out_epipolar: rms distance from epipolar lines of cameras fitted without the pair,
             pixels.
         sheet: (T, 3), how far the target's points are from where they were meant to be, metres;
             None where they are taken as meant.
@@ -150,9 +150,9 @@ class StereoCalibration(storage.SavedCalibration):
 
         Args:
             left_pixels: (N, 2), as the left image has them: the lens is corrected for.
-            right_pixels: (N, 2), of the same points.
-            left_covariance: (N, 2, 2), pixels^2; None: all the same.
-            right_covariance: the same for the right image.
+            right_pixels: (N, 2), pixels of the same points in the right image.
+            left_covariance: (N, 2, 2), covariance of ``left_pixels``, pixels^2; None: all alike.
+            right_covariance: (N, 2, 2), covariance of ``right_pixels``, pixels^2; None: all alike.
 
         Returns:
             (N, 3), left camera's frame, metres; NaN where the rays do not meet before both cameras.
@@ -220,8 +220,8 @@ class StereoCalibration(storage.SavedCalibration):
 
         Args:
             left_views: one for each moment; None where the left camera does not see the target.
-            right_views: of the right camera at the same moments. Of a target that looks the same
-                when turned they are numbered as they fit the left ones.
+            right_views: views of the right camera at the same moments. Of a target that looks the
+                same when turned they are numbered as they fit the left ones.
 
         Returns:
             One for each moment, without any errors where a view is missing.
@@ -251,7 +251,7 @@ class StereoCalibration(storage.SavedCalibration):
 
         Args:
             alpha: 0 to 1, from no invalid pixels in the output to no lost ones of the source.
-            size: of the output, width and height in pixels; None: the source's.
+            size: size of the output, width and height in pixels; None: the source's.
 
         Raises:
             CalibrationError: ``SHAPE``, ``WRONG_SIZE``: as
@@ -266,11 +266,10 @@ class StereoCalibration(storage.SavedCalibration):
     def _pixels(self, left: ArrayLike, right: ArrayLike) -> tuple[Array, Array]:
         first, second = as_points(left, 2, "left pixels"), as_points(right, 2, "right pixels")
         if len(first) != len(second):
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 f"pixels: expected as many on both sides, got {len(first)} and {len(second)}",
-                code=Code.SHAPE,
-                expected=len(first),
-                got=len(second),
+                len(first),
+                len(second),
             )
         return first, second
 
@@ -285,6 +284,14 @@ def _target(calibration: StereoCalibration) -> Target:
     return next(view.target for one in pairs for view in (one.left, one.right) if view)
 
 
+@takes(
+    left_views=a_list,
+    right_views=a_list,
+    distortion_model=check_text,
+    fixed=each(check_text),
+    sheet=check_text,
+    drop_bad=check_flag,
+)
 def calibrate_stereo(
     left_views: Sequence[TargetView | None],
     right_views: Sequence[TargetView | None],
@@ -303,15 +310,14 @@ def calibrate_stereo(
     order of the pairs does not matter.
 
     Args:
-        left_views: of one target, one for each moment; None where the left camera does not see it.
-        right_views: of the right camera at the same moments.
-        left: its lens where that is known and is to stay; None: it is found together with the rest.
-        right: the same for the right camera.
-        distortion_model: of lenses that are to be found.
+        left_views: views of one target, one for each moment; None where the left camera sees none.
+        right_views: views of the right camera at the same moments.
+        left: lens of the left camera where it is known and is to stay; None: found with the rest.
+        right: lens of the right camera where it is known and is to stay; None: found likewise.
+        distortion_model: model of lenses that are to be found.
         fixed: coefficients of those that stay 0, such as ``k3``; ``aspect``: fx and fy are one.
-        sheet: ``exact``: the target's points are where they were meant to be; ``free``: they are
-            adjusted, too, as a sheet that a printer stretched or that is not flat has need of;
-            ``auto``: as :func:`~smartcam.calibration.calibrate_intrinsics` has it.
+        sheet: ``auto``, ``exact`` or ``free``: whether the target's points are adjusted, too, as
+            :func:`~smartcam.calibration.calibrate_intrinsics` has it.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named. Of a pair whose views do not belong
             together it is the right one.
@@ -328,15 +334,13 @@ def calibrate_stereo(
     moments = as_moments(left_views, right_views)
     check_pairs(moments, (left, right))
     check_choice(sheet, get_args(Sheet), "sheet")
-    least = LEAST_PAIRS if left and right else LEAST_VIEWS
+    least = MIN_PAIRS if left and right else MIN_VIEWS
     both = [number for number, one in enumerate(moments) if None not in one]
     if len(both) < least:
-        raise CalibrationError(
-            f"stereo: expected {least} pairs or more in which both cameras see the target, got "
-            f"{len(both)}",
-            code=Code.TOO_FEW,
-            expected=least,
-            got=len(both),
+        raise Code.TOO_FEW.unexpected(
+            f"stereo: expected {least} pairs or more in which both cameras see the target",
+            least,
+            len(both),
         )
     lenses = Lenses((left, right), distortion_model, tuple(as_list(fixed, str, "fixed: name")))
     moments, bundle, apart = start(moments, lenses)
@@ -346,17 +350,16 @@ def calibrate_stereo(
         for side, view in enumerate(moment)
         if view is not None
     ]
-    most, bad = MOST_BAD * len(sights), list[Sight]()
+    most, bad = MAX_BAD_VIEW_SHARE * len(sights), list[Sight]()
     bad += [one for one in sights if one.camera == 1 and one.pose in apart]
     rest = [one for one in sights if one not in bad]
-    if drop_bad and len(bad) <= MOST_BAD * len(both) and len(_pairs(rest)) >= least:
+    if drop_bad and len(bad) <= MAX_BAD_VIEW_SHARE * len(both) and len(_pairs(rest)) >= least:
         sights = rest
     while True:
         adjusted = adjust_weighted(bundle, sights)
         if not math.isfinite(adjusted.weighted):
-            raise CalibrationError(
-                "stereo: expected cameras that show the pairs as they are, got points behind one",
-                code=Code.POOR_FIT,
+            raise Code.POOR_FIT.refusal(
+                "stereo: expected cameras that show the pairs as they are, got points behind one"
             )
         worst, ratio = worst_view([one.view for one in sights], adjusted)
         if ratio <= BAD:
@@ -387,7 +390,7 @@ def _pairs(sights: Sequence[Sight]) -> list[int]:
 
 
 class _Found(NamedTuple):
-    """What a summary is made of."""
+    """The findings from which a summary is made."""
 
     moments: list[Moment]  # all views, the right ones numbered as the left ones
     sights: list[Sight]  # the used ones
@@ -404,23 +407,15 @@ class _Found(NamedTuple):
         return left, right
 
 
-class _HeldOut(NamedTuple):
-    """Errors of one pair under cameras that never saw it."""
-
-    errors: PairErrors
-    residuals: Array
-
-
-def _held_out(found: _Found) -> dict[int, _HeldOut]:
+def _held_out(found: _Found, left_out: Sequence[LeftOut]) -> dict[int, PairErrors]:
+    """Return the errors of each pair under cameras that never saw it."""
     pairs = _pairs(found.sights)
     if len(pairs) <= found.least:
         return {}
     return {
-        one.pose: _HeldOut(
-            pair_errors(_cameras(one.bundle), *found.pair(one.pose)),
-            np.concatenate(one.residuals),
-        )
-        for one in held_out(found.adjusted, found.sights, pairs)
+        one.pose: pair_errors(_cameras(one.bundle), *found.pair(one.pose))
+        for one in left_out
+        if one.pose in pairs
     }
 
 
@@ -431,26 +426,20 @@ def _cameras(bundle: Bundle) -> CameraPair:
 
 def _summary(found: _Found, sheet: Sheet) -> StereoCalibration:
     check_fit(found.adjusted.rms, found.sights, found.bad)
-    shape, without = choose_shape(
-        found.adjusted,
-        found.sights,
-        sheet,
-        lambda fitted: _held_out(found._replace(adjusted=fitted)),
-        lambda errors: _rms([one.residuals for one in errors.values()]),
-    )
+    shape = choose_shape(found.adjusted, found.sights, sheet)
     adjusted = shape.adjusted
-    found = found._replace(adjusted=adjusted)
+    found, without = found._replace(adjusted=adjusted), _held_out(found, shape.left_out)
     cameras = _cameras(adjusted.bundle)
     epipolar = [pair_errors(cameras, *found.pair(n)).epipolar for n in _pairs(found.sights)]
     calibration = StereoCalibration(
         **cameras._asdict(),
-        covariance=adjusted.covariance[-6:, -6:],
+        covariance=camera_covariance(adjusted, shape.left_out)[-6:, -6:],
         pairs=tuple(_pair(found, number, without) for number in range(len(found.moments))),
         rms=adjusted.rms,
         sigma=math.sqrt(adjusted.more),
         epipolar=_rms(epipolar),
-        held_out=_rms([one.errors.spacing for one in without.values()]),
-        held_out_epipolar=_rms([one.errors.epipolar for one in without.values()]),
+        held_out=_rms([one.spacing for one in without.values()]),
+        held_out_epipolar=_rms([one.epipolar for one in without.values()]),
         sheet=shape.off,
         warnings=(),
     )
@@ -463,7 +452,7 @@ def _rms(parts: Sequence[Array]) -> float:
     return math.sqrt(float((values**2).mean())) if len(values) else math.nan
 
 
-def _pair(found: _Found, number: int, without: Mapping[int, _HeldOut]) -> PairFit:
+def _pair(found: _Found, number: int, without: Mapping[int, PairErrors]) -> PairFit:
     rms = {
         one.camera: _rms([residuals])
         for one, residuals in zip(found.sights, found.adjusted.residuals, strict=True)
@@ -478,8 +467,8 @@ def _pair(found: _Found, number: int, without: Mapping[int, _HeldOut]) -> PairFi
         used=(0 in rms, 1 in rms),
         transform=pose if rms else None,
         rms=(rms.get(0, math.nan), rms.get(1, math.nan)),
-        held_out=_rms([held.errors.spacing]) if held else math.nan,
-        epipolar=_rms([held.errors.epipolar]) if held else math.nan,
+        held_out=_rms([held.spacing]) if held else math.nan,
+        epipolar=_rms([held.epipolar]) if held else math.nan,
     )
 
 
@@ -498,21 +487,19 @@ def _remarks(
                 "different moments, or swapped"
             )
         name = f"{label(one.view, one.pose)}, {SIDES[one.camera]}"
-        yield Remark(Code.BAD_VIEW, f"{name}: {off}; it {done}")
+        yield Code.BAD_VIEW.remark(f"{name}: {off}; it {done}")
     if calibration.rms > POOR:
-        yield Remark(
-            Code.POOR_FIT,
+        yield Code.POOR_FIT.remark(
             f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR:g} at most: a lens is "
             "not of its model, the sheet is not flat, or the pairs were not taken at the same "
-            "moments",
+            "moments"
         )
     yield from remark_sides(calibration.transform)
     yield from of_sheet
     if math.isnan(calibration.held_out):
-        yield Remark(
-            Code.NOT_HELD_OUT,
+        yield Code.NOT_HELD_OUT.remark(
             f"{len(_pairs(found.sights))} pairs are no more than the cameras have need of: none "
-            "can be left out to see how good they are",
+            "can be left out to see how good they are"
         )
 
 

@@ -1,4 +1,4 @@
-"""Whether what two cameras saw, and what was found of them, can be so."""
+"""Check whether the views of two cameras, and what was found of them, are possible."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code, Remark
-from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.misfit import Fitted, lens_remarks
 from smartcam.calibration._lens.poses import locate
 from smartcam.calibration._lens.suspicions import (
-    Fitted,
-    lens_gain,
+    most_rms,
     stray_remarks,
     strays,
     view_remarks,
@@ -21,40 +19,31 @@ from smartcam.calibration._lens.suspicions import (
 )
 from smartcam.calibration._stereo.start import SIDES
 from smartcam.calibration._views import checked, label
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code, Remark
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.bundle import Sight
     from smartcam.calibration._stereo.calibration import StereoCalibration
     from smartcam.calibration._stereo.start import Moment
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
 
 WORST: Final = 5.0
 """Pixels rms, beyond which the pairs do not belong together."""
 
 WORST_PART: Final = 0.005
-"""The same as a part of the longer side of the image, where that is more."""
-
-WORST_SIGMAS: Final = 20.0
-"""The same as a multiple of the points' standard deviation, where that is more."""
+"""Residuals, rms, beyond which the pairs do not belong together, as a part of the longer side of
+the image: it counts where it is more pixels than WORST."""
 
 EXCHANGED: Final = 1.05
 """Residuals over those with the lenses exchanged, from which on they are: two lenses of one make
 differ by 1.7 and more where they are not (measured on recorded pairs)."""
 
-MOST_PAIRS: Final = 0.75
-"""Of the pairs that must say so."""
-
-FITTED: Final = 1.2
-"""Squares of the residuals over those with a lens that is fitted to the views: lenses from other
-views reach 1.04 on recorded pairs, a focal length that is 1 % off 2 where noise is 0.05 pixels."""
-
-LEAST_FITTED: Final = 3
-"""Views that such a lens is fitted to at least."""
+MIN_SWAPPED_SHARE: Final = 0.75
+"""At least this part of the pairs must fit better with the lenses exchanged."""
 
 APART: Final = 30.0
 """Squared standard deviations by which the right camera's place is no chance from the left one's:
@@ -78,12 +67,11 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
     ]
     for number, left, right in pairs:
         if np.array_equal(left.ids, right.ids) and np.array_equal(left.points, right.points):
-            raise CalibrationError(
+            raise Code.COINCIDENT.refusal(
                 "stereo: expected what two cameras see, got the same image on both sides in "
                 f"{label(left, number)}",
-                code=Code.COINCIDENT,
-                expected="two cameras",
-                got=number,
+                "two cameras",
+                number,
             )
     first, second = known
     if first is None or second is None or first.size != second.size or not pairs:
@@ -94,13 +82,12 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         for lenses in ((first, second), (second, first))
     )
     ratio = math.sqrt(float(so.sum() / other.sum())) if other.sum() > 0 else 1.0
-    if ratio > EXCHANGED and (other < so).mean() >= MOST_PAIRS:
-        raise CalibrationError(
+    if ratio > EXCHANGED and (other < so).mean() >= MIN_SWAPPED_SHARE:
+        raise Code.SWAPPED_LENSES.refusal(
             "stereo: expected the left camera's lens as left and the right one's as right, got "
             f"residuals {ratio:.3g} times as large as with the two exchanged",
-            code=Code.SWAPPED_LENSES,
-            expected=1.0,
-            got=ratio,
+            1.0,
+            ratio,
         )
 
 
@@ -113,15 +100,15 @@ def check_apart(transform: Transform, covariance: Array) -> None:
 
     ``covariance`` (6, 6): of ``T_right_left``.
     """
+    # by the variance along it, which few views tell where they do not tell all of the covariance
     shift, spread = transform.translation, covariance[3:, 3:]
-    if float(shift @ np.linalg.pinv(spread) @ shift) < APART:
-        raise CalibrationError(
+    if float(shift @ shift) ** 2 <= APART * float(shift @ spread @ shift):
+        raise Code.COINCIDENT.refusal(
             "stereo: expected two cameras that stand apart, got one "
             f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, which may be nothing: "
             "are the images of both sides those of one camera?",
-            code=Code.COINCIDENT,
-            expected="two places",
-            got=float(np.linalg.norm(shift)),
+            "two places",
+            float(np.linalg.norm(shift)),
         )
 
 
@@ -147,7 +134,7 @@ def examined(
     for side, name in enumerate(SIDES):
         if known[side] is not None:
             own = [one.fitted for one in seen if one.used and one.side == side]
-            said += _remarks_on_lens(own, name, found.sigma**2)
+            said += lens_remarks(own, f"{name} lens", found.sigma**2)
     off = strays(fitted, found.sigma**2, used)
     if off and drop:
         for one, view in zip(seen, without([one.view for one in fitted], off), strict=True):
@@ -181,40 +168,23 @@ def _seen(found: StereoCalibration) -> Iterator[_SeenFrom]:
                 )
 
 
-def _remarks_on_lens(fitted: Sequence[Fitted], side: str, more: float) -> Iterator[Remark]:
-    """Yield whether a known lens is not the camera's (``WRONG_LENS``).
-
-    ``fitted``: the views that it shows; ``more``: variance beside their points' own, pixels^2.
-    """
-    gain = lens_gain(fitted, more) if len(fitted) >= LEAST_FITTED else 1.0
-    if gain > FITTED:
-        yield Remark(
-            Code.WRONG_LENS,
-            f"the {side} lens that was given leaves {math.sqrt(gain):.3g} times the residuals of "
-            f"one that is fitted to the {side} views: is it this camera's, at this focus?",
-        )
-
-
 def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None:
     """Raise (``POOR_FIT``) where the pairs do not belong together.
 
     ``rms``: of the residuals, a coordinate, pixels. ``sights``: the used views; ``bad``: those that
     fit worst.
     """
-    noise = float(np.median(np.concatenate([one.view.sigmas for one in sights])))
-    longer = max(max(one.view.size) for one in sights)
-    most = max(WORST, WORST_PART * longer, WORST_SIGMAS * noise)
+    most = most_rms([one.view for one in sights], WORST, WORST_PART)
     if rms <= most:
         return
     named = ", ".join(f"{label(one.view, one.pose)} ({SIDES[one.camera]})" for one in bad)
-    raise CalibrationError(
+    raise Code.POOR_FIT.refusal(
         "stereo: expected cameras that show the pairs as they are, got residuals of "
         f"{rms:.3g} pixels rms, {most:.3g} at most expected: were the views of each pair taken at "
         f"the same moment, and are they in the same order? Those that fit worst: "
         f"{named or 'all alike'}",
-        code=Code.POOR_FIT,
-        expected=most,
-        got=rms,
+        most,
+        rms,
     )
 
 
@@ -225,9 +195,8 @@ def remark_sides(transform: Transform) -> list[Remark]:
     if not beside or float(np.trace(transform.rotation)) <= UPRIGHT:
         return []
     return [
-        Remark(
-            Code.SWAPPED_SIDES,
+        Code.SWAPPED_SIDES.remark(
             "left and right seem swapped: expected the right camera on the right of the left one, "
-            f"got it {1e3 * along[0]:.3g} mm on the left; where it is meant so, all is well",
+            f"got it {1e3 * along[0]:.3g} mm on the left; where it is meant so, all is well"
         )
     ]

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 from smartcam.calibration._stereo import triangulation
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.bundle import Indices
     from smartcam.calibration._stereo.triangulation import CameraPair
     from smartcam.calibration._targets import Target
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry._inside import Array
 
 NEAREST: Final = 1.01
 """Points that are no farther apart than this many times the least distance are neighbours."""

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._optional_imports import load
-from smartcam.exceptions import CalibrationError
+from smartcam._extras import load
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry import CameraModel, Transform
+    from smartcam.geometry._inside import Array
 
 Image: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]"
 
@@ -28,7 +27,7 @@ With less, a camera looks along the line to the other one: rows would meet insid
 """
 
 MAX_PIXELS: Final = 100_000_000
-"""Of a rectified image; its two maps have 8 bytes for each."""
+"""A rectified image has at most this many pixels; its two maps have 8 bytes for each pixel."""
 
 SAMPLES: Final = 50_000
 """Source pixels at most, evenly spread, of which it is counted how many are kept."""
@@ -36,7 +35,7 @@ SAMPLES: Final = 50_000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rectification:
-    """What :meth:`StereoCalibration.rectify` finds.
+    """The result of :meth:`StereoCalibration.rectify`.
 
     Where an image's half stands in a pair, the left one comes first.
 
@@ -44,12 +43,10 @@ class Rectification:
         size: width and height of the rectified images, pixels.
         alpha: 0: all pixels of the output are valid; 1: all source pixels are kept.
         rotations: (3, 3) each, from each camera's frame into its rectified one.
-        projections: (3, 4) each, from the left rectified frame into each rectified image; metres
-            become pixels.
+        projections: (3, 4) each, from the left rectified frame, metres, into each rectified image.
         depth: (4, 4), Q: (u, v, disparity, 1) becomes the point in the left rectified frame,
             homogeneous, metres.
-        maps: (H, W, 2) each, float32: where each output pixel is in the source, for
-            ``cv2.remap``.
+        maps: (H, W, 2) each, float32: source of each output pixel, for ``cv2.remap``.
         masks: (H, W) each: which pixels of the output have a source.
         kept: part of the source pixels that are in the output, of each.
         invalid: part of the output pixels that have no source, of each.
@@ -91,11 +88,11 @@ def rectify(
     """Return the maps after which the rows of two images show the same points.
 
     Args:
-        left: its lens.
-        right: its lens, of the same model and image size.
+        left: lens of the left camera.
+        right: lens of the right camera, of the same model and image size.
         transform: ``T_right_left``.
         alpha: 0 to 1, from no invalid pixels to no lost ones.
-        size: of the output, width and height in pixels; None: the source's.
+        size: size of the output, width and height in pixels; None: the source's.
 
     Raises:
         CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is none or too large,
@@ -114,13 +111,12 @@ def rectify(
     across = min(float(turn[2, 2]) for turn in turns)
     upright = min(float(projection[0, 0]) for projection in projections) > 0
     if not (upright and across > ACROSS and all(mask.any() for mask in masks)):
-        raise CalibrationError(
+        raise Code.OUT_OF_FIELD.refusal(
             f"rectify with alpha {alpha:g}: expected two cameras beside each other that see the "
             "same place the same way up, got parallel images with nothing in them, or upside down "
             f"(cosine between old and new viewing direction: {across:.2f})",
-            code=Code.OUT_OF_FIELD,
-            expected=ACROSS,
-            got=across,
+            ACROSS,
+            across,
         )
     kept = tuple(
         _kept(camera, turn, projection, output)
@@ -148,12 +144,11 @@ def _checked(
     if left.distortion_model != right.distortion_model:
         raise _shape("lenses", f"two of {left.distortion_model}", right.distortion_model)
     if tuple(left.size) != tuple(right.size):
-        raise CalibrationError(
+        raise Code.WRONG_SIZE.refusal(
             f"rectify: expected images of one size, {left.size[0]} x {left.size[1]}, got "
             f"{right.size[0]} x {right.size[1]} on the right",
-            code=Code.WRONG_SIZE,
-            expected=left.size,
-            got=right.size,
+            left.size,
+            right.size,
         )
     width, height = size or left.size
     if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
@@ -162,12 +157,7 @@ def _checked(
 
 
 def _shape(what: str, expected: str, got: object) -> CalibrationError:
-    return CalibrationError(
-        f"rectify: {what}: expected {expected}, got {got}",
-        code=Code.SHAPE,
-        expected=expected,
-        got=got,
-    )
+    return Code.SHAPE.unexpected(f"rectify: {what}: expected {expected}", expected, got)
 
 
 def _parallel(
@@ -217,7 +207,7 @@ def _map(
 
 
 def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
-    """Return whether places (..., 2) are in an image."""
+    """Return True for each place (..., 2) that lies in an image."""
     with np.errstate(invalid="ignore"):
         u, v = places[..., 0], places[..., 1]
         return np.asarray((u >= 0) & (v >= 0) & (u <= size[0] - 1) & (v <= size[1] - 1))

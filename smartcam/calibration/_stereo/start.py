@@ -1,27 +1,26 @@
-"""Where the calibration of two cameras starts from: lenses, poses, and the likeliest transform."""
+"""Find the start of a calibration of two cameras: lenses, poses, and the likeliest transform."""
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 import math
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.rigid import IDENTITY, Rigid
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust, known_lens
 from smartcam.calibration._lens.intrinsics import check_tilts, check_views
-from smartcam.calibration._lens.poses import likeliest_poses
+from smartcam.calibration._lens.poses import half_turn, half_turned, likeliest_poses
 from smartcam.calibration._lens.start import fit_lens, lens_basis
 from smartcam.calibration._views import TargetView, as_list
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+from smartcam.geometry._inside import IDENTITY, Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel, DistortionModel
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array, DistortionModel
 
 LEFT: Final = "left"
 """Name of the left camera's frame."""
@@ -30,7 +29,7 @@ RIGHT: Final = "right"
 """Name of the right camera's frame."""
 
 SIDES: Final = (LEFT, RIGHT)
-"""Their names by number."""
+"""Names of the sides by number."""
 
 GUESSES: Final = 20
 """Pairs at most that are tried for a first guess of the transform."""
@@ -39,11 +38,12 @@ GROSS: Final = 10.0
 """A pair that is more times the median off does not belong together, if it is far off, too."""
 
 FAR: Final = 0.01
-"""Of the longer side of the image: as far off is no noise, nor a lens that is not yet adjusted."""
+"""A pair is far off where its points are off by more than this part of the longer side of the
+image: neither noise nor a lens that is not yet adjusted does that."""
 
 
 class Lenses(NamedTuple):
-    """What is known and wanted of the lenses."""
+    """The lenses that are known, and what is to be fitted of the others."""
 
     # left and right; None for one that is to be found
     known: tuple[CameraModel | None, CameraModel | None]
@@ -59,7 +59,7 @@ class Lenses(NamedTuple):
 
 
 Moment: TypeAlias = tuple["TargetView | None", "TargetView | None"]
-"""What both cameras see of the target at one time."""
+"""Views that both cameras have of the target at one time."""
 
 
 def as_moments(
@@ -76,24 +76,22 @@ def as_moments(
         for side, views in zip(SIDES, (left_views, right_views), strict=True)
     )
     if len(left_views) != len(right_views):
-        raise CalibrationError(
+        raise Code.SHAPE.refusal(
             f"stereo: expected as many left views as right ones, got {len(left_views)} and "
             f"{len(right_views)}",
-            code=Code.SHAPE,
-            expected=len(left_views),
-            got=len(right_views),
+            len(left_views),
+            len(right_views),
         )
     for side, views in zip(SIDES, (left_views, right_views), strict=True):
         check_views([one for one in views if one is not None], f"{side} camera", 1)
     moments = list(zip(left_views, right_views, strict=True))
     for one, two in moments:
         if one is not None and two is not None and one.target != two.target:
-            raise CalibrationError(
+            raise Code.DIFFERENT_TARGETS.refusal(
                 f"stereo: expected views of one target, {one.target}, got {two.target} on the "
                 "right",
-                code=Code.DIFFERENT_TARGETS,
-                expected=one.target,
-                got=two.target,
+                one.target,
+                two.target,
             )
     return moments
 
@@ -117,14 +115,14 @@ def start(moments: list[Moment], lenses: Lenses) -> FirstGuess:
     (left, ones), (right, twos) = (_side(moments, side, lenses) for side in range(2))
     poses: list[Poses] = list(zip(ones, twos, strict=True))
     target = next(view.target for moment in moments for view in moment if view is not None)
+    turns = [IDENTITY]
     if target.turned_alike:
-        around = Rigid(np.diag([-1.0, -1.0, 1.0]), target.points[0] + target.points[-1])
-        for number, ((one, two), (first, second)) in enumerate(zip(poses, moments, strict=True)):
-            if one is not None and two is not None and second is not None:
-                turned = two @ around
-                if one.angle_to(turned) < one.angle_to(two):
-                    moments[number], poses[number] = (first, half_turned(second)), (one, turned)
-    rig, apart = _rig(moments, poses, right)
+        turns.append(half_turn(target))
+    rig, apart, turned = _rig(moments, poses, right, turns)
+    for number in turned:
+        (one, two), (first, second) = poses[number], moments[number]
+        if two is not None and second is not None:
+            moments[number], poses[number] = (first, half_turned(second)), (one, two @ turns[1])
     firsts = Rigid.stacked(one or (rig.inverse() @ two if two else IDENTITY) for one, two in poses)
     basis = lenses.basis(0), lenses.basis(1)
     return FirstGuess(moments, Bundle((left, right), Rigid.stacked([rig]), firsts, basis), apart)
@@ -153,45 +151,44 @@ def _side(
     return found.bundle.cameras[0], poses
 
 
-def half_turned(view: TargetView) -> TargetView:
-    """Return a view whose points are numbered from the target's other end."""
-    ids = len(view.target.points) - 1 - view.ids[::-1]
-    return dataclasses.replace(
-        view, ids=ids, points=view.points[::-1], covariance=view.covariance[::-1]
-    )
-
-
 def _rig(
-    moments: list[Moment], poses: list[Poses], right: CameraModel
-) -> tuple[Rigid, dict[int, float]]:
+    moments: list[Moment], poses: list[Poses], right: CameraModel, turns: Sequence[Rigid]
+) -> tuple[Rigid, dict[int, float], list[int]]:
     """Return the pair's transform that fits most of the pairs best, and the pairs that do not fit.
 
-    Raises ``POOR_FIT``.
+    Then those whose right view is numbered from the other end: ``turns`` of the target leave it as
+    it was. Which numbering fits is told by all pairs together, as the cameras may stand on their
+    heads. Raises ``POOR_FIT``.
     """
     pairs = [
         (number, one, two, moment[1])
         for number, ((one, two), moment) in enumerate(zip(poses, moments, strict=True))
         if one is not None and two is not None and moment[1] is not None
     ]
-    best, least, apart = IDENTITY, math.inf, dict[int, float]()
-    for _, one, two, _ in pairs[:: math.ceil(len(pairs) / GUESSES)]:
+    best, least, off = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
+    some = pairs[:: math.ceil(len(pairs) / GUESSES)]
+    for turn, (_, one, two, _) in itertools.product(turns, some):
         # T_right_left = T_right_target T_target_left; that with the least median counts, which half
         # of the pairs may not spoil: Rousseeuw, Least Median of Squares Regression (1984).
-        guess = two @ one.inverse()
-        off = []
-        for _, pose, _, view in pairs:
-            near = (guess @ pose).apply(view.object_points)
-            distances = np.linalg.norm(right.project(near) - view.points, axis=1)
-            off.append(float(np.nan_to_num(distances, nan=math.inf).mean()))
-        middle = float(np.median(off))
+        guess = two @ turn @ one.inverse()
+        tried = np.array([_off(guess @ pose, view, right, turns) for _, pose, _, view in pairs])
+        middle = float(np.median(tried.min(axis=1)))
         if middle < least:
-            best, least = guess, middle
-            apart = {number: value for (number, *_), value in zip(pairs, off, strict=True)}
+            best, least, off = guess, middle, tried
     if not math.isfinite(least):
-        raise CalibrationError(
+        raise Code.POOR_FIT.refusal(
             f"stereo: expected one transform from left to right that fits most of the "
-            f"{len(pairs)} pairs, got none: were the views taken at the same moments?",
-            code=Code.POOR_FIT,
+            f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
     far = max(GROSS * least, FAR * max(right.size))
-    return best, {number: off for number, off in apart.items() if off > far}
+    numbers, nearest = [number for number, *_ in pairs], off.min(axis=1).tolist()
+    apart = {number: one for number, one in zip(numbers, nearest, strict=True) if one > far}
+    turned = [number for number, one in zip(numbers, off, strict=True) if one[0] > one[-1]]
+    return best, apart, turned
+
+
+def _off(pose: Rigid, view: TargetView, camera: CameraModel, turns: Sequence[Rigid]) -> list[float]:
+    """Return the mean distance of a view's points from a pose's, with each turn, pixels."""
+    seen = [camera.project((pose @ turn).apply(view.object_points)) for turn in turns]
+    off = [np.linalg.norm(one - view.points, axis=1) for one in seen]
+    return [float(np.nan_to_num(one, nan=math.inf).mean()) for one in off]

@@ -6,17 +6,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._geometry.rigid import cross_matrix
+from smartcam._extras import load
 from smartcam.calibration._lens.projection import linearize, whitening
-from smartcam.calibration._optional_imports import load
+from smartcam.geometry._inside import cross_matrix
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel, Transform
+    from smartcam.geometry._inside import Array
 
 STEPS = 10
-"""From the linear solution to the least reprojection error; two or three are enough."""
+"""Steps from the linear solution to the least reprojection error; two or three are enough."""
 
 SETTLED = 1e-9
 """Part of its depth that a point still moves in the last step."""

@@ -19,7 +19,8 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from smartcam.calibration._codes import Code
+from smartcam.calibration._units import LengthUnit
+from smartcam.calibration.formats import _foreign as foreign
 from smartcam.calibration.formats import _handeye as handeye
 from smartcam.calibration.formats import _opencv as opencv
 from smartcam.calibration.formats import _ros as ros
@@ -37,14 +38,14 @@ from smartcam.calibration.formats._plain import frame_name, known
 from smartcam.calibration.formats._planes import plane_frame
 from smartcam.calibration.formats._robots import ROBOTS, pose_from, pose_to
 from smartcam.calibration.formats._samples import HandEyeSample
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Mapping, Sequence
 
-    from smartcam.calibration._geometry.frames import Transform
     from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.geometry import Transform
 
 __all__ = [
     "ROBOTS",
@@ -53,6 +54,7 @@ __all__ = [
     "TRANSFORMS",
     "CameraChain",
     "HandEyeSample",
+    "LengthUnit",
     "PlaneMatrix",
     "compose",
     "plane_frame",
@@ -73,12 +75,20 @@ __all__ = [
 
 def _arguments(title: str, compose: Callable[..., str], **options: bool) -> Format[Transform]:
     """Return a format of arguments; all of them read the same."""
-    return Format(
-        title=title,
-        suffix=".txt",
-        parse=named(ros.parse_arguments),
-        compose=partial(compose, **options),
-    )
+    return Format(title, ".txt", named(ros.parse_arguments), partial(compose, **options))
+
+
+def _easy(
+    name: str, of: str, suffix: str, parse: Callable[[str], Transform], compose: Callable[..., str]
+) -> dict[str, Format[Transform]]:
+    """Return a program's two formats: of a camera that stands, and of one that is carried."""
+    carried = partial(compose, in_hand=True)
+    return {
+        name: Format(f"{name}, {of}: a camera that stands", suffix, named(parse), compose),
+        f"{name}_in_hand": Format(
+            f"{name}, {of}: a camera that the robot carries", suffix, named(parse), carried
+        ),
+    }
 
 
 TRANSFORMS: Mapping[str, Format[Transform]] = {
@@ -93,58 +103,50 @@ TRANSFORMS: Mapping[str, Format[Transform]] = {
     "ros2": _arguments("arguments of ROS 2, tf2_ros: quaternion", ros.compose_options),
     "ros2_ypr": _arguments("the same with yaw, pitch and roll", ros.compose_options, angles=True),
     "ros_industrial": Format(
-        title="pose of ROS-Industrial's calibration, without names of frames",
-        suffix=".yaml",
-        parse=ros.parse_pose,
-        compose=ros.compose_pose,
+        "pose of ROS-Industrial's calibration, without names of frames",
+        ".yaml",
+        ros.parse_pose,
+        ros.compose_pose,
     ),
-    "easy_handeye": Format(
-        title="easy_handeye, ROS 1: a camera that stands",
-        suffix=".yaml",
-        parse=named(handeye.parse_easy_handeye),
-        compose=handeye.compose_easy_handeye,
+    **_easy(
+        "easy_handeye", "ROS 1", ".yaml", handeye.parse_easy_handeye, handeye.compose_easy_handeye
     ),
-    "easy_handeye_in_hand": Format(
-        title="easy_handeye, ROS 1: a camera that the robot carries",
-        suffix=".yaml",
-        parse=named(handeye.parse_easy_handeye),
-        compose=partial(handeye.compose_easy_handeye, in_hand=True),
-    ),
-    "easy_handeye2": Format(
-        title="easy_handeye2, ROS 2: a camera that stands",
-        suffix=".calib",
-        parse=named(handeye.parse_easy_handeye2),
-        compose=handeye.compose_easy_handeye2,
-    ),
-    "easy_handeye2_in_hand": Format(
-        title="easy_handeye2, ROS 2: a camera that the robot carries",
-        suffix=".calib",
-        parse=named(handeye.parse_easy_handeye2),
-        compose=partial(handeye.compose_easy_handeye2, in_hand=True),
+    **_easy(
+        "easy_handeye2",
+        "ROS 2",
+        ".calib",
+        handeye.parse_easy_handeye2,
+        handeye.compose_easy_handeye2,
     ),
     "opencv": Format(
-        title="matrix (4, 4) of cv2.FileStorage",
-        suffix=".yaml",
-        parse=opencv.parse_transform,
-        compose=opencv.compose_transform,
+        "matrix (4, 4) of cv2.FileStorage",
+        ".yaml",
+        opencv.parse_transform,
+        opencv.compose_transform,
         head=opencv.HEAD,
     ),
+    "matrix": Format("a bare matrix (4, 4): rows of numbers, or JSON", ".txt", foreign.parse_bare),
+    "zivid": Format("Zivid's matrix (4, 4), millimetres", ".yaml", foreign.parse_zivid),
+    "euroc_sensor": Format(
+        "sensor.yaml of EuRoC: a sensor on its body", ".yaml", foreign.parse_sensor
+    ),
+    "urdf": Format("origin of a joint in a robot's description", ".urdf", ros.parse_urdf),
 }
 """Formats of one transform. Those that differ in what they write alone read all the same."""
 
 SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
     "moveit": Format(
-        title="samples of MoveIt's hand-eye solver, JSON",
-        suffix=".json",
-        parse=named(samples.parse_json),
-        compose=samples.compose_json,
+        "samples of MoveIt's hand-eye solver, JSON",
+        ".json",
+        named(samples.parse_json),
+        samples.compose_json,
         most=MAX_FILE,
     ),
     "moveit_yaml": Format(
-        title="samples of MoveIt's hand-eye panel, YAML",
-        suffix=".yaml",
-        parse=named(samples.parse_yaml),
-        compose=samples.compose_yaml,
+        "samples of MoveIt's hand-eye panel, YAML",
+        ".yaml",
+        named(samples.parse_yaml),
+        samples.compose_yaml,
         most=MAX_YAML,
     ),
 }
@@ -152,27 +154,27 @@ SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
 
 TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
     "asl": Format(
-        title="t, x, y, z, qx, qy, qz, qw; seconds",
-        suffix=".csv",
-        parse=trajectories.parse_csv,
-        compose=trajectories.compose_asl,
+        "t, x, y, z, qx, qy, qz, qw; seconds",
+        ".csv",
+        trajectories.parse_csv,
+        trajectories.compose_asl,
         most=MAX_FILE,
     ),
     "euroc": Format(
-        title="EuRoC: nanoseconds, the quaternion's real part first",
-        suffix=".csv",
-        parse=trajectories.parse_csv,
-        compose=trajectories.compose_euroc,
+        "EuRoC: nanoseconds, the quaternion's real part first",
+        ".csv",
+        trajectories.parse_csv,
+        trajectories.compose_euroc,
         most=MAX_FILE,
     ),
 }
 """Formats of poses over time; either reads both, and the file's header decides."""
 
 _MATRIX: Format[PlaneMatrix] = Format(
-    title="matrix of a plane calibration",
-    suffix=".yaml",
-    parse=named(opencv.parse_matrix),
-    compose=opencv.compose_matrix,
+    "matrix of a plane calibration",
+    ".yaml",
+    named(opencv.parse_matrix),
+    opencv.compose_matrix,
 )
 
 
@@ -180,23 +182,32 @@ _MATRIX: Format[PlaneMatrix] = Format(
 
 
 def read_transform(
-    path: str | os.PathLike[str], form: str, *, target: str = "robot", source: str = "camera"
+    path: str | os.PathLike[str],
+    form: str,
+    *,
+    target: str = "robot",
+    source: str = "camera",
+    unit: LengthUnit | None = None,
 ) -> Transform:
     """Read a transform.
 
     Args:
         path: the file.
-        form: its format, a key of :data:`TRANSFORMS`.
-        target: the frame that it leads to, for a format that does not name it.
-        source: the frame that it comes from, likewise.
+        form: format of the file, a key of :data:`TRANSFORMS`.
+        target: the frame that the transform leads to, for a format that does not name it.
+        source: the frame that the transform comes from, likewise.
+        unit: unit of the file's lengths; None for the one that the file, or its format, says. A
+            bare matrix and OpenCV's files do not say it.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``; ``MALFORMED``: the file is not what the format says,
-            or too large; ``NOT_FINITE``, ``NOT_RIGID``, ``BAD_NAME``: what it says is no pose.
+            or too large; ``UNIT_UNKNOWN``: nothing says the unit, or a distance of more than 20 m
+            or an angle of more than a turn asks whether it is another one; ``NOT_FINITE``,
+            ``NOT_RIGID``, ``BAD_NAME``: what it says is no pose.
         MissingExtraError: PyYAML is not installed.
         OSError: the file cannot be read.
     """
-    return known(TRANSFORMS, form).read(path, target, source)
+    return known(TRANSFORMS, form).read(path, target, source, unit=unit)
 
 
 def write_transform(path: str | os.PathLike[str], form: str, transform: Transform) -> None:
@@ -204,7 +215,7 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
 
     Args:
         path: the file.
-        form: its format, a key of :data:`TRANSFORMS`.
+        form: format of the file, a key of :data:`TRANSFORMS`.
         transform: ``source`` is the child, ``target`` its parent; a time is not written.
 
     Raises:
@@ -215,13 +226,15 @@ def write_transform(path: str | os.PathLike[str], form: str, transform: Transfor
     known(TRANSFORMS, form).write(path, transform)
 
 
-def read_samples(path: str | os.PathLike[str], form: str) -> Sequence[HandEyeSample]:
+def read_samples(
+    path: str | os.PathLike[str], form: str, *, unit: LengthUnit | None = None
+) -> Sequence[HandEyeSample]:
     """Read the samples of a hand-eye calibration, a key of :data:`SAMPLES`.
 
     Their frames are called base, effector, camera and object. Errors are those of
     :func:`read_transform`.
     """
-    return known(SAMPLES, form).read(path)
+    return known(SAMPLES, form).read(path, unit=unit)
 
 
 def write_samples(path: str | os.PathLike[str], form: str, values: Sequence[HandEyeSample]) -> None:
@@ -236,14 +249,19 @@ def write_samples(path: str | os.PathLike[str], form: str, values: Sequence[Hand
 
 
 def read_trajectory(
-    path: str | os.PathLike[str], form: str, *, target: str = "world", source: str = "body"
+    path: str | os.PathLike[str],
+    form: str,
+    *,
+    target: str = "world",
+    source: str = "body",
+    unit: LengthUnit | None = None,
 ) -> Sequence[Transform]:
     """Read poses over time, a key of :data:`TRAJECTORIES`, in the order of the file.
 
     Times come to the nearest microsecond. Arguments and errors are those of
     :func:`read_transform`, and ``BAD_TIME``.
     """
-    return known(TRAJECTORIES, form).read(path, target, source)
+    return known(TRAJECTORIES, form).read(path, target, source, unit=unit)
 
 
 def write_trajectory(path: str | os.PathLike[str], form: str, values: Sequence[Transform]) -> None:
@@ -271,7 +289,7 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
     """Return the file of a plane calibration's frame, its scale in a comment.
 
     Args:
-        form: its format, a key of :data:`TRANSFORMS`.
+        form: format of the file, a key of :data:`TRANSFORMS`.
         calibration: one that has a frame: see :func:`plane_frame`.
         suffix: what the file's name ends in; None for whatever.
 
@@ -281,11 +299,8 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
     """
     wanted = known(TRANSFORMS, form)
     if suffix not in {None, wanted.suffix}:
-        raise CalibrationError(
-            f"format {form}: expected a name that ends in {wanted.suffix}, got {suffix}",
-            code=Code.BAD_NAME,
-            expected=wanted.suffix,
-            got=suffix,
+        raise Code.BAD_NAME.unexpected(
+            f"format {form}: expected a name that ends in {wanted.suffix}", wanted.suffix, suffix
         )
     transform, scale = plane_frame(calibration)
     for name in (transform.target, transform.source):
@@ -294,4 +309,4 @@ def compose(form: str, calibration: PlaneCalibration, *, suffix: str | None = No
         f"# multiply coordinates of {transform.source} by {scale!r} to have metres, then apply "
         f"{transform.label}\n"
     )
-    return wanted.head + said + wanted.compose(transform)
+    return wanted.head + said + wanted.text(transform)

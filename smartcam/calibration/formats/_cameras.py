@@ -1,12 +1,14 @@
 """Lenses and pairs in files of other programs: ROS' ``camera_info``, Kalibr's camchain, OpenCV's.
 
+Those of other programs that are only read are in ``_foreign.py``.
+
 ::
 
     write_cameras("camchain.yaml", "kalibr", CameraChain.of(calibration))
     camera = read_cameras("left.yaml", "camera_info").cameras[0]
 
-All three count pixels from the middle of the upper left one, as smartcam does. Lengths are metres.
-The number of coefficients that is written follows from the model, and so does what is read.
+Pixels count from the middle of the upper left one, and lengths become metres. The number of
+coefficients that is written follows from the model, and so does what is read.
 """
 
 from __future__ import annotations
@@ -17,47 +19,46 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._files.store import replace_file
-from smartcam.calibration._lens.model import COEFFICIENTS, CameraModel
 from smartcam.calibration._stereo.calibration import StereoCalibration
-from smartcam.calibration.formats._file_format import Format, named
-from smartcam.calibration.formats._opencv import HEAD
+from smartcam.calibration.formats import _foreign as foreign
+from smartcam.calibration.formats._file_format import Format, Measured
+from smartcam.calibration.formats._opencv import HEAD, load_storage, storage_matrix
 from smartcam.calibration.formats._plain import (
     Plain,
+    flow,
     known,
+    lens_matrix,
     load_yaml,
     malformed,
     mapping,
     matrix_rows,
-    number,
     quoted,
-    real,
     rigid,
     sequence,
+    stored_matrix,
+    whole,
 )
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Code
+from smartcam.geometry._inside import COEFFICIENTS, check_size
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Mapping, Sequence
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
-    from smartcam.calibration._lens.model import DistortionModel
+    from smartcam.calibration._units import LengthUnit
+    from smartcam.exceptions import CalibrationError
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array, DistortionModel
 
-CameraForm: TypeAlias = Literal["camera_info", "kalibr", "opencv"]
+CameraForm: TypeAlias = Literal[
+    "camera_info", "kalibr", "opencv", "ros_ini", "euroc", "mrcal", "colmap", "basalt", "multical"
+]
 """Names of the formats."""
 
 MAX_FILE: Final = 1 << 20
 """Bytes of a file at most; a chain of eight cameras has four thousand."""
-
-MAX_CAMERAS: Final = 64
-"""Cameras of a chain at most."""
-
-MAX_SIDE: Final = 1_000_000
-"""Pixels of an image's side at most."""
 
 _KALIBR: Final[dict[DistortionModel, str]] = {"plumb_bob": "radtan", "equidistant": "equidistant"}
 _RADTAN: Final = 4
@@ -73,8 +74,8 @@ class CameraChain:
 
     Attributes:
         cameras: the lenses, one or more.
-        transforms: from each camera's frame into the next one's: ``T_1_0``, ``T_2_1``, ...
-        names: of the cameras.
+        transforms: motions from each camera's frame into the next one's: ``T_1_0``, ``T_2_1``, ...
+        names: names of the cameras.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -83,11 +84,10 @@ class CameraChain:
 
     def __post_init__(self) -> None:
         if not 0 < len(self.cameras) == len(self.transforms) + 1 == len(self.names):
-            raise CalibrationError(
+            raise Code.SHAPE.refusal(
                 "chain of cameras: expected a name for each of them and a transform between each "
                 f"two, got {len(self.cameras)} cameras, {len(self.names)} names and "
-                f"{len(self.transforms)} transforms",
-                code=Code.SHAPE,
+                f"{len(self.transforms)} transforms"
             )
 
     @classmethod
@@ -107,7 +107,7 @@ class CameraInfo(NamedTuple):
 
     Attributes:
         camera: the lens.
-        name: of the camera.
+        name: name of the camera.
         rectification: (3, 3), from the camera's frame into the rectified one.
         projection: (3, 4), of the rectified image, pixels.
     """
@@ -118,20 +118,44 @@ class CameraInfo(NamedTuple):
     projection: Array
 
 
-def read_cameras(path: str | os.PathLike[str], form: CameraForm) -> CameraChain:
+def read_cameras(
+    path: str | os.PathLike[str],
+    form: CameraForm,
+    *,
+    size: tuple[int, int] | None = None,
+    unit: LengthUnit | None = None,
+    extrinsics: str | os.PathLike[str] | None = None,
+) -> CameraChain:
     """Return the cameras of a file.
 
     Args:
         path: the file.
-        form: ``camera_info``, ``kalibr`` or ``opencv``.
+        form: ``camera_info`` and ``ros_ini`` (ROS), ``kalibr``, ``opencv`` (YAML or XML),
+            ``euroc`` (``sensor.yaml``), ``mrcal`` (``.cameramodel``), ``colmap``
+            (``cameras.txt``), ``basalt`` or ``multical`` (``calibration.json``).
+        size: width and height of the cameras' images, pixels, for a file that does not say it, as
+            OpenCV's ``intrinsics.yml``; else what the file says has to be the same.
+        unit: unit of the lengths between cameras; None for what the file or its format says.
+            OpenCV's and multical's do not.
+        extrinsics: the second file of OpenCV's sample ``stereo_calib``, with R and T.
 
     Raises:
         CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID`` or ``SHAPE``: the file is not
-            what its format says, or has a lens of another model; ``UNKNOWN_FORMAT``.
+            what its format says, or has a lens of another model; ``WRONG_SIZE``: it has no size of
+            the images, or another one; ``UNIT_UNKNOWN``; ``UNKNOWN_FORMAT``.
         MissingExtraError: PyYAML is not installed.
         OSError: it cannot be read.
     """
-    return known(FORMS, form, "format of cameras").read(path)
+    wanted = known(FORMS, form, "format of cameras")
+    if size is not None:
+        check_size(size, "read_cameras")
+    if extrinsics is None:
+        return wanted.read(path, size, unit=unit)
+    if form != "opencv":
+        raise _cannot(form, "one file", "extrinsics as well")
+    with Path(extrinsics).open("rb") as stream:
+        more = stream.read(MAX_FILE + 1).decode("utf-8", "replace")
+    return wanted.read(path, size, more, unit=unit)
 
 
 def write_cameras(path: str | os.PathLike[str], form: CameraForm, chain: CameraChain) -> None:
@@ -163,7 +187,7 @@ def write_camera_info(
     Args:
         path: the file.
         camera: the lens.
-        name: of the camera.
+        name: name of the camera.
         rectification: (3, 3), as :meth:`StereoCalibration.rectify` has it; None: none.
         projection: (3, 4), pixels and, for the right camera, pixels times metres; None: the lens
             without its distortion.
@@ -205,26 +229,27 @@ def compose_camera_info(
 def _ros_matrix(name: str, matrix: Array) -> str:
     return (
         f"{name}:\n  rows: {matrix.shape[0]}\n  cols: {matrix.shape[1]}\n"
-        f"  data: {_flow(matrix.ravel())}\n"
+        f"  data: {flow(matrix.ravel())}\n"
     )
 
 
-def parse_camera_info(text: str) -> CameraInfo:
+def parse_camera_info(text: str, size: tuple[int, int] | None = None) -> CameraInfo:
     """Return the camera of a ``camera_info``; four coefficients of ``plumb_bob`` mean k3 = 0.
 
     Raises ``MALFORMED``, ``NOT_FINITE``, ``SHAPE``; MissingExtraError: PyYAML is not installed.
     """
     needed = ["camera_matrix", "distortion_model", "distortion_coefficients"]
-    data = mapping(load_yaml(text), "file", ["image_width", "image_height", *needed])
-    matrix = _matrix(data["camera_matrix"], "camera_matrix", (3, 3))
+    data = mapping(load_yaml(text), "file", needed)
+    matrix = stored_matrix(data["camera_matrix"], "camera_matrix", (3, 3))
     rectification, projection = np.eye(3), np.column_stack([matrix, np.zeros(3)])
     if "rectification_matrix" in data:
-        rectification = _matrix(data["rectification_matrix"], "rectification_matrix", (3, 3))
+        rectification = stored_matrix(data["rectification_matrix"], "rectification_matrix", (3, 3))
     if "projection_matrix" in data:
-        projection = _matrix(data["projection_matrix"], "projection_matrix", (3, 4))
-    coefficients = _matrix(data["distortion_coefficients"], "distortion_coefficients").ravel()
+        projection = stored_matrix(data["projection_matrix"], "projection_matrix", (3, 4))
+    coefficients = stored_matrix(data["distortion_coefficients"], "distortion_coefficients").ravel()
     model = _model(data["distortion_model"], coefficients)
-    camera = _camera(_size(data), matrix, coefficients, model)
+    said = [data[key] for key in ("image_width", "image_height") if key in data]
+    camera = _camera(_size(said, size), matrix, coefficients, model)
     name = data.get("camera_name", "camera")
     if not isinstance(name, str):
         raise malformed("camera_name", "a text", name)
@@ -237,8 +262,8 @@ def _compose_one(chain: CameraChain) -> str:
     return compose_camera_info(chain.cameras[0], chain.names[0])
 
 
-def _parse_one(text: str) -> CameraChain:
-    info = parse_camera_info(text)
+def _parse_one(text: str, size: tuple[int, int] | None = None) -> CameraChain:
+    info = parse_camera_info(text, size)
     return CameraChain(cameras=(info.camera,), names=(info.name,))
 
 
@@ -258,14 +283,14 @@ def compose_camchain(chain: CameraChain) -> str:
         text += (
             f"cam{number_}:\n"
             "  camera_model: pinhole\n"
-            f"  intrinsics: {_flow(camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}\n"
+            f"  intrinsics: {flow(camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]])}\n"
             f"  distortion_model: {_KALIBR.get(camera.distortion_model, '')}\n"
-            f"  distortion_coeffs: {_flow(_of_kalibr(camera))}\n"
+            f"  distortion_coeffs: {flow(_of_kalibr(camera))}\n"
         )
         if number_:
             motion = chain.transforms[number_ - 1]
             text += "  T_cn_cnm1:\n"
-            text += "".join(f"  - {_flow(row)}\n" for row in matrix_rows(motion))
+            text += "".join(f"  - {flow(row)}\n" for row in matrix_rows(motion))
         text += f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n"
         text += f"  rostopic: {quoted(f'/{name}/image_raw')}\n"
     return text
@@ -278,49 +303,6 @@ def _of_kalibr(camera: CameraModel) -> Array:
     if camera.distortion[_RADTAN:].any():
         raise _cannot("kalibr", "k3 = 0 (calibrate with fixed=['k3'])", f"{camera.distortion[4]:g}")
     return camera.distortion[:_RADTAN]
-
-
-def parse_camchain(text: str) -> CameraChain:
-    """Return the cameras of a camchain.
-
-    Raises ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``, ``SHAPE``; MissingExtraError: no PyYAML.
-    """
-    data = mapping(load_yaml(text), "file", ["cam0"])
-    count = sum(key.startswith("cam") for key in data)
-    if count > MAX_CAMERAS:
-        raise malformed("file", f"{MAX_CAMERAS} cameras at most", str(count))
-    needed = ["camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution"]
-    names = tuple(f"cam{place}" for place in range(count))
-    parts = [mapping(mapping(data, "file", names)[name], name, needed) for name in names]
-    return CameraChain(
-        cameras=tuple(_kalibr_camera(part, name) for part, name in zip(parts, names, strict=True)),
-        transforms=tuple(
-            _kalibr_transform(part, after, before)
-            for part, before, after in zip(parts[1:], names[:-1], names[1:], strict=True)
-        ),
-        names=names,
-    )
-
-
-def _kalibr_camera(part: dict[str, Plain], name: str) -> CameraModel:
-    if part["camera_model"] != "pinhole":
-        raise malformed(f"{name}.camera_model", "pinhole", part["camera_model"])
-    models: dict[str, DistortionModel] = {said: model for model, said in _KALIBR.items()}
-    said = part["distortion_model"]
-    if not (isinstance(said, str) and said in models):
-        raise malformed(f"{name}.distortion_model", " or ".join(models), said)
-    fx, fy, cx, cy = _numbers(part["intrinsics"], f"{name}.intrinsics", 4)
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    coefficients = np.array(_numbers(part["distortion_coeffs"], f"{name}.distortion_coeffs", 4))
-    width, height = sequence(part["resolution"], f"{name}.resolution", 2)
-    size = _side(width, f"{name}.resolution"), _side(height, f"{name}.resolution")
-    return _camera(size, matrix, coefficients, models[said])
-
-
-def _kalibr_transform(part: dict[str, Plain], target: str, source: str) -> Transform:
-    where = f"{target}.T_cn_cnm1"
-    rows = sequence(mapping(part, target, ["T_cn_cnm1"])["T_cn_cnm1"], where, 4)
-    return rigid(target, source, [_numbers(row, where, 4) for row in rows], where)
 
 
 # ---------------------------------------------------------------------- OpenCV
@@ -340,82 +322,112 @@ def compose_opencv(chain: CameraChain) -> str:
         f"{HEAD}image_width: {first.size[0]}\nimage_height: {first.size[1]}\n"
         f"distortion_model: {quoted(first.distortion_model)}\n"
         f"fisheye_model: {int(first.distortion_model == 'equidistant')}\n"
+        'unit: "m"\n'
     )
     if len(chain.cameras) == 1:
         return (
             head
-            + _opencv_matrix("camera_matrix", first.matrix)
-            + _opencv_matrix("distortion_coefficients", first.distortion[:, None])
+            + storage_matrix("camera_matrix", first.matrix)
+            + storage_matrix("distortion_coefficients", first.distortion[:, None])
         )
     if len(chain.cameras) > len(_MATRICES):
         raise _cannot("opencv", "one camera or two", f"{len(chain.cameras)}")
-    for camera in chain.cameras:
-        if (tuple(camera.size), camera.distortion_model) != (
-            tuple(first.size),
-            first.distortion_model,
-        ):
-            raise _cannot(
-                "opencv",
-                f"cameras of {first.size} pixels and {first.distortion_model}",
-                f"{camera.size} and {camera.distortion_model}",
-            )
+    alike, *others = (f"{one.size} pixels and {one.distortion_model}" for one in chain.cameras)
+    if any(one != alike for one in others):
+        raise _cannot("opencv", f"cameras of {alike}", others[0])
     motion = chain.transforms[0]
     return (
         head
         + "".join(
-            _opencv_matrix(matrix, camera.matrix)
-            + _opencv_matrix(coefficients, camera.distortion[None])
+            storage_matrix(matrix, camera.matrix)
+            + storage_matrix(coefficients, camera.distortion[None])
             for camera, (matrix, coefficients) in zip(chain.cameras, _MATRICES, strict=True)
         )
-        + _opencv_matrix("R", motion.rotation)
-        + _opencv_matrix("T", motion.translation[:, None])
+        + storage_matrix("R", motion.rotation)
+        + storage_matrix("T", motion.translation[:, None])
     )
 
 
-def _opencv_matrix(name: str, matrix: Array) -> str:
-    return (
-        f"{name}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}\n"
-        f"   dt: d\n   data: {_flow(matrix.ravel())}\n"
-    )
+def parse_opencv(
+    text: str, size: tuple[int, int] | None = None, extrinsics: str = ""
+) -> Measured[CameraChain]:
+    """Return the cameras of a file of OpenCV's calibration samples and tutorials, YAML or XML.
 
-
-def parse_opencv(text: str) -> CameraChain:
-    """Return the cameras of a file of OpenCV's calibration samples.
-
-    Where it does not name the model, four or five coefficients are ``plumb_bob``, eight are
-    ``rational_polynomial``, and four with ``fisheye_model: 1`` are ``equidistant``.
+    Names are the same in whatever case, with or without ``_``. Where the file does not name the
+    model, coefficients beyond the fifth that are not 0 make it ``rational_polynomial``, and eight
+    of them; else it is ``plumb_bob``, and ``equidistant`` with ``fisheye_model: 1``.
+    ``extrinsics``: the text of the file with R and T.
 
     Raises:
-        CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``, ``SHAPE``.
+        CalibrationError: ``MALFORMED``, ``NOT_FINITE``, ``NOT_RIGID``, ``SHAPE``, ``WRONG_SIZE``.
         MissingExtraError: PyYAML is not installed.
     """
-    data = mapping(load_yaml(text), "file", ["image_width", "image_height"])
-    size = _size(data)
-    if "camera_matrix" in data or "M1" not in data:
-        keys = ("camera_matrix", "distortion_coefficients")
-        return CameraChain(cameras=(_opencv_camera(data, size, keys),), names=("camera",))
-    cameras = [_opencv_camera(data, size, keys) for keys in _MATRICES]
-    mapping(data, "file", ["R", "T"])
-    rotation = _matrix(data["R"], "R", (3, 3))
-    shift = _matrix(data["T"], "T").ravel()
+    data = _normal(load_storage(text))
+    if extrinsics:
+        data = {**_normal(load_storage(extrinsics)), **data}
+    sides = next((ends for ends in _ENDS if _has(data, _MATRIX, ends[0])), None)
+    said = [data[key] for key in ("imagewidth", "imageheight") if key in data]
+    whole = _first(data, ("imagesize", "size"), "", [])
+    size = _size(said or sequence(whole, "image_size"), size)
+    if sides is None:
+        camera = _opencv_camera(data, size, "")
+        return Measured(CameraChain(cameras=(camera,), names=("camera",)), "m")
+    cameras = tuple(_opencv_camera(data, size, end) for end in sides)
+    if not {"r", "t"} <= data.keys():
+        raise malformed(
+            "file",
+            "R and T from the first camera to the second; where they are in a file of their own, "
+            'as OpenCV\'s extrinsics.yml, give it as extrinsics="extrinsics.yml"',
+            ", ".join(data),
+        )
+    rotation, shift = stored_matrix(data["r"], "R", (3, 3)), stored_matrix(data["t"], "T").ravel()
     if len(shift) != 3:
         raise malformed("T", "3 numbers", str(len(shift)))
-    rows = [*np.column_stack([rotation, shift]).tolist(), [0.0, 0.0, 0.0, 1.0]]
+    rows = [*np.column_stack([rotation, shift]), [0.0, 0.0, 0.0, 1.0]]
     motion = rigid("right", "left", rows, "R")
-    return CameraChain(cameras=tuple(cameras), transforms=(motion,), names=("left", "right"))
+    chain = CameraChain(cameras=cameras, transforms=(motion,), names=("left", "right"))
+    return Measured(chain, data.get("unit"))
 
 
-def _opencv_camera(
-    data: dict[str, Plain], size: tuple[int, int], keys: Sequence[str]
-) -> CameraModel:
-    mapping(data, "file", keys)
-    matrix = _matrix(data[keys[0]], keys[0], (3, 3))
-    coefficients = _matrix(data[keys[1]], keys[1]).ravel()
-    said = data.get("distortion_model")
+_MATRIX: Final = ("cameramatrix", "intrinsicmatrix", "k", "m")
+_BENT: Final = ("distortioncoefficients", "distcoeffs", "distcoeff", "distcoefs", "distortion", "d")
+_ENDS: Final = (("1", "2"), ("left", "right"), ("l", "r"))
+"""Names of a camera's matrix and coefficients in files of OpenCV, and what tells two cameras."""
+
+
+def _normal(data: Plain) -> dict[str, Plain]:
+    """Return a mapping with its names in lower case and without ``_``."""
+    found: dict[str, Plain] = {}
+    for name, value in mapping(data, "file").items():
+        key = name.lower().replace("_", "")
+        if key in found:
+            raise malformed("file", "each name once", name)
+        found[key] = value
+    return found
+
+
+def _has(data: dict[str, Plain], names: Sequence[str], end: str) -> bool:
+    return any(f"{name}{end}" in data for name in names)
+
+
+def _first(data: dict[str, Plain], names: Sequence[str], end: str, other: Plain = None) -> Plain:
+    """Return the value of the first name that is there."""
+    return next((data[f"{name}{end}"] for name in names if f"{name}{end}" in data), other)
+
+
+def _opencv_camera(data: dict[str, Plain], size: tuple[int, int], end: str) -> CameraModel:
+    for names in (_MATRIX, _BENT):
+        if not _has(data, names, end):
+            expected = f"{names[0]}{end} (or {', '.join(f'{one}{end}' for one in names[1:])})"
+            raise malformed("file", expected, ", ".join(data))
+    matrix = stored_matrix(_first(data, _MATRIX, end), f"camera matrix {end}".rstrip(), (3, 3))
+    coefficients = stored_matrix(_first(data, _BENT, end), f"coefficients {end}".rstrip()).ravel()
+    said = data.get("distortionmodel")
     if said is None:
-        by_count: dict[int, DistortionModel] = {8: "rational_polynomial"}
-        fisheye = data.get("fisheye_model") == "1"
-        said = "equidistant" if fisheye else by_count.get(len(coefficients), "plumb_bob")
+        many = len(coefficients) == 8 or coefficients[5:].any()
+        said = "rational_polynomial" if many else "plumb_bob"
+        if data.get("fisheyemodel") == "1":
+            said = "equidistant"
     return _camera(size, matrix, coefficients, _model(said, coefficients))
 
 
@@ -423,58 +435,77 @@ def _opencv_camera(
 
 
 def _form(
-    name: CameraForm, compose: Callable[[CameraChain], str], parse: Callable[[str], CameraChain]
+    name: CameraForm,
+    parse: Callable[..., CameraChain | Measured[CameraChain]],
+    compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    return Format(title=name, suffix=".yaml", parse=named(parse), compose=compose, most=MAX_FILE)
+    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE)
+
+
+def _foreign(
+    name: CameraForm,
+    parse: Callable[[str], foreign.Found],
+    compose: Callable[[CameraChain], str] | None = None,
+) -> Format[CameraChain]:
+    """Return a format whose parser knows no cameras of ours."""
+
+    def read(
+        text: str, given: tuple[int, int] | None = None
+    ) -> CameraChain | Measured[CameraChain]:
+        lenses, transforms, unit = parse(text)
+        if not 1 <= len(lenses) <= foreign.MAX_CAMERAS:
+            raise malformed("file", f"1 to {foreign.MAX_CAMERAS} cameras", str(len(lenses)))
+        if len(transforms) != len(lenses) - 1:
+            raise malformed("file", "one camera, since it has no poses", str(len(lenses)))
+        cameras = []
+        for lens in lenses:
+            matrix, size = lens_matrix(*lens.focal), _size(lens.size or [], given)
+            cameras.append(_camera(size, matrix, np.array(lens.coefficients), lens.model))
+        names = tuple(lens.name for lens in lenses)
+        chain = CameraChain(cameras=tuple(cameras), transforms=tuple(transforms), names=names)
+        return chain if unit == foreign.BY_FORMAT else Measured(chain, unit)
+
+    return _form(name, read, compose)
 
 
 FORMS: Final[Mapping[str, Format[CameraChain]]] = {
-    "camera_info": _form("camera_info", _compose_one, _parse_one),
-    "kalibr": _form("kalibr", compose_camchain, parse_camchain),
-    "opencv": _form("opencv", compose_opencv, parse_opencv),
+    "camera_info": _form("camera_info", _parse_one, _compose_one),
+    "kalibr": _foreign("kalibr", foreign.parse_camchain, compose_camchain),
+    "opencv": _form("opencv", parse_opencv, compose_opencv),
+    "ros_ini": _foreign("ros_ini", foreign.parse_ros_ini),
+    "euroc": _foreign("euroc", foreign.parse_euroc),
+    "mrcal": _foreign("mrcal", foreign.parse_mrcal),
+    "colmap": _foreign("colmap", foreign.parse_colmap),
+    "basalt": _foreign("basalt", foreign.parse_basalt),
+    "multical": _foreign("multical", foreign.parse_multical),
 }
 """The formats by their names."""
 
 
 def _cannot(form: str, expected: str, got: str) -> CalibrationError:
-    return CalibrationError(
-        f"{form}: expected {expected}, which is all it can hold, got {got}",
-        code=Code.SHAPE,
-        expected=expected,
-        got=got,
+    return Code.SHAPE.unexpected(
+        f"{form}: expected {expected}, which is all it can hold", expected, got
     )
 
 
-def _flow(values: Sequence[float] | Array) -> str:
-    return "[ {} ]".format(", ".join(real(float(value)) for value in values))
-
-
-def _numbers(value: Plain, where: str, count: int) -> list[float]:
-    return [number(one, where) for one in sequence(value, where, count)]
-
-
-def _matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
-    """Return a matrix of rows, cols and data; None: of any shape."""
-    data = mapping(value, where, ["rows", "cols", "data"])
-    rows, cols = (_side(data[key], f"{where}.{key}", least=0) for key in ("rows", "cols"))
-    if shape not in {None, (rows, cols)}:
-        raise malformed(where, f"{shape} rows and cols", f"{rows}, {cols}")
-    values = [number(one, where) for one in sequence(data["data"], where)]
-    if len(values) != rows * cols:
-        raise malformed(where, f"{rows * cols} numbers for {rows} x {cols}", str(len(values)))
-    return np.array(values, dtype=np.float64).reshape(rows, cols)
-
-
-def _side(value: Plain, where: str, least: int = 1) -> int:
-    if not (isinstance(value, str) and value.isdecimal() and len(value) < 8):
-        raise malformed(where, "a whole number", value)
-    if not least <= int(value) <= MAX_SIDE:
-        raise malformed(where, f"{least} to {MAX_SIDE}", value)
-    return int(value)
-
-
-def _size(data: dict[str, Plain]) -> tuple[int, int]:
-    return _side(data["image_width"], "image_width"), _side(data["image_height"], "image_height")
+def _size(said: Sequence[Plain], given: tuple[int, int] | None) -> tuple[int, int]:
+    """Return width and height, pixels, of what a file says and what the user gives."""
+    if not said:
+        if given is None:
+            raise Code.WRONG_SIZE.refusal(
+                "file: expected width and height of the images, which it does not say; give them "
+                "as size=(width, height), pixels",
+                "size=(width, height)",
+            )
+        return int(given[0]), int(given[1])
+    width, height = (whole(one, "size of the images") for one in sequence([*said], "size", 2))
+    if given is not None and (width, height) != tuple(given):
+        raise Code.WRONG_SIZE.refusal(
+            f"size: the file says {width} x {height}, got {given[0]} x {given[1]}",
+            (width, height),
+            tuple(given),
+        )
+    return width, height
 
 
 def _model(said: Plain, coefficients: Array) -> DistortionModel:

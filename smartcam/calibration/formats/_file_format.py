@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+
+import numpy as np
 
 from smartcam.calibration._files.store import replace_file
+from smartcam.calibration._units import check_length, metres_of, no_unit
 from smartcam.calibration.formats._plain import malformed
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
 
 if TYPE_CHECKING:
     import os
@@ -26,23 +31,40 @@ MAX_FILE = 1 << 24
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
+class Measured(Generic[T]):
+    """A value of a file whose format leaves the unit of lengths open."""
+
+    value: T
+    unit: str | None = None  # what the file itself says
+
+
+@dataclass(frozen=True, slots=True)
 class Format(Generic[T]):
     """One format."""
 
     title: str  # what it is
     suffix: str  # what its files' names end in
-    # makes a value of a text and the names of target and source, which formats without names of
-    # frames use; errors are those of :func:`~smartcam.calibration.formats.read_transform`
-    parse: Callable[[str, str, str], T]
+    # makes a value of a text and of what else is given: of cameras their size, else the names of
+    # target and source where the format has none; Measured where lengths may be in any unit, else
+    # metres; errors are those of :func:`~smartcam.calibration.formats.read_transform`
+    parse: Callable[..., T | Measured[T]]
     # makes a text of a value, without ``head``; errors are those of
     # :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
-    compose: Callable[[T], str]
+    compose: Callable[[T], str] | None = None  # None: it is only read
     head: str = ""  # what the file begins with
     most: int = MAX_TEXT  # bytes of a file at most
 
-    def read(self, path: str | os.PathLike[str], target: str = "", source: str = "") -> T:
-        """Read a file; errors are those of ``parse``."""
+    def read(
+        self,
+        path: str | os.PathLike[str],
+        *given: Any,
+        unit: str | None = None,
+    ) -> T:
+        """Read a file; errors are those of ``parse``, and UNIT_UNKNOWN.
+
+        ``unit``: of its lengths; None for what the file or its format says.
+        """
         with Path(path).open("rb") as stream:
             body = stream.read(self.most + 1)
         try:
@@ -52,17 +74,62 @@ class Format(Generic[T]):
                 text = body.decode("utf-8-sig")
             except UnicodeDecodeError as exc:
                 raise malformed("file", f"UTF-8 ({exc.reason} at byte {exc.start})") from exc
-            return self.parse(text, target, source)
+            return self._in_metres(self.parse(text, *given), unit)
         except CalibrationError as exc:
             raise CalibrationError(
                 f"{path}: {self.title}: {exc}", code=exc.code, expected=exc.expected, got=exc.got
             ) from exc
 
+    def _in_metres(self, found: T | Measured[T], unit: str | None) -> T:
+        by_file = isinstance(found, Measured)
+        said = cast("Measured[T]", found).unit if by_file else "m"
+        value = cast("Measured[T]", found).value if by_file else cast("T", found)
+        motions = _motions(value)
+        if not motions:
+            return value
+        if unit is None and said is None:
+            raise no_unit("lengths")
+        factor = metres_of(unit or said or "m", "lengths")
+        if unit is None and not by_file:
+            for motion in motions:
+                distance = factor * float(np.linalg.norm(motion.translation))
+                check_length(distance, f"distance of {motion.source} from {motion.target}")
+        return value if factor == 1.0 else cast("T", _scaled(value, factor))
+
     def write(self, path: str | os.PathLike[str], value: T) -> None:
         """Write a file, whole or not at all; errors are those of ``compose``, and NOT_WRITTEN."""
-        replace_file(Path(path), (self.head + self.compose(value)).encode())
+        replace_file(Path(path), (self.head + self.text(value)).encode())
+
+    def text(self, value: T) -> str:
+        """Return a value as the format has it, without ``head``; UNKNOWN_FORMAT: only read."""
+        if self.compose is None:
+            raise Code.UNKNOWN_FORMAT.refusal(
+                f"{self.title}: expected a format that can be written, got one that is only read",
+                got=self.title,
+            )
+        return self.compose(value)
 
 
-def named(parse: Callable[[str], T]) -> Callable[[str, str, str], T]:
+def _motions(value: Any) -> list[Transform]:
+    """Return the motions of what a file holds: one, lists of them to any depth, or a chain's."""
+    if isinstance(value, Transform):
+        return [value]
+    if isinstance(value, (list, tuple)):
+        return [motion for one in value for motion in _motions(one)]
+    return _motions(getattr(value, "transforms", ()))
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    """Return the value that a file holds, with all translations multiplied by a factor."""
+    if isinstance(value, Transform):
+        return dataclasses.replace(value, translation=factor * value.translation)
+    if isinstance(value, tuple) and hasattr(value, "_replace"):
+        return type(value)(*(_scaled(one, factor) for one in value))
+    if isinstance(value, (list, tuple)):
+        return type(value)(_scaled(one, factor) for one in value)
+    return dataclasses.replace(value, transforms=_scaled(value.transforms, factor))
+
+
+def named(parse: Callable[[str], T | Measured[T]]) -> Callable[..., T | Measured[T]]:
     """Return a parser for a format that names its frames, or has none to name."""
-    return lambda text, _target, _source: parse(text)
+    return lambda text, *_names: parse(text)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration.formats._plain import (
     POSE,
     Plain,
@@ -23,12 +22,15 @@ from smartcam.calibration.formats._plain import (
     malformed,
     mapping,
     numbers,
+    placed,
     quoted,
     row,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from smartcam.geometry import Transform
 
 _ROBOT = {False: "robot_base_frame", True: "robot_effector_frame"}
 _TYPES = {"eye_on_base": False, "eye_in_hand": True}
@@ -64,7 +66,7 @@ def _camera(parameters: Mapping[str, Plain], pose: list[float], *, in_hand: bool
         frame_name(names[key], f"parameters.{key}")
         for key in (_ROBOT[in_hand], "tracking_base_frame")
     )
-    return Transform.from_quaternion(robot, camera, pose[:3], pose[3:])
+    return placed(robot, camera, pose)
 
 
 def compose_easy_handeye(transform: Transform, *, in_hand: bool = False) -> str:

@@ -8,39 +8,45 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
 from smartcam.calibration._lens.comparison import Lens
 from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
 from smartcam.calibration._stereo.calibration import StereoCalibration
 from smartcam.calibration.formats._cameras import read_cameras
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Mapping
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration.formats._cameras import CameraChain, CameraForm
+    from smartcam.calibration._units import LengthUnit
+    from smartcam.calibration.formats._cameras import CameraForm
+    from smartcam.geometry import Transform
 
 HEAD: Final = 1 << 16
 """Bytes of a file by which its format is told."""
 
 MARKS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
-    "opencv": re.compile(rb"\A\s*%YAML"),
+    "euroc": re.compile(rb"^sensor_type\s*:\s*camera", re.MULTILINE),
     "kalibr": re.compile(rb"^cam0\s*:", re.MULTILINE),
+    "mrcal": re.compile(rb"LENSMODEL_"),
+    "basalt": re.compile(rb'\A\s*{\s*"value0"'),
+    "multical": re.compile(rb'\A\s*{\s*"cameras"'),
+    "colmap": re.compile(rb"^\d+ [A-Z_]+ \d+ \d+ [\d.]", re.MULTILINE),
+    "ros_ini": re.compile(rb"^camera matrix\s*$", re.MULTILINE),
+    "opencv": re.compile(rb"\A\s*(?:%YAML|<\?xml|<opencv_storage)"),
     "camera_info": re.compile(rb"^camera_matrix\s*:", re.MULTILINE),
 }
-"""What tells the formats of other programs apart; ours begin with a brace."""
+"""Signs that tell the formats of other programs apart."""
 
 
 class StoredLenses(NamedTuple):
     """Lenses of a file.
 
     Attributes:
-        names: of the cameras.
-        lenses: as much of each as the file has.
+        names: names of the cameras.
+        lenses: lens of each camera, as much of it as the file has.
         transforms: ``T_1_0``, ... between neighbours; none of a single camera.
     """
 
@@ -49,11 +55,16 @@ class StoredLenses(NamedTuple):
     transforms: tuple[Transform, ...] = ()
 
 
-def read_lenses(path: str | os.PathLike[str]) -> StoredLenses:
+def read_lenses(
+    path: str | os.PathLike[str],
+    *,
+    size: tuple[int, int] | None = None,
+    unit: LengthUnit | None = None,
+) -> StoredLenses:
     """Return the lenses of a file; its content tells the format.
 
-    It may be a calibration of a lens, of a pair or of a camera on a robot, a ``camera_info``, a
-    camchain of Kalibr, or a file of OpenCV.
+    It may be a calibration of a lens, of a pair or of a camera on a robot, or of a format of
+    :func:`read_cameras`, which says what ``size`` and ``unit`` are.
 
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``: none of these; ``WRONG_KIND``: a calibration without a
@@ -63,21 +74,18 @@ def read_lenses(path: str | os.PathLike[str]) -> StoredLenses:
     """
     with Path(path).open("rb") as stream:
         head = stream.read(HEAD)
-    if head.lstrip().startswith(b"{"):
-        return _ours(path)
     for form, mark in MARKS.items():
         if mark.search(head):
-            return _of_chain(read_cameras(path, form))
-    raise CalibrationError(
+            found = read_cameras(path, form, size=size, unit=unit)
+            lenses = tuple(Lens(one) for one in found.cameras)
+            return StoredLenses(found.names, lenses, found.transforms)
+    if head.lstrip().startswith(b"{"):
+        return _ours(path)
+    raise Code.UNKNOWN_FORMAT.refusal(
         f"{path}: expected a calibration of smartcam, or one of {', '.join(MARKS)}; got none of "
         "them",
-        code=Code.UNKNOWN_FORMAT,
-        expected=list(MARKS),
+        list(MARKS),
     )
-
-
-def _of_chain(chain: CameraChain) -> StoredLenses:
-    return StoredLenses(chain.names, tuple(Lens(one) for one in chain.cameras), chain.transforms)
 
 
 def _of_pair(pair: StereoCalibration) -> StoredLenses:
@@ -122,9 +130,8 @@ def _ours(path: str | os.PathLike[str]) -> StoredLenses:
         found = _of_robot(HandEyeCalibration.from_data(document.data))
         if found is not None:
             return found
-    raise CalibrationError(
+    raise Code.WRONG_KIND.refusal(
         f"{path}: holds {document.kind!r}, expected a calibration that has a lens",
-        code=Code.WRONG_KIND,
-        expected="a calibration that has a lens",
-        got=document.kind,
+        "a calibration that has a lens",
+        document.kind,
     )

@@ -10,29 +10,40 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam.calibration.formats._file_format import Measured
 from smartcam.calibration.formats._plain import (
     Plain,
+    flow,
     frame_name,
     load_yaml,
     malformed,
     mapping,
     matrix_rows,
-    number,
     quoted,
     real,
     rigid,
-    sequence,
+    stored_matrix,
 )
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration.formats._xml import load_xml, storage_data
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
 
 HEAD = "%YAML:1.0\n---\n"
 """Beginning of OpenCV's files; its readers want ``%YAML`` there."""
+
+
+def load_storage(text: str) -> Plain:
+    """Return the data of a file of ``cv2.FileStorage``, YAML or XML."""
+    if not text.lstrip().startswith("<"):
+        return load_yaml(text)
+    root = load_xml(text.strip())
+    if root.kind != "opencv_storage":
+        raise malformed("file", "<opencv_storage>", f"<{root.kind}>")
+    return storage_data(root)
 
 
 class PlaneMatrix(NamedTuple):
@@ -88,43 +99,35 @@ def parse_matrix(text: str) -> PlaneMatrix:
     for name in names:
         if not isinstance(data[name], str):
             raise malformed(name, "a text", data[name])
-    matrix = _matrix(data, "matrix", (4, 3))
+    matrix = stored_matrix(data, "matrix", (4, 3))
     if np.linalg.matrix_rank(matrix) < 3:
-        raise CalibrationError(
-            f"matrix: expected one of rank 3, got {matrix.tolist()}",
-            code=Code.COLLINEAR,
-            got=matrix.tolist(),
-        )
+        raise Code.COLLINEAR.unexpected("matrix: expected one of rank 3", got=matrix.tolist())
     return PlaneMatrix(matrix, *(data[name] for name in names))
 
 
-def _matrix(value: Plain, where: str, shape: tuple[int, int]) -> Array:
-    data = mapping(value, where, ["rows", "cols", "data"])
-    said = data["rows"], data["cols"]
-    if said != (str(shape[0]), str(shape[1])):
-        raise malformed(where, f"{shape[0]} rows and {shape[1]} cols", " ".join(map(str, said)))
-    read = [number(one, where) for one in sequence(data["data"], where, shape[0] * shape[1])]
-    return np.array(read).reshape(shape)
+def storage_matrix(name: str, matrix: Array) -> str:
+    """Return a matrix as ``cv2.FileStorage`` has it under a name."""
+    return (
+        f"{name}: !!opencv-matrix\n   rows: {matrix.shape[0]}\n   cols: {matrix.shape[1]}\n"
+        f"   dt: d\n   data: {flow(matrix.ravel())}\n"
+    )
 
 
 def compose_transform(transform: Transform) -> str:
     """Return a transform as a (4, 4) ``!!opencv-matrix``, without :data:`HEAD`."""
-    rows = matrix_rows(transform)
-    values = ",\n       ".join(", ".join(real(value) for value in row) for row in rows)
     return (
         f"target: {quoted(frame_name(transform.target, 'target'))}\n"
         f"source: {quoted(frame_name(transform.source, 'source'))}\n"
-        "transform: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: d\n"
-        f"   data: [ {values} ]\n"
+        'unit: "m"\n' + storage_matrix("transform", np.array(matrix_rows(transform)))
     )
 
 
-def parse_transform(text: str, target: str, source: str) -> Transform:
+def parse_transform(text: str, target: str, source: str) -> Measured[Transform]:
     """Return the one (4, 4) matrix of a file of OpenCV, of any name.
 
     ``target`` and ``source`` are the frames where the file does not say them.
     """
-    data = mapping(load_yaml(text), "file")
+    data = mapping(load_storage(text), "file")
     names = [
         name
         for name, one in data.items()
@@ -132,9 +135,9 @@ def parse_transform(text: str, target: str, source: str) -> Transform:
     ]
     if len(names) != 1:
         raise malformed("file", "one matrix of 4 rows and 4 cols", ", ".join(names) or "none")
-    rows = _matrix(data[names[0]], names[0], (4, 4)).tolist()
+    rows = stored_matrix(data[names[0]], names[0], (4, 4))
     frames = [
         frame_name(data.get(key, given), key)
         for key, given in (("target", target), ("source", source))
     ]
-    return rigid(frames[0], frames[1], rows, names[0])
+    return Measured(rigid(frames[0], frames[1], rows, names[0]), data.get("unit"))

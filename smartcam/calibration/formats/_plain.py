@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
 from smartcam.exceptions import CalibrationError
-from smartcam.layout._yamls import BadYamlError, compose
+from smartcam.geometry import Code, Transform
+from smartcam.layout._inside import BadYamlError, compose
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 T = TypeVar("T")
 
@@ -39,6 +38,9 @@ MAX_DEPTH = 16
 MAX_NUMBER = 1e9
 """Largest number of a pose, metres or what it is in: farther off is no robot, and its square is
 still a number."""
+
+MAX_SIDE = 1_000_000
+"""Pixels of an image's side at most, and rows or columns of a matrix."""
 
 _MAX_NAME = 255
 _MAX_SHOWN = 64
@@ -56,17 +58,21 @@ def malformed(what: str, expected: str, got: object = None) -> CalibrationError:
     """Return the error for a text that is not what its format says; ``got`` is shown cut."""
     shown = None if got is None else _cut(got)
     text = f"{what}: expected {expected}" + ("" if shown is None else f", got {shown}")
-    return CalibrationError(text, code=Code.MALFORMED, expected=expected, got=shown)
+    return Code.MALFORMED.refusal(text, expected, shown)
+
+
+def within(where: str, error: CalibrationError) -> CalibrationError:
+    """Return an error that says where in a file it was."""
+    return CalibrationError(
+        f"{where}: {error}", code=error.code, expected=error.expected, got=error.got
+    )
 
 
 def known(table: Mapping[str, T], name: str, what: str = "format") -> T:
     """Return a table's value for a name (``UNKNOWN_FORMAT``)."""
     if not isinstance(name, str) or name not in table:
-        raise CalibrationError(
-            f"no {what} is called {name!r}; expected one of {', '.join(table)}",
-            code=Code.UNKNOWN_FORMAT,
-            expected=list(table),
-            got=name,
+        raise Code.UNKNOWN_FORMAT.refusal(
+            f"no {what} is called {name!r}; expected one of {', '.join(table)}", list(table), name
         )
     return table[name]
 
@@ -155,13 +161,46 @@ def number(value: Plain, where: str) -> float:
     if read is None:
         raise malformed(where, "a number", value)
     if not abs(read) <= MAX_NUMBER:
-        raise CalibrationError(
+        raise Code.NOT_FINITE.refusal(
             f"{where}: expected a number of at most {MAX_NUMBER:g}, got {_cut(text)}",
-            code=Code.NOT_FINITE,
-            expected=MAX_NUMBER,
-            got=text,
+            MAX_NUMBER,
+            text,
         )
     return read
+
+
+def reals(value: Plain, where: str, count: int | None = None) -> list[float]:
+    """Return the numbers of a list, of ``count`` if that is given."""
+    return [number(one, where) for one in sequence(value, where, count)]
+
+
+def matrix_of(value: Plain, where: str, shape: tuple[int, int]) -> Array:
+    """Return a matrix that stands as a list of rows."""
+    rows = sequence(value, where, shape[0])
+    return np.array([reals(one, where, shape[1]) for one in rows]).reshape(shape)
+
+
+def stored_matrix(value: Plain, where: str, shape: tuple[int, int] | None = None) -> Array:
+    """Return a matrix that stands as ``rows``, ``cols`` and ``data``; without ``shape`` any."""
+    data = mapping(value, where, ["rows", "cols", "data"])
+    rows, cols = (whole(data[key], f"{where}.{key}", 0) for key in ("rows", "cols"))
+    if shape is not None and shape != (rows, cols):
+        raise malformed(where, f"{shape[0]} rows and {shape[1]} cols", f"{rows} {cols}")
+    return np.array(reals(data["data"], where, rows * cols)).reshape(rows, cols)
+
+
+def whole(value: Plain, where: str, least: int = 1) -> int:
+    """Return a whole number of pixels, rows or columns."""
+    if not (isinstance(value, str) and value.isdecimal() and len(value) < 8):
+        raise malformed(where, "a whole number", value)
+    if not least <= int(value) <= MAX_SIDE:
+        raise malformed(where, f"{least} to {MAX_SIDE}", value)
+    return int(value)
+
+
+def lens_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Return a lens' (3, 3) matrix."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def numbers(value: Plain, where: str, keys: Sequence[str]) -> list[float]:
@@ -190,16 +229,17 @@ def frame_name(value: Plain, where: str) -> str:
     command line.
     """
     if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):
-        raise CalibrationError(
-            f"{where}: expected a frame's name of letters, digits and _ . / + -, got {_cut(value)}",
-            code=Code.BAD_NAME,
-            expected=_NAME.pattern,
-            got=_cut(value),
+        raise Code.BAD_NAME.unexpected(
+            f"{where}: expected a frame's name of letters, digits and _ . / + -",
+            _NAME.pattern,
+            _cut(value),
         )
     return value
 
 
-def rigid(target: str, source: str, rows: Sequence[Sequence[float]], where: str) -> Transform:
+def rigid(
+    target: str, source: str, rows: Sequence[Sequence[float]] | Array, where: str
+) -> Transform:
     """Return the transform of a (4, 4) matrix; its rotation may be printed with few decimals.
 
     Raises ``MALFORMED``: its last row; ``NOT_RIGID``: it is no rotation.
@@ -217,6 +257,11 @@ def rigid(target: str, source: str, rows: Sequence[Sequence[float]], where: str)
 def _nearest_rotation(matrix: Array) -> Array:
     left, _, right = np.linalg.svd(matrix)
     return np.asarray(left @ right, dtype=np.float64)  # a reflection stays one, and is refused
+
+
+def placed(target: str, source: str, pose: Sequence[float]) -> Transform:
+    """Return the transform of the numbers of :data:`POSE`."""
+    return Transform.from_quaternion(target, source, pose[:3], pose[3:])
 
 
 def row(transform: Transform) -> list[float]:
@@ -245,6 +290,11 @@ def real(value: float) -> str:
         return mantissa
     sign = "" if exponent.startswith("-") else "+"
     return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}e{sign}{exponent.lstrip('+')}"
+
+
+def flow(values: Sequence[float] | Array) -> str:
+    """Return a YAML list of numbers in one line."""
+    return "[ {} ]".format(", ".join(real(float(value)) for value in values))
 
 
 def block(values: Mapping[str, float], indent: str = "") -> str:

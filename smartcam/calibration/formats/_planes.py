@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
 
 if TYPE_CHECKING:
     from smartcam.calibration._plane.calibration import PlaneCalibration
@@ -36,7 +34,7 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
 
     Args:
         calibration: a rigid one, a similarity, or one of touches.
-        name: of the frame, where the calibration has no ``camera_frame``.
+        name: name of the frame, where the calibration has no ``camera_frame``.
 
     Raises:
         CalibrationError: ``NOT_SIMILAR``: an affine map or a homography, which is no frame: its
@@ -49,13 +47,12 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
     shear = float(np.abs(inner - square * np.eye(2)).max()) / square
     bend = float(np.abs(matrix[3, :2]).max()) * calibration.place.camera_size
     if max(shear, bend) > _SIMILAR:
-        raise CalibrationError(
+        raise Code.NOT_SIMILAR.refusal(
             f"{calibration.model}: expected one scale for the whole plane, got axes that differ by "
             f"{shear:.2g} and a scale that changes by {bend:.2g} over the points: no rigid frame "
             "says this; export the matrix, or fit a similarity",
-            code=Code.NOT_SIMILAR,
-            expected="similarity",
-            got=calibration.model,
+            "similarity",
+            calibration.model,
         )
     source = calibration.camera_frame or name
     transform = Transform(calibration.robot_frame, source, calibration.rotation, calibration.origin)

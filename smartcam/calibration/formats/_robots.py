@@ -21,18 +21,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rotations import as_vector, matrix_from_quaternion
+from smartcam.calibration._units import check_angles, check_length, metres_of
 from smartcam.calibration.formats._plain import MAX_NUMBER, known
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
+from smartcam.geometry._inside import as_vector, matrix_from_quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.calibration._units import LengthUnit
+    from smartcam.geometry._inside import Array
 
 _UNIT: Final = 0.01
 """Largest deviation of a quaternion's length from one; it is made one."""
@@ -63,31 +63,6 @@ def angles_zyx(rotation: Array) -> tuple[float, float, float]:
     return z, math.atan2(-r[2][0], cz * r[0][0] + sz * r[1][0]), x
 
 
-def _from_zyx(angles: Array) -> Array:
-    return rotation_zyx(*np.radians(angles).tolist())
-
-
-def _to_zyx(pose: Transform) -> list[float]:
-    return [math.degrees(angle) for angle in angles_zyx(pose.rotation)]
-
-
-def _from_wpr(angles: Array) -> Array:
-    return _from_zyx(angles[::-1])
-
-
-def _to_wpr(pose: Transform) -> list[float]:
-    return _to_zyx(pose)[::-1]
-
-
-def _from_mobile_xyz(angles: Array) -> Array:
-    # Rx(a) Ry(b) Rz(c) undoes Rz(-c) Ry(-b) Rx(-a)
-    return rotation_zyx(*np.radians(-angles[::-1]).tolist()).T
-
-
-def _to_mobile_xyz(pose: Transform) -> list[float]:
-    return [-math.degrees(angle) for angle in reversed(angles_zyx(pose.rotation.T))]
-
-
 def _from_vector(vector: Array) -> Array:
     angle = float(np.linalg.norm(vector))
     share = math.sin(0.5 * angle) / angle if angle > 0 else 0.5
@@ -104,31 +79,47 @@ def _to_vector(pose: Transform) -> list[float]:
 def _from_xyzw(quaternion: Array) -> Array:
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) < _UNIT:
-        raise CalibrationError(
+        raise Code.NOT_RIGID.refusal(
             f"expected a quaternion of length 1, got {quaternion.tolist()} of length {length:.6g}",
-            code=Code.NOT_RIGID,
-            expected=1.0,
-            got=length,
+            1.0,
+            length,
         )
     return matrix_from_quaternion(quaternion / length)
 
 
-def _to_xyzw(pose: Transform) -> list[float]:
-    quaternion: list[float] = pose.quaternion.tolist()
-    return quaternion
+def _shifted(places: int) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
+    """Return the two ways of a quaternion whose real part is moved to the front by a place."""
+    return (
+        lambda given: _from_xyzw(np.roll(given, -places)),
+        lambda pose: list(map(float, np.roll(pose.quaternion, places))),
+    )
 
 
-def _from_wxyz(quaternion: Array) -> Array:
-    return _from_xyzw(np.roll(quaternion, -1))
+def _angles(
+    signs: int, order: slice
+) -> tuple[Callable[[Array], Array], Callable[[Transform], list[float]]]:
+    """Return the two ways of angles in degrees about z, y and x, in an order.
+
+    With ``signs`` of -1 they are about the axes that turn along, x first: Rx(a) Ry(b) Rz(c) undoes
+    Rz(-c) Ry(-b) Rx(-a).
+    """
+    return (
+        lambda given: _turned(
+            rotation_zyx(*(math.radians(signs * one) for one in given.tolist()[order])), signs
+        ),
+        lambda pose: [
+            signs * math.degrees(one)
+            for one in list(angles_zyx(_turned(pose.rotation, signs)))[order]
+        ],
+    )
 
 
-def _to_wxyz(pose: Transform) -> list[float]:
-    quaternion: list[float] = np.roll(pose.quaternion, 1).tolist()
-    return quaternion
+def _turned(rotation: Array, signs: int) -> Array:
+    return rotation if signs > 0 else rotation.T
 
 
 class PoseConvention(NamedTuple):
-    """How poses are written."""
+    """The way in which a robot's poses are written."""
 
     numbers: tuple[str, ...]  # names of the numbers, in order
     metre: float  # how many of its units of length a metre has
@@ -143,27 +134,27 @@ ROBOTS: Mapping[str, PoseConvention] = {
         "rotation vector, rad: along the axis, as long as the angle",
     ),
     "abb": PoseConvention(
-        ("x", "y", "z", "q1", "q2", "q3", "q4"), 1000.0, _from_wxyz, _to_wxyz,
+        ("x", "y", "z", "q1", "q2", "q3", "q4"), 1000.0, *_shifted(1),
         "quaternion, its real part q1 first",
     ),
     "kuka": PoseConvention(
-        ("x", "y", "z", "a", "b", "c"), 1000.0, _from_zyx, _to_zyx,
+        ("x", "y", "z", "a", "b", "c"), 1000.0, *_angles(1, slice(None)),
         "degrees: Rz(a) Ry(b) Rx(c)",
     ),
     "fanuc": PoseConvention(
-        ("x", "y", "z", "w", "p", "r"), 1000.0, _from_wpr, _to_wpr,
+        ("x", "y", "z", "w", "p", "r"), 1000.0, *_angles(1, slice(None, None, -1)),
         "degrees: Rz(r) Ry(p) Rx(w)",
     ),
     "meca500": PoseConvention(
-        ("x", "y", "z", "alpha", "beta", "gamma"), 1000.0, _from_mobile_xyz, _to_mobile_xyz,
+        ("x", "y", "z", "alpha", "beta", "gamma"), 1000.0, *_angles(-1, slice(None, None, -1)),
         "degrees, mobile XYZ: Rx(alpha) Ry(beta) Rz(gamma)",
     ),
     "xyzw": PoseConvention(
-        ("x", "y", "z", "qx", "qy", "qz", "qw"), 1.0, _from_xyzw, _to_xyzw,
+        ("x", "y", "z", "qx", "qy", "qz", "qw"), 1.0, *_shifted(0),
         "quaternion, its real part last",
     ),
     "wxyz": PoseConvention(
-        ("x", "y", "z", "qw", "qx", "qy", "qz"), 1.0, _from_wxyz, _to_wxyz,
+        ("x", "y", "z", "qw", "qx", "qy", "qz"), 1.0, *_shifted(1),
         "quaternion, its real part first",
     ),
 }  # fmt: skip
@@ -172,15 +163,21 @@ ROBOTS: Mapping[str, PoseConvention] = {
 
 
 def pose_from(
-    robot: str, values: ArrayLike, *, target: str = "base", source: str = "tool"
+    robot: str,
+    values: ArrayLike,
+    *,
+    target: str = "base",
+    source: str = "tool",
+    unit: LengthUnit | None = None,
 ) -> Transform:
     """Return a pose that a robot's controller shows.
 
     Args:
         robot: the convention, a key of :data:`ROBOTS`.
-        values: its numbers in their order, in its units.
+        values: numbers of the pose in the convention's order and units.
         target: name of the frame in which the pose is given.
         source: name of the frame whose pose it is.
+        unit: unit of the position; None for the controller's.
 
     Returns:
         ``T_target_source``, metres.
@@ -188,19 +185,24 @@ def pose_from(
     Raises:
         CalibrationError: ``UNKNOWN_FORMAT``: no such convention; ``SHAPE``: not as many numbers;
             ``NOT_FINITE``: NaN, infinity or beyond 1e9; ``NOT_RIGID``: a quaternion whose length is
-            more than 1 % off.
+            more than 1 % off; ``UNIT_UNKNOWN``: farther than 20 m without a ``unit``, or a rotation
+            vector of more than a turn.
     """
     convention = known(ROBOTS, robot, "robot's convention")
     what = f"pose of {robot} ({', '.join(convention.numbers)})"
     given = as_vector(values, len(convention.numbers), what)
     if not np.abs(given).max() <= MAX_NUMBER:
-        raise CalibrationError(
-            f"{what}: expected numbers of at most {MAX_NUMBER:g}, got {given.tolist()}",
-            code=Code.NOT_FINITE,
-            expected=MAX_NUMBER,
-            got=given.tolist(),
+        raise Code.NOT_FINITE.unexpected(
+            f"{what}: expected numbers of at most {MAX_NUMBER:g}", MAX_NUMBER, given.tolist()
         )
-    return Transform(target, source, convention.rotation(given[3:]), given[:3] / convention.metre)
+    if unit is None:
+        position = given[:3] / convention.metre
+        check_length(float(np.linalg.norm(position)), what)
+    else:
+        position = given[:3] * metres_of(unit, what)
+    if robot == "ur":
+        check_angles([float(np.linalg.norm(given[3:]))], what)
+    return Transform(target, source, convention.rotation(given[3:]), position)
 
 
 def pose_to(robot: str, pose: Transform) -> list[float]:

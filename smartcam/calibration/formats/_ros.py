@@ -12,13 +12,14 @@ Source: wiki.ros.org/tf, section 6.3; github.com/ros2/geometry2,
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration._units import check_angles
 from smartcam.calibration.formats._plain import (
     POSE,
     block,
@@ -28,9 +29,14 @@ from smartcam.calibration.formats._plain import (
     mapping,
     number,
     numbers,
+    placed,
+    reals,
     row,
+    sequence,
 )
 from smartcam.calibration.formats._robots import angles_zyx, rotation_zyx
+from smartcam.calibration.formats._xml import load_xml
+from smartcam.geometry import Transform
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,10 +45,7 @@ PERIOD_MS = 100
 """Period with which ``tf`` sends it; its documents call that a good value."""
 
 _COMMAND = "static_transform_publisher"
-# each stops where the next may begin, so none goes over a text more than once
-_REMARK = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
-_NODE = re.compile(r"<node\b[^<>]*>")
-_ATTRIBUTE = re.compile(r'\b([a-z]+)="([^"<>]*)"')
+_PYTHON = re.compile(r"^(?:from|import) [a-z]", re.MULTILINE)
 _QUATERNION = {"--qx": 0.0, "--qy": 0.0, "--qz": 0.0, "--qw": 1.0}
 _ANGLES = {"--yaw": 0.0, "--pitch": 0.0, "--roll": 0.0}
 _POSITION = {"--x": 0.0, "--y": 0.0, "--z": 0.0}
@@ -53,16 +56,23 @@ def parse_arguments(text: str) -> Transform:
     """Return the transform that ``static_transform_publisher`` would send.
 
     ``text``: its arguments, with the command in front of them or without; ``#`` begins a comment.
-    Or a launch file with one such node, as MoveIt's hand-eye calibration writes it. Raises
+    Or a launch file with one such node: XML of ROS 1 or 2, or ROS 2's Python, which is read as text
+    and not run. Raises
     ``MALFORMED``: another number of arguments, options that are none of its own, or arguments that
     can be meant in two ways.
     """
     if text.lstrip().startswith("<"):
         text = _from_launch(text)
+    elif _PYTHON.search(text):
+        return _from_words(_from_python(text))
     try:
         words = shlex.split(text, comments=True)
     except ValueError as exc:
         raise malformed("arguments", f"words as on a command line ({exc})") from exc
+    return _from_words(words)
+
+
+def _from_words(words: list[str]) -> Transform:
     if _COMMAND in words:
         words = words[words.index(_COMMAND) + 1 :]
     if any(word.startswith("--") for word in words):
@@ -72,11 +82,69 @@ def parse_arguments(text: str) -> Transform:
 
 def _from_launch(text: str) -> str:
     """Return the arguments of the one publisher in a launch file."""
-    nodes = [dict(_ATTRIBUTE.findall(one)) for one in _NODE.findall(_REMARK.sub("", text))]
-    found = [one["args"] for one in nodes if one.get("type") == _COMMAND and "args" in one]
+    nodes = [one.attributes for one in load_xml(text.strip()).all("node")]
+    found = [
+        one["args"]
+        for one in nodes
+        if _COMMAND in (one.get("type"), one.get("exec")) and "args" in one
+    ]
     if len(found) != 1:
         raise malformed("launch file", f"one node of type {_COMMAND}", str(len(found)))
-    return str(found[0])
+    return found[0]
+
+
+def _from_python(text: str) -> list[str]:
+    """Return the arguments of the one publisher in a launch file of Python, which is not run."""
+    try:
+        tree = ast.parse(text)
+    except (SyntaxError, ValueError, MemoryError, RecursionError) as exc:
+        raise malformed("launch file", f"Python ({exc})") from exc
+    calls = [
+        {one.arg: one.value for one in node.keywords}
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+    ]
+    found = [
+        one["arguments"]
+        for one in calls
+        if "arguments" in one
+        and isinstance(one.get("executable"), ast.Constant)
+        and getattr(one["executable"], "value", None) == _COMMAND
+    ]
+    if len(found) != 1:
+        raise malformed("launch file", f"one Node of executable {_COMMAND}", str(len(found)))
+    try:
+        words = ast.literal_eval(found[0])
+    except (ValueError, TypeError, MemoryError, RecursionError) as exc:
+        raise malformed("arguments", "texts and numbers, no variables or calls", "others") from exc
+    return [str(word) for word in sequence(words, "arguments")]
+
+
+def parse_urdf(text: str, target: str, source: str) -> Transform:
+    """Return the origin of a joint of a robot's description: its child's pose in its parent.
+
+    Of several joints it is the one from ``target`` to ``source``.
+    """
+    joints = {}
+    for joint in load_xml(text.strip()).all("joint"):
+        ends = [
+            one.attributes.get("link", "")
+            for kind in ("parent", "child")
+            for one in joint.all(kind)
+        ]
+        if len(ends) == 2:
+            joints[ends[0], ends[1]] = joint
+    names = (target, source)
+    if names not in joints and len(joints) == 1:
+        (names,) = joints
+    if names not in joints:
+        there = ", ".join(f"{parent} to {child}" for parent, child in joints) or "none"
+        raise malformed("file", f"a joint of parent {target} and child {source}", there)
+    given = next((one.attributes for one in joints[names].all("origin")), {})
+    place, turn = (
+        reals(given.get(name, "0 0 0").split(), f"origin {name}", 3) for name in ("xyz", "rpy")
+    )
+    return _transform(place, turn[::-1], names)
 
 
 def _from_options(words: Sequence[str]) -> Transform:
@@ -144,6 +212,7 @@ def _transform(
     frame, child = (frame_name(one, "frame") for one in frames)
     if len(turn) == 4:
         return Transform.from_quaternion(frame, child, position, turn)
+    check_angles(turn, "yaw, pitch and roll")
     return Transform(frame, child, rotation_zyx(*turn), np.array(position))
 
 
@@ -185,7 +254,7 @@ def parse_pose(text: str, target: str, source: str) -> Transform:
             raise malformed("file", "one pose", ", ".join(data) or "none")
         ((where, data),) = data.items()
     pose = numbers(data, where, POSE)
-    return Transform.from_quaternion(target, source, pose[:3], pose[3:])
+    return placed(target, source, pose)
 
 
 def compose_pose(transform: Transform) -> str:

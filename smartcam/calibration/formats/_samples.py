@@ -12,24 +12,26 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.calibration._codes import Code
+import numpy as np
+
 from smartcam.calibration.formats._plain import (
-    Plain,
     load_json,
     load_yaml,
     mapping,
+    matrix_of,
     matrix_rows,
-    number,
     real,
+    reals,
     rigid,
     sequence,
 )
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.frames import Transform
+    from smartcam.geometry import Transform
+    from smartcam.geometry._inside import Array
 
 _HAND, _SEEN = "effector_wrt_world", "object_wrt_sensor"
 
@@ -48,37 +50,29 @@ class HandEyeSample(NamedTuple):
 
 def parse_json(text: str) -> list[HandEyeSample]:
     """Return the samples of a JSON file; frames are base, effector, camera and object."""
-    pairs = [
-        sequence(pair, f"sample {index}", 2)
-        for index, pair in enumerate(sequence(load_json(text), "file"))
+    found = sequence(load_json(text), "file")
+    pairs = [sequence(pair, f"sample {index}", 2) for index, pair in enumerate(found)]
+    return [
+        _sample(index, *(matrix_of(one, f"sample {index}", (4, 4)) for one in pair))
+        for index, pair in enumerate(pairs)
     ]
-    return [_sample(_flat(hand), _flat(seen), index) for index, (hand, seen) in enumerate(pairs)]
 
 
 def parse_yaml(text: str) -> list[HandEyeSample]:
     """Return the samples of a YAML file; frames are base, effector, camera and object."""
-    pairs = [
-        mapping(pair, f"sample {index}", [_HAND, _SEEN])
-        for index, pair in enumerate(sequence(load_yaml(text), "file"))
+    found, keys = sequence(load_yaml(text), "file"), (_HAND, _SEEN)
+    pairs = [mapping(pair, f"sample {index}", keys) for index, pair in enumerate(found)]
+    return [
+        _sample(index, *(np.reshape(reals(pair[key], key, 16), (4, 4)) for key in keys))
+        for index, pair in enumerate(pairs)
     ]
-    return [_sample(pair[_HAND], pair[_SEEN], index) for index, pair in enumerate(pairs)]
 
 
-def _flat(matrix: Plain) -> list[Plain]:
-    rows = [sequence(row, "matrix row", 4) for row in sequence(matrix, "matrix", 4)]
-    return [value for row in rows for value in row]
-
-
-def _sample(hand: Plain, seen: Plain, index: int) -> HandEyeSample:
+def _sample(index: int, hand: Array, seen: Array) -> HandEyeSample:
     return HandEyeSample(
-        _matrix("base", "effector", hand, f"sample {index}, hand"),
-        _matrix("camera", "object", seen, f"sample {index}, seen"),
+        rigid("base", "effector", hand, f"sample {index}, hand"),
+        rigid("camera", "object", seen, f"sample {index}, seen"),
     )
-
-
-def _matrix(target: str, source: str, values: Plain, where: str) -> Transform:
-    read = [number(value, where) for value in sequence(values, where, 16)]
-    return rigid(target, source, [read[i : i + 4] for i in range(0, 16, 4)], where)
 
 
 def compose_json(samples: Sequence[HandEyeSample]) -> str:
@@ -106,11 +100,10 @@ def same_frames(transforms: Sequence[Transform]) -> None:
     """Raise (``WRONG_FRAME``) where not all are between the same frames: the file cannot tell."""
     for index, one in enumerate(transforms):
         if (one.target, one.source) != (transforms[0].target, transforms[0].source):
-            raise CalibrationError(
-                f"number {index}: expected {transforms[0].label} as the first is, got {one.label}",
-                code=Code.WRONG_FRAME,
-                expected=transforms[0].label,
-                got=one.label,
+            raise Code.WRONG_FRAME.unexpected(
+                f"number {index}: expected {transforms[0].label} as the first is",
+                transforms[0].label,
+                one.label,
             )
 
 

@@ -15,11 +15,11 @@ from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration.formats._file_format import Measured
 from smartcam.calibration.formats._plain import POSE, malformed, number, row
 from smartcam.calibration.formats._samples import same_frames
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -39,6 +39,7 @@ class _Columns(NamedTuple):
     places: tuple[int, ...]  # of the columns of time, then of x, y, z, qx, qy, qz, qw
     width: int  # how many columns there are
     seconds: Decimal  # the unit of time
+    metres: str | None  # the unit of lengths, where the header says one
 
 
 _COLUMNS = (
@@ -64,7 +65,9 @@ _EUROC_HEAD = (
 )
 
 
-def parse_csv(text: str, target: str, source: str) -> list[Transform]:
+def parse_csv(
+    text: str, target: str, source: str
+) -> Sequence[Transform] | Measured[Sequence[Transform]]:
     """Return the poses of a file with a header, in its order; further columns are left out.
 
     Lines that begin with ``#`` are remarks, one of them may be the header. The poses are
@@ -87,7 +90,7 @@ def parse_csv(text: str, target: str, source: str) -> list[Transform]:
             raise _no_header(line)
     if header is None:
         raise _no_header("")
-    return found
+    return found if header.metres is None else Measured(found, header.metres)
 
 
 def _no_header(line: str) -> CalibrationError:
@@ -105,7 +108,10 @@ def _header(line: str) -> _Columns | None:
             places = tuple(names.index(name) for name in columns)
             seconds = _SECONDS.get(units[places[0]] or unit)
             if seconds is not None:
-                return _Columns(places, len(cells), seconds)
+                said = {units[place] for place in places[1:4]}
+                if len(said) > 1:
+                    raise malformed("header", "one unit of x, y and z", line)
+                return _Columns(places, len(cells), seconds, said.pop() or None)
     return None
 
 
@@ -127,9 +133,8 @@ def _pose(line: str, header: _Columns, where: str, target: str, source: str) -> 
 def _microseconds(text: str, unit: Decimal, where: str) -> int:
     seconds = Decimal(text) * unit if _TIME.fullmatch(text) else None
     if seconds is None or not seconds <= _LAST:
-        raise CalibrationError(
+        raise Code.BAD_TIME.refusal(
             f"{where}: expected a time since 1970, before the year 10000, got {text[:64]!r}",
-            code=Code.BAD_TIME,
             got=text,
         )
     return int((seconds * 1_000_000).to_integral_value())
@@ -161,10 +166,8 @@ def _timed(transforms: Sequence[Transform]) -> list[tuple[int, Transform]]:
     found: list[tuple[int, Transform]] = []
     for index, one in enumerate(transforms):
         if one.at is None or one.at < _EPOCH:
-            raise CalibrationError(
-                f"number {index}: expected a time since 1970, got {one.at}",
-                code=Code.BAD_TIME,
-                got=one.at,
+            raise Code.BAD_TIME.unexpected(
+                f"number {index}: expected a time since 1970", got=one.at
             )
         found.append(((one.at - _EPOCH) // timedelta(microseconds=1), one))
     return found

@@ -12,23 +12,22 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._detection.charucos import charuco_board
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._targets import Charuco, Checkerboard
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._detection.marker_grids import marker_patterns
+from smartcam.calibration._targets import Charuco, Checkerboard, MarkerGrid
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.calibration._detection.pixels import Floats
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import CircleGrid, Target
+    from smartcam.geometry import CameraModel, Transform
+    from smartcam.geometry._inside import Array
 
 SAMPLES = 4
-"""Of a pixel, along each side."""
+"""A pixel is drawn from this many samples along each side."""
 
 QUIET = 1.0
 """White paper around a target, sides of its squares or distances of its dots."""
@@ -50,13 +49,13 @@ def render(
 
     Args:
         target: what is printed.
-        camera: its size is the image's.
+        camera: lens that sees the target; its image size is that of the result.
         T_camera_target: where the target is.
         blur: standard deviation of the lens' blur, pixels; the pixels' own square comes on top.
         noise: standard deviation of each pixel, grey levels of 255.
         black: grey level of the print.
-        white: of the paper.
-        background: of what lies around the paper.
+        white: grey level of the paper.
+        background: grey level of what lies around the paper.
         random: source of the noise; None is one that starts the same each time.
 
     Returns:
@@ -102,6 +101,8 @@ def _outline(target: Target, quiet: float = 0.0) -> Array:
     """
     if isinstance(target, Charuco | Checkerboard):
         pitch = reach = target.square
+    elif isinstance(target, MarkerGrid):
+        pitch, reach = target.marker, target.gap if target.kalibr else 0.0
     else:
         pitch, reach = target.spacing, max(target.diameter, target.origin_diameter or 0.0) / 2
     flat, beyond = target.points[:, :2], reach + quiet * pitch
@@ -111,11 +112,10 @@ def _outline(target: Target, quiet: float = 0.0) -> Array:
 def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tuple[int, ...]:
     """Return the columns and rows in which paper is seen: left, top, right, bottom."""
     if float(pose.rotation[:, 2] @ pose.translation) >= 0:
-        raise CalibrationError(
+        raise Code.MIRRORED.refusal(
             f"{pose.label}: expected the sheet's front towards the camera, got its back",
-            code=Code.MIRRORED,
-            expected="the target's z towards the camera",
-            got="its z away from the camera",
+            "the target's z towards the camera",
+            "its z away from the camera",
         )
     along = np.linspace(0.0, 1.0, 50)
     zero, one = np.zeros(50), np.ones(50)
@@ -123,12 +123,11 @@ def _box(paper: Array, camera: CameraModel, pose: Transform, more: float) -> tup
     rim = (paper[0] + parts * (paper[1] - paper[0])) @ pose.rotation[:, :2].T + pose.translation
     nearest = float(rim[:, 2].min())
     if not nearest > 0:
-        raise CalibrationError(
-            f"{pose.label}: expected the sheet before the camera, got a corner at z = "
+        raise Code.OUT_OF_FIELD.refusal(
+            f"{pose.label}: expected the sheet in front of the camera, got a corner at z = "
             f"{nearest:.3g} m",
-            code=Code.OUT_OF_FIELD,
-            expected="z > 0",
-            got=nearest,
+            "z > 0",
+            nearest,
         )
     seen, size = camera.project(rim), np.array(camera.size)
     low, high = np.floor(seen.min(axis=0) - more), np.ceil(seen.max(axis=0) + more)
@@ -182,6 +181,8 @@ def _black(target: Target, sheet: _Samples) -> Floats:
                 black = np.maximum(black, dot)
         case Charuco():
             black = _charuco(target, sheet)
+        case MarkerGrid():
+            black = _marker_grid(target, sheet)
         case _:
             black = _dots(target, sheet)
     return black
@@ -264,4 +265,37 @@ def _charuco(target: Charuco, sheet: _Samples) -> Floats:
     dark = np.zeros(len(number), dtype=np.bool_)
     dark[marked] = patterns[number[marked], down[marked], across[marked]]
     black[there] = np.maximum(black[there], dark)
+    return black
+
+
+def _marker_grid(target: MarkerGrid, sheet: _Samples) -> Floats:
+    """Return markers, and of Kalibr's the squares between their corners."""
+    pitch, side, gap = (
+        np.float32(one) for one in (target.marker + target.gap, target.marker, target.gap)
+    )
+    places, parts, markers, between = [], [], [], []
+    for at, grain, count in (
+        (sheet.x, sheet.x_grain, target.columns),
+        (sheet.y, sheet.y_grain, target.rows),
+    ):
+        place = np.floor((at + gap / 2) / pitch)
+        part = at - place * pitch
+        inside = (place >= 0) & (place < count)
+        places.append(place.clip(0, count - 1).astype(np.intp))
+        parts.append(part / side)
+        markers.append(inside * _share(np.minimum(part, side - part), grain))
+        # the gap that is nearer: before the marker, or behind it
+        near = np.where(part < side / 2, part + gap, part - side)
+        whole = (at > -1.5 * gap) & (at < count * pitch + gap / 2)
+        between.append(whole * _share(np.minimum(near, gap - near), grain))
+    (column, row), (across, up) = places, parts
+    numbers = column + target.columns * (row if target.kalibr else target.rows - 1 - row)
+    patterns = marker_patterns(target)
+    modules = patterns.shape[1]
+    x, y = ((modules * part).astype(np.intp).clip(0, modules - 1) for part in (across, up))
+    white = ~patterns[numbers, modules - 1 - y, x]
+    inner = np.minimum(np.minimum(across, 1 - across), np.minimum(up, 1 - up)) > 0.5 / modules
+    black: Floats = (markers[0] * markers[1] * ~(white & inner)).astype(np.float32)
+    if target.kalibr:
+        black = np.maximum(black, (between[0] * between[1]).astype(np.float32))
     return black

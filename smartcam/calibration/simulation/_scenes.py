@@ -12,9 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
 from smartcam.calibration._hand_eye.equations import (
     PixelObservations,
     RobotNoise,
@@ -24,16 +21,17 @@ from smartcam.calibration._hand_eye.equations import (
     information,
 )
 from smartcam.calibration._views import TargetView
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
+from smartcam.geometry._inside import Rigid, exp_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from smartcam.calibration._hand_eye.equations import Setup
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Target
+    from smartcam.geometry import CameraModel
 
-LEAST_VISIBLE = 4
+MIN_VISIBLE_POINTS = 4
 """Points that a view must have in the image."""
 
 GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
@@ -58,9 +56,9 @@ def view(
         target: what is on the sheet.
         camera: the camera.
         transform: ``T_camera_target``.
-        sigma: of a coordinate of a point, pixels.
+        sigma: standard deviation of a coordinate of a point, pixels.
         random: where the noise comes from.
-        name: of the view, for messages.
+        name: name of the view, for messages.
 
     Returns:
         The points inside of the image.
@@ -72,13 +70,12 @@ def view(
     pixels = pixels + sigma * random.normal(size=pixels.shape)
     inside = ((pixels >= -0.5) & (pixels < np.array(camera.size) - 0.5)).all(axis=1)
     ids = np.flatnonzero(inside)
-    if len(ids) < LEAST_VISIBLE:
-        raise CalibrationError(
-            f"view: expected at least {LEAST_VISIBLE} points of the target in the image, got "
+    if len(ids) < MIN_VISIBLE_POINTS:
+        raise Code.OUT_OF_FIELD.refusal(
+            f"view: expected at least {MIN_VISIBLE_POINTS} points of the target in the image, got "
             f"{len(ids)} of {len(pixels)}",
-            code=Code.OUT_OF_FIELD,
-            expected=LEAST_VISIBLE,
-            got=len(ids),
+            MIN_VISIBLE_POINTS,
+            len(ids),
         )
     variance = max(sigma, EXACT) ** 2
     covariance = np.broadcast_to(variance * np.eye(2), (len(ids), 2, 2)).copy()
@@ -99,10 +96,10 @@ def around(
 
     Args:
         target: what is looked at.
-        count: of poses.
-        tilt: of the outermost ones against the target's normal, radians.
-        distance: from the target's centre, metres; it varies by a fifth to both sides.
-        random: of the distances, and of the turns about the optical axis, up to 90 degrees.
+        count: count of poses.
+        tilt: tilt of the outermost poses against the target's normal, radians.
+        distance: distance from the target's centre, metres; it varies by a fifth to both sides.
+        random: source of the distances, and of the turns about the optical axis, up to 90 degrees.
 
     Returns:
         ``T_target_camera``, one for each pose.
@@ -133,8 +130,8 @@ class Bound(NamedTuple):
     """The least rms error that an unbiased calibration can have.
 
     Attributes:
-        rotation: of the camera's orientation, all axes together, radians.
-        translation: of the camera's position, all axes together, metres.
+        rotation: bound of the camera's orientation, all axes together, radians.
+        translation: bound of the camera's position, all axes together, metres.
     """
 
     rotation: float
@@ -172,8 +169,8 @@ class HandEyeScene:
         """Return the robot's poses as its controller says them, and the views.
 
         Args:
-            pixel_sigma: of a coordinate, pixels.
-            robot_sigmas: of each axis of the robot's poses.
+            pixel_sigma: standard deviation of a coordinate, pixels.
+            robot_sigmas: standard deviations of each axis of the robot's poses.
             random: where the noise comes from.
 
         Raises:
@@ -244,10 +241,10 @@ def hand_eye_scene(
         target: what is looked at.
         camera: the camera.
         setup: where the camera is. Beside the robot it stands still, and the target moves.
-        poses: of the robot.
-        tilt: of the outermost views against the target's normal, radians.
-        distance: of camera and target, metres; it varies by a fifth to both sides.
-        random: where the poses come from, and where camera and target are.
+        poses: count of poses of the robot.
+        tilt: tilt of the outermost views against the target's normal, radians.
+        distance: distance of camera and target, metres; it varies by a fifth to both sides.
+        random: source of the poses, and of the places of camera and target.
     """
     looks = around(target, poses, tilt=tilt, distance=distance, random=random)
     turn = exp_rotation(random.uniform(-1.5, 1.5, size=3))

@@ -13,14 +13,15 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from smartcam.calibration._codes import Code
+import numpy as np
+
 from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._drawing.draw import draw_scene, draw_views
-from smartcam.calibration._files.storage import motion_from_data, motion_to_data
-from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
-from smartcam.calibration._hand_eye.closed_forms import LEAST_POSES
+from smartcam.calibration._hand_eye.closed_forms import MIN_POSES
 from smartcam.calibration._hand_eye.result import KIND, HandEyeCalibration
+from smartcam.calibration._lens.poses import CAMERA, TARGET, locate
+from smartcam.calibration._verdict import VIEW_CURES, Judgement, refused
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
@@ -29,15 +30,18 @@ from smartcam.calibration.wizards._pictures import (
     how_to_take,
     taker,
 )
-from smartcam.calibration.wizards._points import Calibrated, ask_to_save, review_step
+from smartcam.calibration.wizards._points import Calibrated, accepting, ask_to_save, review_step
 from smartcam.calibration.wizards._sequence import Wizard, ask
+from smartcam.calibration.wizards._sheet import DIAGONALS, shape_of
 from smartcam.calibration.wizards._steps import Number, Option, Step, pick
 from smartcam.calibration.wizards._target_drawing import draw
 from smartcam.calibration.wizards._target_steps import ask_target
+from smartcam.calibration.wizards._touches import ALLOWED
 from smartcam.calibration.wizards._usage import usage
-from smartcam.calibration.wizards._verdict import VIEW_CURES, Judgement, judge, refused
 from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
+from smartcam.geometry._inside import motion_from_data, motion_to_data
 from smartcam.models import Pose
 
 if TYPE_CHECKING:
@@ -45,31 +49,34 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.calibration._hand_eye.equations import Setup
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Target
     from smartcam.calibration.wizards._pictures import Pictures, TakePicture
     from smartcam.calibration.wizards._steps import Answers
     from smartcam.calibration.wizards._view_suggestions import Suggestion
+    from smartcam.geometry import CameraModel
 
 ReadFlange = Callable[[], Awaitable[Transform | Pose]]
 """Returns ``T_base_flange``, the flange's pose in the robot's base."""
 
-MOST_VIEWS = 40
+MAX_VIEWS = 40
 """Largest number of views of one run: far more than it takes."""
 
 ADVISED_VIEWS = 10
-"""From which on the wizard offers to calculate first."""
+"""Views from which on the wizard offers to calculate first."""
 
 CALCULATION = 120.0
-"""Seconds that it may take; of 15 views it takes a few."""
+"""Seconds that the calculation may take; of 15 views it takes a few."""
 
 _MOVES: Mapping[str, str] = {
     "eye-in-hand": "Bring the camera to where it looks at the sheet",
     "eye-to-hand": "Bring the sheet before the camera, and hold it",
 }
 
+TOUCHES = 3
+"""Touches that verify a calibration: of points of the sheet that are far apart."""
+
 SUGGESTIONS = tuple(look.text for look in LOOKS)
-"""From where to look, one view after the other; then from the beginning, a bit beside it."""
+"""Views to take, one after the other; then from the beginning, a bit beside the earlier ones."""
 
 
 def hand_eye_wizard(
@@ -99,31 +106,36 @@ def hand_eye_wizard(
         target: what is on the sheet, with the lengths that it has on paper; None: it is asked.
         suggested: the default of what is asked.
         read_robot: reads the pose of the flange; None: it is typed.
-        camera: its lens; None: calibrated from the same views.
-        awaited: which picture ``take_picture`` waits for, for people: what
-            :attr:`PictureFolder.awaited` says; empty: it takes one.
+        camera: the camera's lens; None: calibrated from the same views.
+        awaited: description, for people, of the picture that ``take_picture`` waits for, as
+            :attr:`PictureFolder.awaited` says it; empty: ``take_picture`` takes one.
 
     Cancellation: a picture or a pose under way is given up; a calculation ends in its thread, and
     what it finds is dropped.
     """
 
     async def script(parameters: Mapping[str, Any]) -> Any:
-        setup, robot = await _ask_setup(parameters, typed=read_robot is None)
+        setup, robot, allowed = await _ask_setup(parameters, typed=read_robot is None)
         there = target
         if there is None:
-            there = await ask_target(suggested, known=parameters.get("target"))
+            there = await ask_target(
+                suggested, known=parameters.get("target"), square=parameters.get("square")
+            )
         views = _Views(there, setup, taker(take_picture), read_robot or robot, camera, awaited)
+        views.allowed = allowed
         calibration = await views.run()
         name = str(parameters.get("name", KIND))
         preview = {"svg": draw_scene(calibration, title="Where camera and sheet were")}
         result = await ask_to_save(name, save_to, KIND, _outcome(calibration), preview)
         return {**result, "use": usage(KIND, save_to(name))}
 
-    return Wizard(name=KIND, version=1, script=script)
+    return Wizard(name=KIND, version=1, script=script, steps=14)
 
 
-async def _ask_setup(parameters: Mapping[str, Any], *, typed: bool) -> tuple[Setup, str]:
-    """Ask for the camera's place and for the convention in which the robot's poses are typed."""
+async def _ask_setup(
+    parameters: Mapping[str, Any], *, typed: bool
+) -> tuple[Setup, str, float | None]:
+    """Ask for the camera's place, the convention of typed poses, and the error that is allowed."""
     setup = Option(
         name="setup",
         label="Where the camera is",
@@ -137,7 +149,9 @@ async def _ask_setup(parameters: Mapping[str, Any], *, typed: bool) -> tuple[Set
         label="How the robot shows the pose of its flange",
         options={name: f"{', '.join(one.numbers)}; {one.title}" for name, one in ROBOTS.items()},
     )
-    inputs = (setup, robot) if typed else (setup,)
+    label = "Largest error that is good enough; empty: a hundredth of the sheet's distance"
+    allowed = replace(ALLOWED, label=label)
+    inputs = (setup, robot, allowed) if typed else (setup, allowed)
     step = Step(
         id="about",
         title="Camera and robot",
@@ -146,7 +160,8 @@ async def _ask_setup(parameters: Mapping[str, Any], *, typed: bool) -> tuple[Set
     )
     answer = await ask(step.with_defaults(parameters))
     where: Setup = "eye-to-hand" if answer["setup"] == "eye-to-hand" else "eye-in-hand"
-    return where, str(answer.get("robot", ""))
+    error = answer["allowed"]
+    return where, str(answer.get("robot", "")), None if error is None else 1e-3 * error
 
 
 @dataclass(eq=False)
@@ -160,6 +175,7 @@ class _Views:
     _camera: CameraModel | None
     _awaited: str
     _samples: list[dict[str, Any]] = field(default_factory=list)
+    allowed: float | None = None  # metres, of an error that is good enough; None: nobody said
 
     async def run(self) -> HandEyeCalibration:
         """Ask for views until a calibration is accepted; return it."""
@@ -169,20 +185,73 @@ class _Views:
                 pass
             calibration, notes, judgement = await self._calculate()
             answers = await ask(self._review(calibration, notes, judgement))
+            while answers["next"] == "verify" and calibration is not None:
+                calibration, touched = await self._verify(calibration)
+                notes = (*_outcome(calibration).notes, touched)
+                answers = await ask(self._review(calibration, notes, calibration.judged()))
             if answers["next"] == "accept" and calibration is not None:
                 return calibration
             more = answers["next"] == "more"
             if answers["next"] == "remove":
                 del self._samples[answers["view"] - 1]
-                more = len(self._samples) < LEAST_POSES
+                more = len(self._samples) < MIN_POSES
+
+    async def _verify(self, calibration: HandEyeCalibration) -> tuple[HandEyeCalibration, str]:
+        """Ask for touches of the sheet; return the calibration with what they say, and a note."""
+        points = (calibration.target or self._target).points
+        if self._setup == "eye-in-hand":
+            places = calibration.target_pose.apply(points)
+        else:
+            step = Step(
+                id="verify-picture",
+                title="A sheet that the robot can touch",
+                description="Lay a print of the same sheet into the camera's field where the robot "
+                f"can touch it, and fix it.{how_to_take(self._awaited)}",
+                button="Take a picture",
+                waiting=f"Waiting: {self._awaited}" if self._awaited else "",
+                timeout=PICTURE_TIMEOUT,
+            )
+            lying = (await ask(step, partial(self._lying, calibration.camera))).outcome
+            seen = motion_from_data(lying, CAMERA, TARGET)
+            places = (calibration.camera_pose @ seen).apply(points)
+        columns = shape_of(self._target)[0]
+        off: list[float] = []
+        for direction in DIAGONALS[:TOUCHES]:
+            number = int(np.argmax(points[:, :2] @ direction))
+            row, column = divmod(number, columns)
+            step = Step(
+                id=f"verify-{len(off) + 1}",
+                title=f"Touch {len(off) + 1} of {TOUCHES}",
+                description=f"Move the tip of the tool onto point {column + 1} of row {row + 1} of "
+                "the sheet, counted from its origin, and take the tip's position from the robot, "
+                "in its base.",
+                inputs=tuple(Number(name=axis, label=axis, unit="mm") for axis in "xyz"),
+            )
+            answer = await ask(step)
+            touched = np.array([1e-3 * answer[axis] for axis in "xyz"])
+            off.append(1e3 * float(np.linalg.norm(touched - places[number])))
+        note = f"the tip touched the sheet {', '.join(f'{one:.2f}' for one in off)} mm off"
+        others = tuple(one for one in calibration.warnings if one.code != Code.REFUTED)
+        allowed = calibration.allowed
+        if max(off) > allowed.error:
+            others = (Code.REFUTED.remark(f"{note}, but {allowed.text}"), *others)
+        return replace(calibration, warnings=others), note
+
+    async def _lying(self, lens: CameraModel | None, _answers: Answers) -> dict[str, Any]:
+        """Take a picture of a sheet that lies there, and tell where."""
+        image = await self._take_picture()
+        view = await asyncio.to_thread(find_target, image, self._target)
+        if lens is None:
+            raise TypeError("views give a lens")
+        return motion_to_data(locate(view, lens).transform)
 
     async def _take_view(self) -> bool:
         """Take one more view; return false where it is to be calculated instead."""
         count = len(self._samples)
-        if count >= MOST_VIEWS:
+        if count >= MAX_VIEWS:
             return False
         inputs: tuple[Option | Number, ...] = ()
-        if count >= LEAST_POSES:
+        if count >= MIN_POSES:
             options = {
                 "view": "take this view",
                 "calculate": f"calculate with the {count} views; {ADVISED_VIEWS} or more are good",
@@ -194,13 +263,13 @@ class _Views:
         typed = ""
         if isinstance(self._robot, str):
             typed = " Then take the pose of the flange from the robot, in its base."
-            inputs = (*inputs, *_pose_inputs(self._robot, optional=count >= LEAST_POSES))
+            inputs = (*inputs, *_pose_inputs(self._robot, optional=count >= MIN_POSES))
         step = Step(
             id=f"view-{count + 1}",
             title=f"View {count + 1}",
             description=f"{_MOVES[self._setup]}: {look}. The whole sheet must be in the image, and "
             f"the robot must stand still.{typed}{how_to_take(self._awaited)}",
-            button="Take a picture" if count < LEAST_POSES else "Go on",
+            button="Take a picture" if count < MIN_POSES else "Go on",
             inputs=inputs,
             notes=tuple(filter(None, (self._progress(count), following.get("gain")))),
             preview=self.preview(),
@@ -213,13 +282,13 @@ class _Views:
         return bool(sample)
 
     def _progress(self, count: int) -> str:
-        """Return how many views there are, how many are good, and how to end."""
+        """Return a text of the views so far, the views advised and allowed, and the way to end."""
         end = (
             "to end, choose to calculate"
-            if count >= LEAST_POSES
-            else f"with {LEAST_POSES} it can be calculated; to end before, abort"
+            if count >= MIN_POSES
+            else f"with {MIN_POSES} it can be calculated; to end before, abort"
         )
-        return f"{count} of {ADVISED_VIEWS} views, {MOST_VIEWS} at most; {end}"
+        return f"{count} of {ADVISED_VIEWS} views, {MAX_VIEWS} at most; {end}"
 
     async def _sample(self, answers: Answers) -> dict[str, Any]:
         """Take a picture and read the robot, if that is wanted."""
@@ -296,7 +365,12 @@ class _Views:
         """Return the calibration without the samples' views, or why there is none."""
         poses = [motion_from_data(one["pose"], *one["frames"]) for one in self._samples]
         work = partial(
-            calibrate_hand_eye, poses, self._views(), setup=self._setup, camera=self._camera
+            calibrate_hand_eye,
+            poses,
+            self._views(),
+            setup=self._setup,
+            camera=self._camera,
+            allowed_error=self.allowed,
         )
         try:
             calibration = await asyncio.to_thread(work)
@@ -311,13 +385,14 @@ class _Views:
         judgement: Judgement,
     ) -> Step:
         options = {
-            "accept": "accept it",
+            "accept": accepting(judgement),
+            "verify": "touch the sheet with the robot's tip, to see that it is right",
             "more": "take another view",
             "remove": "remove a view",
         }
         worst = len(self._samples)
         if calibration is None:
-            del options["accept"]
+            del options["accept"], options["verify"]
         else:
             worst = 1 + calibration.worst
         label = "View to remove; the worst one stands there"
@@ -348,16 +423,14 @@ def _typed_pose(robot: str, answers: Answers) -> Transform:
         if value is None
     }
     if missing:
-        raise CalibrationError(
-            f"pose: no answer for {', '.join(missing)}", code=Code.WRONG_ANSWERS, got=missing
-        )
+        raise Code.WRONG_ANSWERS.refusal(f"pose: no answer for {', '.join(missing)}", got=missing)
     return pose_from(robot, values, source="flange")
 
 
 def _outcome(calibration: HandEyeCalibration) -> Calibrated:
     held_out = calibration.held_out_error
     remarks = [f"{one.code}: {one.text}" for one in calibration.warnings]
-    judgement = _judged(calibration)
+    judgement = calibration.judged()
     figures = {
         **judgement.figures,
         "method": calibration.method,
@@ -382,21 +455,6 @@ def _outcome(calibration: HandEyeCalibration) -> Calibrated:
             f"orientation to {figures['rotation_error_deg']:.2g} deg"
         )
     return Calibrated(calibration, figures, (*notes, *remarks), judgement)
-
-
-def _judged(calibration: HandEyeCalibration) -> Judgement:
-    """Return what a calibration is worth; of few views the error cannot be relied on."""
-    held_out, codes = calibration.held_out_error, {one.code for one in calibration.warnings}
-    left_out = [str(number) for number, used in enumerate(calibration.used, 1) if not used]
-    relied_on = held_out is not None and Code.TOO_FEW not in codes
-    return judge(
-        1e3 * held_out if held_out is not None and relied_on else None,
-        [one for one in calibration.warnings if not (left_out and one.code == Code.BAD_VIEW)],
-        worst=1 + calibration.worst,
-        cures=VIEW_CURES,
-        more="take more views",
-        where=f" without view{'s' * (len(left_out) > 1)} {', '.join(left_out)}" if left_out else "",
-    )
 
 
 def _known(factor: float, value: float) -> float | None:

@@ -13,13 +13,14 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from smartcam._locks import try_lock
-from smartcam.calibration._codes import Code
-from smartcam.calibration._files.store import sync_folder
-from smartcam.exceptions import CalibrationError
+from smartcam._whole_files import sync_folder
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from pathlib import Path
     from typing import Self
+
+    from smartcam.exceptions import CalibrationError
 
 MAX_ENTRIES = 10_000
 """Entries of a journal; a calibration by hand has some dozens."""
@@ -83,9 +84,8 @@ class Journal:
         the file is as it was.
         """
         if len(self.entries) >= MAX_ENTRIES:
-            raise CalibrationError(
-                f"{self.path}: entry {MAX_ENTRIES + 1}, expected {MAX_ENTRIES} at most",
-                code=Code.NOT_STORABLE,
+            raise Code.NOT_STORABLE.refusal(
+                f"{self.path}: entry {MAX_ENTRIES + 1}, expected {MAX_ENTRIES} at most"
             )
         read = self._write(entry)
         self.entries.append(read)
@@ -97,9 +97,8 @@ class Journal:
 
     def _lock(self) -> None:
         if try_lock(self._stream.fileno()) is False:
-            raise CalibrationError(
-                f"{self.path}: another sequence writes it; expected one at a time",
-                code=Code.IN_USE,
+            raise Code.IN_USE.refusal(
+                f"{self.path}: another sequence writes it; expected one at a time"
             )
 
     def _load(self) -> None:
@@ -125,13 +124,10 @@ class Journal:
         try:
             line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         except (TypeError, ValueError, RecursionError) as exc:
-            raise CalibrationError(
-                f"{self.path}: cannot be stored: {exc}", code=Code.NOT_STORABLE
-            ) from exc
+            raise Code.NOT_STORABLE.refusal(f"{self.path}: cannot be stored: {exc}") from exc
         if len(line) > MAX_LINE:
-            raise CalibrationError(
-                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE} at most",
-                code=Code.NOT_STORABLE,
+            raise Code.NOT_STORABLE.refusal(
+                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE} at most"
             )
         try:
             self._put(line)
@@ -154,6 +150,4 @@ class Journal:
         self._stream.seek(self._size)
 
     def _broken(self, why: str) -> CalibrationError:
-        return CalibrationError(
-            f"{self.path}: {why}; expected the journal of a sequence", code=Code.BROKEN_FILE
-        )
+        return Code.BROKEN_FILE.refusal(f"{self.path}: {why}; expected the journal of a sequence")

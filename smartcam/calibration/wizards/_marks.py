@@ -6,10 +6,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Flag, Step
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ class Mark:
         return cls(row["feature_id"], row["x"], row["y"], row["theta"])
 
     def text(self, unit: str) -> str:
-        """Return it for people; ``unit`` of its place, metres are shown as millimetres."""
+        """Return the mark as a text; ``unit`` of its place, metres are shown as millimetres."""
         name = self.feature if self.feature.isprintable() else repr(self.feature)
         factor, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
         return f"{name or 'mark'} at x {factor * self.x:.1f} {unit}, y {factor * self.y:.1f} {unit}"
@@ -84,10 +83,9 @@ class MarkCamera:
         ]
         if not 0 < len(rows) <= MAX_MARKS:
             wanted = f"{self.feature!r} " if self.feature else ""
-            raise CalibrationError(
+            raise (Code.SHAPE if rows else Code.TOO_FEW).refusal(
                 f"the camera found {len(rows)} marks {wanted}among {len(found)} localizations; "
                 f"expected 1 to {MAX_MARKS}",
-                code=Code.TOO_FEW if not rows else Code.SHAPE,
                 got=len(rows),
             )
         return rows
@@ -98,12 +96,11 @@ class MarkCamera:
         ``what``: what was made then, for people.
         """
         if None not in {before, self.y_down} and before != self.y_down:
-            raise CalibrationError(
+            raise Code.MIRRORED.refusal(
                 f"{what} with y_down={before}, now it is {self.y_down}, and everything would be "
                 f"mirrored; expected y_down={before}",
-                code=Code.MIRRORED,
-                got=self.y_down,
-                expected=before,
+                before,
+                self.y_down,
             )
 
 

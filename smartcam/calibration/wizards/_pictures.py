@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._detection.image import LARGEST, HasGrey
-from smartcam.calibration._optional_imports import load
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     import os
 
     from numpy.typing import NDArray
+
+    from smartcam.exceptions import CalibrationError
 
 TakePicture = Callable[[], Awaitable[Any]]
 """Takes a picture and returns it: uint8 or uint16, (H, W) or (H, W, 3)."""
@@ -35,9 +36,10 @@ class Pictures(Protocol):
 
 
 def taker(pictures: TakePicture | Pictures) -> TakePicture:
-    """Return what takes a picture; of a source of frames the first one that is exposed then.
+    """Return a function that takes a picture, or the first frame a source exposes after the call.
 
-    Its brightness counts. The source's errors are the picture's: no such device, none in time.
+    The picture is the frame's brightness. Errors of the source pass as they are: no such device, no
+    frame in time.
     """
     if callable(pictures):
         return pictures
@@ -98,7 +100,7 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
 
 
 def how_to_take(awaited: str) -> str:
-    """Return how a picture that is waited for comes, behind a step's description."""
+    """Return the sentence behind a step's description that says how to take an awaited picture."""
     if not awaited:
         return ""
     return f" Go on here first, then have the camera take its picture: {awaited}."
@@ -113,7 +115,7 @@ class PictureFolder:
 
     Attributes:
         path: the folder.
-        deadline: as given.
+        deadline: the deadline as given, seconds.
 
     Raises:
         CalibrationError: NO_PICTURE: it is no folder.
@@ -126,7 +128,7 @@ class PictureFolder:
 
     @property
     def awaited(self) -> str:
-        """Which picture :meth:`take` waits for, for people."""
+        """Text for people that says which picture :meth:`take` waits for."""
         return (
             f"the next file that comes into {self.path} counts, one that ends in "
             f"{', '.join(sorted(SUFFIXES))}; what is there already does not. It is waited for "
@@ -162,12 +164,11 @@ class PictureFolder:
                         return await asyncio.to_thread(self._read, newest)
                     last = now
         except TimeoutError as exc:
-            raise CalibrationError(
+            raise Code.NO_PICTURE.refusal(
                 f"no picture came into {self.path} within {self.deadline:g} s"
                 f"{self._others(before, others)}; expected a file that ends in one of "
                 f"{', '.join(sorted(SUFFIXES))}, written after the button",
-                code=Code.NO_PICTURE,
-                expected=sorted(SUFFIXES),
+                sorted(SUFFIXES),
             ) from exc
 
     def _names(self) -> set[str]:
@@ -178,7 +179,7 @@ class PictureFolder:
         return set()
 
     def _others(self, before: dict[str, tuple[int, int]], others: set[str]) -> str:
-        """Say what came instead of a picture, and how many were there before."""
+        """Return a note on files that came instead of a picture, and on the count there before."""
         said = [f"there before: {len(before)}"] if before else []
         came = sorted(self._names() - others)
         if came:
@@ -192,10 +193,8 @@ class PictureFolder:
         try:
             for count, file in enumerate(self.path.iterdir()):
                 if count >= MAX_FILES:
-                    raise CalibrationError(
-                        f"{self.path}: expected {MAX_FILES} files at most, got more",
-                        code=Code.NO_PICTURE,
-                        expected=MAX_FILES,
+                    raise Code.NO_PICTURE.refusal(
+                        f"{self.path}: expected {MAX_FILES} files at most, got more", MAX_FILES
                     )
                 if file.suffix.lower() not in SUFFIXES:
                     continue
@@ -205,10 +204,8 @@ class PictureFolder:
                     continue
                 found[file.name] = (about.st_mtime_ns, about.st_size)
         except OSError as exc:
-            raise CalibrationError(
-                f"{self.path}: expected a folder that pictures come into, got {exc.strerror}",
-                code=Code.NO_PICTURE,
-                got=exc.strerror,
+            raise Code.NO_PICTURE.unexpected(
+                f"{self.path}: expected a folder that pictures come into", got=exc.strerror
             ) from exc
         return found
 
@@ -222,9 +219,4 @@ class PictureFolder:
 
 
 def _bad(name: str, expected: str, got: str) -> CalibrationError:
-    return CalibrationError(
-        f"{name}: expected {expected}, got {got}",
-        code=Code.BAD_PICTURE,
-        expected=expected,
-        got=got,
-    )
+    return Code.BAD_PICTURE.unexpected(f"{name}: expected {expected}", expected, got)

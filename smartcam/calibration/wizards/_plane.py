@@ -88,7 +88,7 @@ def plane_wizard(
         source.connect = connect
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
-    return Wizard(name=KIND, version=1, script=script)
+    return Wizard(name=KIND, version=1, script=script, steps=9)
 
 
 class _MarkSource(PointSource):

@@ -16,21 +16,26 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from smartcam.calibration._codes import Code
+import numpy as np
+
 from smartcam.calibration._files.store import write
-from smartcam.calibration._plane.robust import LEAST_POINTS
+from smartcam.calibration._plane.diagnostics import MAX_SIGMA
+from smartcam.calibration._plane.order import Reordered, better_order
+from smartcam.calibration._plane.robust import MIN_POINTS
 from smartcam.calibration._plane.touches import fit_touches
+from smartcam.calibration._plane.validation import extent
+from smartcam.calibration._verdict import Judgement, refused
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
-from smartcam.calibration.wizards._touches import SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.calibration.wizards._touches import ALLOWED, SIDE, SIGMA, UNIT, Touch, Touches
 from smartcam.calibration.wizards._usage import usage
-from smartcam.calibration.wizards._verdict import Judgement, judge, refused
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
     from smartcam.calibration._files.load import AnyCalibration
@@ -59,7 +64,7 @@ class Calibrated(NamedTuple):
 
 
 class PointSource(Touches, ABC):
-    """Where a plane's points come from, and their touches: one run of a wizard.
+    """The source of a plane's points, and their touches: one run of a wizard.
 
     Args: as of :class:`~smartcam.calibration.wizards._touches.Touches`; ``about`` answers
         :func:`about_step`.
@@ -118,7 +123,7 @@ class PointSource(Touches, ABC):
     async def run(self, name: str, save_to: Callable[[str], Path]) -> dict[str, Any]:
         """Ask for touches and whether to save what came out; return the wizard's result."""
         rays = self.about["method"] == "rays"
-        plane = await (self._touch_rays() if rays else self._touch_points())
+        plane = self._allowing(await (self._touch_rays() if rays else self._touch_points()))
         about, outcome = self.about, self.outcome(plane)
         context = {
             "frames": {"camera": about["camera_frame"] or None, "robot": about["robot_frame"]},
@@ -162,7 +167,7 @@ class PointSource(Touches, ABC):
             camera_frame=self.camera_frame,
             y_down=self.y_down,
         )
-        outcome = self.outcome(plane)
+        outcome = self.outcome(self._allowing(plane))
         await ask(
             Step(
                 id="review",
@@ -179,12 +184,15 @@ class PointSource(Touches, ABC):
 
     async def _touch_points(self) -> PlaneCalibration:
         wanted, robust = self.FIRST, False
+        again: set[int] = set()  # numbers of the points that were touched again
         while True:
             while len(self.touches) < wanted:
                 await self.add()
             wanted = LEAST
             plane, notes, judgement = self._try_fit(robust=robust)
-            choice = await ask(self._review(plane, notes, judgement, robust=robust))
+            judgement = _other_advice(judgement, again, len(self.touches))
+            order = self._better_order() if judgement.verdict.level == "poor" else None
+            choice = await ask(self._review(plane, notes, judgement, order, robust=robust))
             index = choice["point"] - 1
             match choice["next"]:
                 case "accept" if plane is not None:
@@ -193,8 +201,15 @@ class PointSource(Touches, ABC):
                     await self.add()
                 case "redo":
                     await self.redo(index)
+                    again.add(index + 1)
                 case "remove":
                     del self.touches[index]
+                    again.clear()  # numbers have moved
+                case "reorder" if order is not None:
+                    self.touches = [
+                        replace(one, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
+                        for one, i in zip(self.touches, order.order, strict=True)
+                    ]
                 case _:
                     robust = choice["next"] == "robust"
 
@@ -202,15 +217,31 @@ class PointSource(Touches, ABC):
         self, *, robust: bool
     ) -> tuple[PlaneCalibration | None, tuple[str, ...], Judgement]:
         try:
-            plane = self.fit(robust=robust and len(self.touches) >= LEAST_POINTS)
+            fitted = self.fit(robust=robust and len(self.touches) >= MIN_POINTS)
+            plane = self._allowing(fitted)
         except CalibrationError as exc:
             return None, (f"{exc.code}: {exc}",), self._blamed(exc)
         _, _, notes, judgement = self.outcome(plane)
         return plane, notes, judgement
 
+    def _allowing(self, plane: PlaneCalibration) -> PlaneCalibration:
+        """Return a calibration with the error that the user allows."""
+        allowed = self.about["allowed"]
+        return replace(plane, allowed_error=None if allowed is None else 1e-3 * allowed)
+
+    def _better_order(self) -> Reordered | None:
+        """Return the order of touches that explains them far better, if there is only one."""
+        touched = np.array(self.places)
+        sigma = self.sigma or MAX_SIGMA.of(extent(touched))
+        marks = np.array([(one.mark.x, one.mark.y) for one in self.touches])
+        return better_order(marks, touched, sigma)
+
     def _blamed(self, error: CalibrationError) -> Judgement:
-        """Return what to do: one touch that is far off can look like another scale."""
-        if len(self.touches) >= LEAST_POINTS:
+        """Return the judgement of an error; one touch far off can look like another scale."""
+        if (order := self._better_order()) is not None:
+            numbers = np.arange(1, 1 + len(self.touches))
+            return refused(Code.WRONG_ORDER, order.remark(numbers).text)
+        if len(self.touches) >= MIN_POINTS:
             with contextlib.suppress(CalibrationError):
                 for index in self.fit(robust=True).outliers:
                     return refused(Code.OUTLIER, f"point {1 + index}")
@@ -221,11 +252,12 @@ class PointSource(Touches, ABC):
         plane: PlaneCalibration | None,
         notes: tuple[str, ...],
         judgement: Judgement,
+        order: Reordered | None,
         *,
         robust: bool,
     ) -> Step:
         options = {
-            "accept": "accept it",
+            "accept": accepting(judgement),
             "more": self.MORE,
             "redo": "touch a point again",
             "remove": "remove a point",
@@ -235,10 +267,13 @@ class PointSource(Touches, ABC):
             del options["accept"]
         else:
             worst = 1 + min(plane.outliers, default=plane.worst)
+        if order is not None and order.sure:
+            moved = ", ".join(str(1 + index) for index in order.moved)
+            options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
         doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
         if robust:
             options["all"] = "count all points, also those that do not agree with the others"
-        elif len(self.touches) >= LEAST_POINTS and doubtful:
+        elif len(self.touches) >= MIN_POINTS and doubtful:
             options["robust"] = "leave out the points that do not agree with the others"
         label = "Point, to touch again or to remove; the worst one stands there"
         named = judgement.number or worst
@@ -268,6 +303,24 @@ class PointSource(Touches, ABC):
             {"at": place, "label": str(number), "answers": {"point": number}}
             for number, place in enumerate(places, 1)
         ]
+
+
+def _other_advice(judgement: Judgement, again: Collection[int], count: int) -> Judgement:
+    """Return a judgement that does not ask for one touch again and again.
+
+    ``again``: numbers of the points that were touched again already. ``count``: of all points.
+    """
+    number = judgement.number
+    if judgement.option != "redo" or number not in again:
+        return judgement
+    leave = "remove it, and touch another one" if count > LEAST else "touch more points first"
+    text = (
+        f"Not good enough: point {number} was touched again, and still does not agree with the "
+        f"others. Look whether its mark has moved, whether another mark was touched, and whether "
+        f"the tool is held as at the others; or {leave}"
+    )
+    verdict = replace(judgement.verdict, text=text)
+    return judgement._replace(verdict=verdict, option="remove" if count > LEAST else "more")
 
 
 def about_step(
@@ -300,9 +353,17 @@ def about_step(
             UNIT,
             *((SIDE,) if typed else ()),
             SIGMA,
+            ALLOWED,
         ),
     )
     return step.with_defaults(parameters)
+
+
+def accepting(judgement: Judgement) -> str:
+    """Return the text of the option to accept what came out."""
+    if judgement.verdict.level == "good":
+        return "accept it"
+    return "accept it all the same; each program that loads it is warned"
 
 
 def review_step(
@@ -373,8 +434,13 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
         )
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
+    x, y, z = calibration.rotation[:, 0]
+    notes.append(
+        f"the camera's x axis lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
+        "does, for points in a regular grid fit as well when touched from another corner on"
+    )
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]
-    judgement = judge_plane(calibration, predicted)
+    judgement = calibration.judged()
     found = {
         **judgement.figures,
         "model": calibration.model,
@@ -386,18 +452,3 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
         "remarks": [[one.code.value, one.text] for one in calibration.warnings],
     }
     return Calibrated(calibration, found, tuple(notes), judgement)
-
-
-def judge_plane(
-    calibration: PlaneCalibration, predicted: float | None, where: str = ""
-) -> Judgement:
-    """Return what a plane's calibration is worth, given its predicted error in mm."""
-    held_out, out = calibration.held_out_error, [1 + index for index in calibration.outliers]
-    without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
-    return judge(
-        None if held_out is None else 1e3 * held_out,
-        [one for one in calibration.warnings if not (out and one.code == Code.OUTLIER)],
-        worst=1 + calibration.worst,
-        predicted=predicted,
-        where=f"{where}{without}",
-    )

@@ -34,8 +34,8 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
-from smartcam.calibration._codes import Code
 from smartcam.exceptions import CalibrationError, SmartCamError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from smartcam.calibration.wizards._journal import Journal
@@ -102,13 +102,15 @@ class Wizard:
 
     Attributes:
         name: what journals call it.
-        version: to be raised when its steps change, so that no journal is read with others.
+        version: number to raise when the steps change, so that no journal is read with others.
         script: the coroutine function; takes the parameters of the start, returns the result.
+        steps: number of steps that it takes as a rule; 0: nobody knows.
     """
 
     name: str
     version: int
     script: Callable[[Mapping[str, Any]], Coroutine[Any, Any, Any]]
+    steps: int = 0
 
 
 class _ScriptRun:
@@ -126,10 +128,9 @@ class _ScriptRun:
             if self.request is None or self.request.step.id != entry["step"]:
                 here = "the end" if self.request is None else f"step {self.request.step.id!r}"
                 self.close()
-                raise CalibrationError(
+                raise Code.WRONG_JOURNAL.refusal(
                     f"entry {number} is of step {entry['step']!r}, expected {here}: another "
-                    f"version of {wizard.name!r} wrote it",
-                    code=Code.WRONG_JOURNAL,
+                    f"version of {wizard.name!r} wrote it"
                 )
             self.take(entry)
 
@@ -192,6 +193,8 @@ class WizardSession:
         wizard: the wizard.
         flow: name of this run, part of its tokens.
         parameters: the parameters of its start.
+        resumed: ``since, last, done, parameters``: when the journal was begun and written last,
+            its answers, and what it was begun with; None for a new one, and once it goes on.
 
     Raises:
         CalibrationError: ``WRONG_JOURNAL``: another wizard's, or another version's;
@@ -216,16 +219,30 @@ class WizardSession:
             self.parameters: dict[str, Any] = dict(header["parameters"])
             self._log = functools.reduce(_Replay.then, self._all, _Replay())
         except (KeyError, IndexError, TypeError, ValueError) as exc:
-            raise CalibrationError(
-                f"the journal is incomplete: {exc!r}; expected one as a sequence writes it",
-                code=Code.BROKEN_FILE,
+            raise Code.BROKEN_FILE.refusal(
+                f"the journal is incomplete: {exc!r}; expected one as a sequence writes it"
             ) from exc
         self._run = self._resumed()
         if journal is not None and journal.header is None:
             journal.start(header)
+        self.resumed: dict[str, Any] | None = self._told_of(header)
         self._errors: dict[str, str] = {}
         self._lock = asyncio.Lock()
         self._scope: asyncio.Timeout | None = None
+
+    def _told_of(self, header: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Return the facts of what was answered before; None where there is nothing to go on with.
+
+        Measurements may be old: what was touched may have been moved since.
+        """
+        if self.state != "asking" or not self._log.entries:
+            return None
+        done = [
+            {"step": one["step"], "answers": one["answers"], "at": one["at"]}
+            for one in copy.deepcopy(self._log.entries)
+        ]
+        times = {"since": header.get("started_at"), "last": done[-1]["at"]}
+        return {**times, "done": done, "parameters": copy.deepcopy(self.parameters)}
 
     def _resumed(self) -> _ScriptRun:
         try:
@@ -233,10 +250,9 @@ class WizardSession:
         except (AttributeError, LookupError, TypeError, ValueError) as exc:
             if isinstance(exc, SmartCamError) or not self._log.entries:
                 raise
-            raise CalibrationError(
+            raise Code.BROKEN_FILE.refusal(
                 f"the journal's answers do not lead through {self.wizard.name!r}: {exc!r}; "
-                "expected those that its steps took",
-                code=Code.BROKEN_FILE,
+                "expected those that its steps took"
             ) from exc
 
     def _header(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -245,11 +261,10 @@ class WizardSession:
         if journal is not None and journal.header is not None:
             found = {name: journal.header.get(name) for name in mine}
             if found != mine:
-                raise CalibrationError(
+                raise Code.WRONG_JOURNAL.refusal(
                     f"{journal.path}: written by {_named(found)}, expected {_named(mine)}",
-                    code=Code.WRONG_JOURNAL,
-                    got=found,
-                    expected=mine,
+                    mine,
+                    found,
                 )
             return journal.header
         return {
@@ -261,7 +276,7 @@ class WizardSession:
 
     @property
     def state(self) -> State:
-        """Where it stands."""
+        """State of the wizard."""
         if self._log.state == "asking" and self._run.request is None:
             return "ended"
         return self._log.state
@@ -279,7 +294,7 @@ class WizardSession:
 
     @property
     def busy(self) -> bool:
-        """Whether a call is under way."""
+        """True while a call is under way."""
         return self._lock.locked()
 
     @property
@@ -298,8 +313,9 @@ class WizardSession:
         """The view that a front-end shows, JSON-able.
 
         Returns:
-            ``flow, wizard, token, type, number`` (of the step, from 1)``, step`` (its id)``,
-            title, description, button, notes, verdict`` (``level, text``)``, preview, waiting,
+            ``flow, wizard, token, type, number`` (of the step, from 1)``, of`` (about how many
+            steps; None: not known)``, step`` (its id)``, title, description, button, notes,
+            verdict`` (``level, text``)``, preview, waiting,
             schema, defaults, errors`` (a text by input, ``base`` for all else)``, can`` (of ``undo,
             repeat, abort``)``, result``. ``type`` is ``form`` (with inputs), ``confirm`` (without),
             ``progress`` (its action is under way), ``result`` (with the verdict and the preview of
@@ -311,6 +327,7 @@ class WizardSession:
             "token": self.token,
             "type": {"ended": "result", "aborted": "abort"}.get(self.state, "confirm"),
             "number": len(self._log.entries) + 1,
+            "of": self._about(),
             "errors": dict(self._errors),
             "can": self._can(),
             "result": self.result,
@@ -336,6 +353,13 @@ class WizardSession:
             "defaults": self._defaults(step),
         }
 
+    def _about(self) -> int | None:
+        """Return about how many steps there are; None where nobody knows."""
+        if not self.wizard.steps or self.step is None:
+            return None
+        rest = {"save": 0, "review": 1}.get(self.step.id, 2)
+        return max(self.wizard.steps, len(self._log.entries) + 1 + rest)
+
     def _can(self) -> list[str]:
         if self.state != "asking":
             return []
@@ -354,9 +378,9 @@ class WizardSession:
         """Answer the current step.
 
         Args:
-            token: of the step. The one before with the same answers changes nothing: so a call
-                whose answer was lost can be made again.
-            answers: by the names of inputs; None for none.
+            token: token of the step. The one before with the same answers changes nothing: so a
+                call whose answer was lost can be made again.
+            answers: answers by the names of inputs; None for none.
 
         Returns:
             :attr:`current`: the next step, or the same one with ``errors``.
@@ -456,17 +480,12 @@ class WizardSession:
     def _expect(self, token: str) -> PendingStep:
         request = self._run.request
         if self.state != "asking" or request is None:
-            raise CalibrationError(
-                f"the sequence is over ({self.state}); expected one that asks",
-                code=Code.NOT_POSSIBLE,
-                got=self.state,
+            raise Code.NOT_POSSIBLE.refusal(
+                f"the sequence is over ({self.state}); expected one that asks", got=self.state
             )
         if token != self.token:
-            raise CalibrationError(
-                "the step has changed meanwhile: look at the current one",
-                code=Code.STALE_STEP,
-                got=token,
-                expected=self.token,
+            raise Code.STALE_STEP.refusal(
+                "the step has changed meanwhile: look at the current one", self.token, token
             )
         return request
 
@@ -478,10 +497,8 @@ class WizardSession:
         return _ScriptRun(self.wizard, self.parameters, self._log.entries[:-1])
 
     def _impossible(self, what: str) -> CalibrationError:
-        return CalibrationError(
-            f"{what}: not possible here; expected one of {', '.join(self._can())}",
-            code=Code.NOT_POSSIBLE,
-            got=what,
+        return Code.NOT_POSSIBLE.refusal(
+            f"{what}: not possible here; expected one of {', '.join(self._can())}", got=what
         )
 
     async def _act(self, request: PendingStep, values: Answers) -> Any:
@@ -529,6 +546,7 @@ class WizardSession:
             entry = self._journal.append(entry)
         self._all.append(entry)
         self._log = self._log.then(entry)
+        self.resumed = None
         if run is not self._run:
             self._run.close()
             self._run = run
@@ -548,7 +566,7 @@ class WizardSession:
 
 
 def _shown_of(step: Step) -> dict[str, Any]:
-    """Return what stands beside the texts of a step."""
+    """Return the things that stand beside the texts of a step."""
     return {
         "verdict": None if step.verdict is None else asdict(step.verdict),
         "preview": None if step.preview is None else dict(step.preview),
@@ -564,7 +582,7 @@ def _stored(value: dict[str, Any], what: str) -> dict[str, Any]:
     try:
         read: dict[str, Any] = json.loads(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError) as exc:
-        raise CalibrationError(f"{what} cannot be stored: {exc}", code=Code.NOT_STORABLE) from exc
+        raise Code.NOT_STORABLE.refusal(f"{what} cannot be stored: {exc}") from exc
     return read
 
 

@@ -12,7 +12,6 @@ import itertools
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._files.directory import EXPORTS, Folder
 from smartcam.calibration._files.load import of_document
 from smartcam.calibration._files.store import keep_backup, read_document, replace_file
@@ -21,6 +20,7 @@ from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._listing import listing
 from smartcam.calibration.wizards._sequence import WizardSession
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
@@ -97,9 +97,8 @@ class CalibrationService:
             CalibrationError: ``NO_SEQUENCE``.
         """
         if self._session is None:
-            raise CalibrationError(
-                "no calibration is under way; expected one to be started",
-                code=Code.NO_SEQUENCE,
+            raise Code.NO_SEQUENCE.refusal(
+                "no calibration is under way; expected one to be started"
             )
         return self._session
 
@@ -114,9 +113,9 @@ class CalibrationService:
         """Start a wizard, or go on with the one of that name that was broken off.
 
         Args:
-            name: of the calibration.
-            wizard: which one; each has a journal of its own for a name.
-            parameters: for its start; one that is resumed has its own.
+            name: name of the calibration.
+            wizard: kind of the wizard; each kind has a journal of its own for a name.
+            parameters: parameters of the wizard's start; one that is resumed has its own.
             fresh: begin anew in any case. The journal of the run before is kept beside it.
 
         Returns:
@@ -129,15 +128,13 @@ class CalibrationService:
         """
         path = self.folder.journal(name, "" if wizard == KIND else wizard)
         if wizard not in self._wizards:
-            raise CalibrationError(
+            raise Code.NOT_FOUND.refusal(
                 f"no wizard is called {wizard!r}; expected one of {', '.join(self._wizards)}",
-                code=Code.NOT_FOUND,
                 got=wizard,
             )
         if self._session is not None and self._session.busy:
-            raise CalibrationError(
-                "an action is under way; expected it to end or to be aborted",
-                code=Code.NOT_POSSIBLE,
+            raise Code.NOT_POSSIBLE.refusal(
+                "an action is under way; expected it to end or to be aborted"
             )
         self.close()
         given = {**(parameters or {}), "name": name}
@@ -162,7 +159,7 @@ class CalibrationService:
         """Copy a calibration to a file of ``exports/``, as a backup or for another program.
 
         Args:
-            name: of the calibration.
+            name: name of the calibration.
             target: name of the file. With ``.json`` it is a copy, which :meth:`load` takes; with
                 ``.yaml`` the matrix, which PyYAML and ``cv2.FileStorage`` read, and
                 :func:`~smartcam.calibration.formats.read_matrix`.
@@ -187,12 +184,11 @@ class CalibrationService:
         if form is None and path.suffix == ".json":
             body = source.read_bytes()
         elif form is None and path.suffix != MATRIX:
-            raise CalibrationError(
+            raise Code.UNKNOWN_FORMAT.refusal(
                 f"{path.name}: expected the format to be named, or a file that ends in .json or "
                 f"{MATRIX}",
-                code=Code.UNKNOWN_FORMAT,
-                expected=[".json", MATRIX],
-                got=path.suffix,
+                [".json", MATRIX],
+                path.suffix,
             )
         else:
             calibration = PlaneCalibration.from_data(_of_kind(document, KIND, source.name))
@@ -208,7 +204,8 @@ class CalibrationService:
         """Load a calibration, of a plane or by a sheet, which :meth:`transform` then uses.
 
         Args:
-            name_or_path: its name; or with a ``/`` the path of an exported one, in the folder.
+            name_or_path: name of the calibration; with a ``/`` the path of an exported one in the
+                folder.
 
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read.
@@ -222,7 +219,7 @@ class CalibrationService:
         """Return the robot's pose for a pose in the camera's plane, by the loaded calibration.
 
         Args:
-            x: to the right, in the unit of the calibration.
+            x: coordinate to the right, in the unit of the calibration.
             y: upwards: of a sheet's calibration, whose pixels count down, -v.
             theta: counter-clockwise, radians.
             frame: frame that the pose must come out in; None for the calibration's.
@@ -232,16 +229,14 @@ class CalibrationService:
         """
         calibration = self._calibration
         if calibration is None:
-            raise CalibrationError(
-                "no calibration is loaded; expected one to be loaded first",
-                code=Code.NO_CALIBRATION,
+            raise Code.NO_CALIBRATION.refusal(
+                "no calibration is loaded; expected one to be loaded first"
             )
         if frame not in {None, calibration.robot_frame}:
-            raise CalibrationError(
+            raise Code.WRONG_FRAME.refusal(
                 f"frame {frame!r}: expected {calibration.robot_frame!r}",
-                code=Code.WRONG_FRAME,
-                got=frame,
-                expected=calibration.robot_frame,
+                calibration.robot_frame,
+                frame,
             )
         header = Header(next(self._numbers), datetime.now(UTC), calibration.camera_frame or "")
         pose = Pose(header, Position(x, y), Quaternion.from_theta(theta))
@@ -268,10 +263,7 @@ def _put_aside(path: Path) -> None:
 
 def _of_kind(document: Document, kind: str, name: str) -> dict[str, Any]:
     if document.kind != kind:
-        raise CalibrationError(
-            f"{name}: holds {document.kind!r}, expected {kind!r}",
-            code=Code.WRONG_KIND,
-            got=document.kind,
-            expected=kind,
+        raise Code.WRONG_KIND.refusal(
+            f"{name}: holds {document.kind!r}, expected {kind!r}", kind, document.kind
         )
     return document.data

@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._sheet.calibration import KIND, calibrate_sheet, fit_corners
 from smartcam.calibration._sheet.plane import look_at_sheet
 from smartcam.calibration._targets import Charuco
@@ -36,13 +34,12 @@ from smartcam.calibration.wizards._points import (
     PointSource,
     about_step,
     calibrated_plane,
-    judge_plane,
 )
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Step, StepVerdict, pick
+from smartcam.calibration.wizards._steps import Step, pick
 from smartcam.calibration.wizards._target_drawing import draw_sheet, place_in, with_ring
 from smartcam.calibration.wizards._target_steps import ask_target
-from smartcam.calibration.wizards._verdict import Judgement
+from smartcam.geometry import CameraModel
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -55,7 +52,7 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._steps import Answers
     from smartcam.calibration.wizards._touches import ReadRobot, Touch
 
-_DIAGONALS: Final = ((-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0))
+DIAGONALS: Final = ((-1.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0))
 """Directions in which the outermost points of a target lie, the origin first."""
 
 
@@ -88,8 +85,8 @@ def sheet_wizard(
         camera: the lens, kept with each picture; None: a homography of what is seen.
         connect: what :func:`smartcam.connect` takes for the camera, ``url`` among it, for the lines
             that use the result; None: it cannot be asked.
-        awaited: which picture ``take_picture`` waits for, for people: what
-            :attr:`PictureFolder.awaited` says; empty: it takes one.
+        awaited: description, for people, of the picture that ``take_picture`` waits for, as
+            :attr:`PictureFolder.awaited` says it; empty: ``take_picture`` takes one.
 
     Cancellation: a picture under way is given up; what looks for the target in it ends in its
     thread, and what that finds is dropped.
@@ -108,14 +105,16 @@ def sheet_wizard(
             typed=read_robot is None,
         )
         about = await ask(step)
-        target = await ask_target(suggested, known=parameters.get("target"))
+        target = await ask_target(
+            suggested, known=parameters.get("target"), square=parameters.get("square")
+        )
         source = _SheetSource(about, read_robot, target)
         # pixels count down, positions that are mapped count up
         source.connect = None if connect is None else {**connect, "y_down": True}
         await source.ask_picture(taker(take_picture), camera, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
-    return Wizard(name=KIND, version=1, script=script)
+    return Wizard(name=KIND, version=1, script=script, steps=10)
 
 
 class _SheetSource(PointSource):
@@ -176,7 +175,7 @@ class _SheetSource(PointSource):
 
     def _corners(self) -> list[dict[str, Any]]:
         """Return the points that were seen as choices, where the picture shows them."""
-        columns, view = _shape(self._target)[0], self._view
+        columns, view = shape_of(self._target)[0], self._view
         places = np.round(place_in(view.size, view.points), 1).tolist()
         return [
             {"at": at, "label": f"{1 + column}, {1 + row}", "answers": _answers(column, row)}
@@ -201,7 +200,7 @@ class _SheetSource(PointSource):
 
     async def _touch_corner(self, step_id: str, title: str, suggested: int) -> Touch:
         """Ask for the touch of a point of the target, or of another one that is named."""
-        columns, rows = _shape(self._target)
+        columns, rows = shape_of(self._target)
         row, column = divmod(suggested, columns)
         step = Step(
             id=step_id,
@@ -221,7 +220,7 @@ class _SheetSource(PointSource):
         )
 
     def _mark(self, column: int, row: int) -> Mark:
-        number = row * _shape(self._target)[0] + column
+        number = row * shape_of(self._target)[0] + column
         x, y, _ = self._target.points[number].tolist()
         return Mark(f"point {column + 1} of row {row + 1}", x, y, 0.0, number)
 
@@ -232,7 +231,7 @@ class _SheetSource(PointSource):
         """
         ids = self._view.ids
         places = self._target.points[ids, :2]
-        for direction in _DIAGONALS:
+        for direction in DIAGONALS:
             outermost = int(ids[int(np.argmax(places @ direction))])
             if outermost not in self._touched():
                 return outermost
@@ -275,13 +274,7 @@ class _SheetSource(PointSource):
             )
         notes += [f"{one.code}: {one.text}" for one in found.remarks]
         remarks = [[one.code.value, one.text] for one in found.warnings]
-        judgement = judge_plane(plane, predicted, " where the sheet lay")
-        if any(one.code == Code.POOR_FIT for one in found.remarks):
-            lens = "another lens" if found.camera else "a lens: --lens"
-            said = StepVerdict(
-                "poor", f"Not good enough: the picture wants {lens}, or a flat sheet"
-            )
-            judgement = Judgement(said, option="more")
+        judgement = found.judged()
         more = {"predicted_mm": predicted, "seen": seen, "rms_px": found.rms, "remarks": remarks}
         return Calibrated(found, figures | more | judgement.figures, tuple(notes), judgement)
 
@@ -305,7 +298,7 @@ def _answers(column: int, row: int) -> Answers:
     return {"column": 1 + column, "row": 1 + row}
 
 
-def _shape(target: Target) -> tuple[int, int]:
+def shape_of(target: Target) -> tuple[int, int]:
     """Return the number of points of a target's row, and the number of rows."""
     if isinstance(target, Charuco):
         return target.columns - 1, target.rows - 1

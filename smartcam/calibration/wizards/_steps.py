@@ -14,10 +14,13 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from smartcam.calibration._codes import Code
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
+
+if TYPE_CHECKING:
+    from smartcam.calibration._verdict import CalibrationVerdict
+    from smartcam.exceptions import CalibrationError
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """The JSON Schema that steps use."""
@@ -46,7 +49,7 @@ class Input(ABC):
     """One answer that a step asks for.
 
     Attributes:
-        name: of the answer.
+        name: name of the answer.
         label: what people read.
         default: what stands there at first; None: nothing.
     """
@@ -188,25 +191,12 @@ def pick(name: str, label: str, count: int, default: int) -> Number:
     return Number(name=name, label=label, integer=True, minimum=1, maximum=count, default=default)
 
 
-@dataclass(frozen=True, slots=True)
-class StepVerdict:
-    """What something is worth, on top of a step that shows it.
-
-    Attributes:
-        level: ``good``, ``poor`` (not good enough), or ``unknown``.
-        text: the same in words, and what to do about it.
-    """
-
-    level: Literal["good", "poor", "unknown"]
-    text: str
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
     """A page of a wizard: texts to show, and inputs to ask for.
 
     Attributes:
-        id: of the step; the same one may come again.
+        id: name of the step; the same one may come again.
         title: one line.
         description: what to do now.
         button: what stands on the button that goes on.
@@ -225,7 +215,7 @@ class Step:
     button: str = "Next"
     inputs: tuple[Input, ...] = ()
     notes: tuple[str, ...] = ()
-    verdict: StepVerdict | None = None
+    verdict: CalibrationVerdict | None = None
     preview: Mapping[str, Any] | None = field(default=None, compare=False)
     waiting: str = ""
     timeout: float = 30.0
@@ -293,14 +283,14 @@ def _with_default(one: Input, parameters: Mapping[str, Any]) -> Input:
     try:
         return replace(one, default=one.checked(value))
     except ValueError as exc:
-        raise CalibrationError(
-            f"parameter {one.name}: {exc}", code=Code.WRONG_ANSWERS, got={one.name: str(exc)}
+        raise Code.WRONG_ANSWERS.refusal(
+            f"parameter {one.name}: {exc}", got={one.name: str(exc)}
         ) from exc
 
 
 def _wrong(errors: dict[str, str]) -> CalibrationError:
     text = "; ".join(text if name == "base" else f"{name}: {text}" for name, text in errors.items())
-    return CalibrationError(text, code=Code.WRONG_ANSWERS, got=errors)
+    return Code.WRONG_ANSWERS.refusal(text, got=errors)
 
 
 # ---------------------------------------------------------------------- the thesis' lists
@@ -312,7 +302,8 @@ def as_lists(step: Step) -> dict[str, list[Any]]:
     Returns:
         ``descriptions_for_needed_values``, ``default_needed_values`` and the same for ``strings``
         and ``options``. An option is one text, ``"DEFAULT OPT1 OPT2 ..."``; a flag is an option of
-        ``no`` and ``yes``; a number without a default has 0.0.
+        ``no`` and ``yes``; a number without a default has 0.0, which of one that may be missing and
+        cannot be 0 means none.
 
     Source: thesis Figure 2.9 (published).
     """
@@ -366,5 +357,7 @@ def from_lists(
         value = given[_as_listed(one, None)[0]].pop(0)
         if isinstance(one, Flag):
             value = _YES_NO.get(value, value)
+        elif isinstance(one, Number) and one.optional and value == 0.0 < one.minimum:
+            value = None
         answers[one.name] = value
     return answers

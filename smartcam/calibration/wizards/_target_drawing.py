@@ -11,21 +11,20 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._detection.image import grey_image
-from smartcam.calibration._geometry.rotations import as_points
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._svg import line, polygon, round_down, text
-from smartcam.exceptions import CalibrationError
+from smartcam.calibration._svg import circle, document, line, polygon, rectangle, round_down, text
+from smartcam.geometry import Code
+from smartcam.geometry._inside import as_points
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._sheet.plane import SheetPlane
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry._inside import Array
 
 MAX_SIDE: Final = 640
 """Width and height at most of the camera's picture in the preview, pixels."""
@@ -43,7 +42,7 @@ LONGEST: Final = 0.05
 END: Final = "</svg>"
 
 STYLE: Final = """\
-text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px }
+text { font: 13px sans-serif; fill: #333 } .title { font-size: 16px } .paper { fill: #fff }
 .covered { fill: #2e8b57; fill-opacity: 0.25 } .point { fill: none; stroke: #1f5fbf; \
 stroke-width: 1.5 }
 .origin { fill: #1f5fbf } .residual { stroke: #c0392b; stroke-width: 1.5 }
@@ -93,26 +92,22 @@ def draw(
     """
     grey = grey_image(image)
     if view is not None and view.size != grey.size:
-        raise CalibrationError(
+        raise Code.SHAPE.refusal(
             f"preview: expected a view of an image of {grey.size[0]} x {grey.size[1]} pixels, "
             f"got one of {view.size[0]} x {view.size[1]}",
-            code=Code.SHAPE,
-            expected=grey.size,
-            got=view.size,
+            grey.size,
+            view.size,
         )
     canvas = _Canvas(*grey.size)
     width, height = WIDTH + 2 * BORDER, canvas.height + HEAD + FOOT
     counts = cell_counts([*earlier, view] if view is not None else earlier)
     lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
-        f'viewBox="0 0 {width:.0f} {height:.0f}">',
-        f"<style>{STYLE}</style>",
-        f'<rect width="{width:.0f}" height="{height:.0f}" fill="#fff"/>',
         f'<image x="{BORDER:.0f}" y="{HEAD:.0f}" width="{WIDTH:.0f}" height="{canvas.height:.2f}" '
         f'href="data:image/png;base64,{_png(grey.bytes)}"/>',
         *canvas.covered(counts),
     ]
-    texts = ["no target found" if view is None else _found(view), _seen(counts, earlier, view)]
+    found = f"{len(view.ids)} of {len(view.target.points)} points" if view else "no target found"
+    texts = [found, _seen(counts, earlier, view)]
     if suggested is not None:
         lines.append(canvas.outline(as_points(suggested, 2, "suggested outline")))
     if view is not None and predicted is not None:
@@ -126,7 +121,7 @@ def draw(
     if title:
         lines.append(text((BORDER, 26), title, "title"))
     lines.append(text((BORDER, HEAD + canvas.height + 24), "; ".join(texts)))
-    return "\n".join([*lines, END]) + "\n"
+    return document(width, height, lines, STYLE)
 
 
 def draw_sheet(image: Any, view: TargetView, plane: SheetPlane) -> str:
@@ -140,16 +135,13 @@ def draw_sheet(image: Any, view: TargetView, plane: SheetPlane) -> str:
     parts: list[str] = []
     for (u, v), name, kind in zip(ends, "AB", "xy", strict=True):
         if np.isfinite([*origin, u, v]).all():
-            place = f'x="{u + 8:.2f}" y="{v - 8:.2f}"'
-            parts += [
-                line(origin, (u, v), kind),
-                f'<text {place} class="name" style="font-size:26px">{name}</text>',
-            ]
+            large = ' style="font-size:26px"'
+            parts += [line(origin, (u, v), kind), text((u + 8, v - 8), name, "name", large)]
     return _with(draw(image, view=view, title="The sheet, its origin and rays"), parts)
 
 
 def place_in(size: tuple[int, int], pixels: Array) -> Array:
-    """Return where a picture of :func:`draw` shows pixels (N, 2), in the SVG's own units.
+    """Return the places of pixels (N, 2) in a picture of :func:`draw`, in the SVG's own units.
 
     ``size``: width and height of the camera's image, pixels.
     """
@@ -161,17 +153,12 @@ def with_ring(svg: str, size: tuple[int, int], pixel: Array) -> str:
 
     ``size``: width and height of the camera's image, pixels.
     """
-    x, y = _Canvas(*size).place(pixel)
-    return _with(svg, [f'<circle cx="{x:.2f}" cy="{y:.2f}" r="24" class="suggested"/>'])
+    return _with(svg, [circle(_Canvas(*size).place(pixel), 24, "suggested")])
 
 
 def _with(svg: str, parts: Sequence[str]) -> str:
     head, _, tail = svg.rpartition(END)
     return "\n".join([head.rstrip("\n"), *parts, END]) + tail
-
-
-def _found(view: TargetView) -> str:
-    return f"{len(view.ids)} of {len(view.target.points)} points"
 
 
 def _seen(counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetView | None) -> str:
@@ -183,12 +170,7 @@ def _seen(counts: NDArray[np.intp], earlier: Sequence[TargetView], view: TargetV
 def _shaped(given: ArrayLike, count: int) -> Array:
     points = as_points(given, 2, "preview")
     if len(points) != count:
-        raise CalibrationError(
-            f"preview: expected {count} points, got {len(points)}",
-            code=Code.SHAPE,
-            expected=count,
-            got=len(points),
-        )
+        raise Code.SHAPE.unexpected(f"preview: expected {count} points", count, len(points))
     return points
 
 
@@ -204,7 +186,7 @@ def _png(image: NDArray[np.uint8]) -> str:
 
 
 class _Canvas:
-    """Where an image's pixels lie in the preview."""
+    """The place of an image's pixels in the preview."""
 
     def __init__(self, width: int, height: int) -> None:
         self.zoom = WIDTH / width
@@ -219,15 +201,12 @@ class _Canvas:
         rows, columns = counts.shape
         wide, high = WIDTH / columns, self.height / rows
         for row, column in np.argwhere(counts).tolist():
-            yield (
-                f'<rect x="{BORDER + column * wide:.2f}" y="{HEAD + row * high:.2f}" '
-                f'width="{wide:.2f}" height="{high:.2f}" class="covered"/>'
-            )
+            place = (BORDER + column * wide, HEAD + row * high)
+            yield rectangle(place, (wide, high), 'class="covered"')
 
     def points(self, view: TargetView) -> Iterator[str]:
-        for number, (x, y) in zip(view.ids.tolist(), self.place(view.points), strict=True):
-            kind = "point" if number else "point origin"
-            yield f'<circle cx="{x:.2f}" cy="{y:.2f}" r="5" class="{kind}"/>'
+        for number, place in zip(view.ids.tolist(), self.place(view.points), strict=True):
+            yield circle(place, 5, "point" if number else "point origin")
 
     def residuals(self, view: TargetView, predicted: Array) -> tuple[list[str], str]:
         """Return the lines, and what the legend says of them."""

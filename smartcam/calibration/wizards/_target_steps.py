@@ -6,13 +6,12 @@ import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration._printing.page_layout import RULER
 from smartcam.calibration._printing.sheets import scaled
 from smartcam.calibration._targets import target_from_data, target_to_data
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Flag, Number, Option, Step, Text
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -68,15 +67,20 @@ def ruler(name: str, along: str = "") -> Number:
     )
 
 
-async def ask_target(suggested: Target | None = None, *, known: object = None) -> Target:
+async def ask_target(
+    suggested: Target | None = None, *, known: object = None, square: float | None = None
+) -> Target:
     """Ask what is on the sheet, and how large it was printed: lengths are those on paper.
 
     ``suggested``: the default of what is asked. ``known``: a description of the target, which is
-    not asked then; None: there is none.
+    not asked then; None: there is none. ``square``: the default of a square's side, mm.
     Refused as a step shows it: what is no description of a target, or rulers that
     :func:`~smartcam.calibration.scaled` refuses.
     """
-    target = await _which_target(suggested) if known is None else target_from_data(_checked(known))
+    if known is None:
+        target = await _which_target(suggested, square)
+    else:
+        target = target_from_data(_checked(known))
     step = Step(
         id="rulers",
         title="Was the sheet printed true to size?",
@@ -88,7 +92,7 @@ async def ask_target(suggested: Target | None = None, *, known: object = None) -
     return scaled(target, (measured["ruler_x"], measured["ruler_y"]))
 
 
-async def _which_target(suggested: Target | None) -> Target:
+async def _which_target(suggested: Target | None, square: float | None) -> Target:
     kinds = Option(
         name="kind",
         label="What is printed on the sheet",
@@ -115,7 +119,8 @@ async def _which_target(suggested: Target | None) -> Target:
         except (ValueError, RecursionError):
             data = None
         return target_from_data(_checked(data))
-    given = await ask(Step(id="target", title="What is on it", inputs=_INPUTS[kind]))
+    step = Step(id="target", title="What is on it", inputs=_INPUTS[kind])
+    given = await ask(step.with_defaults({"square": square}))
     lengths = {one.name for one in _INPUTS[kind] if isinstance(one, Number) and one.unit}
     values = {
         name: 1e-3 * value if name in lengths and value is not None else value
@@ -128,6 +133,6 @@ def _checked(data: object) -> dict[str, Any]:
     if not isinstance(data, dict):
         wrong = "expected the description of a target, such as "
         wrong += '{"kind": "checkerboard", "columns": 9, "rows": 6, "square": 0.025}'
-        raise CalibrationError(wrong, code=Code.WRONG_ANSWERS, got={"description": wrong})
+        raise Code.WRONG_ANSWERS.refusal(wrong, got={"description": wrong})
     found: dict[str, Any] = data
     return found

@@ -16,10 +16,10 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration.wizards._marks import Mark
     from smartcam.calibration.wizards._touches import Touch
+    from smartcam.geometry._inside import Array
 
 CELLS = 24
 """Cells of the heat map along its longer side."""

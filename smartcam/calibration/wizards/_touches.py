@@ -9,20 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
 from smartcam.calibration.wizards._marks import Mark, choose
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Number, Option, Step
 from smartcam.calibration.wizards._touch_previews import before
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 from smartcam.models import Pose, Quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration.wizards._sequence import StepAnswer
     from smartcam.calibration.wizards._steps import Answers
+    from smartcam.geometry._inside import Array
 
 ReadRobot = Callable[[], Awaitable[Pose]]
 """Returns where the robot's tip is, in the robot's base, metres; its z points out of the tool."""
@@ -48,6 +47,16 @@ SIGMA = Number(
     optional=True,
 )
 """Asks for a touch's sigma."""
+
+ALLOWED = Number(
+    name="allowed",
+    label="Largest error that is good enough; empty: a hundredth of the touched field",
+    unit="mm",
+    minimum=1e-3,
+    maximum=1e4,
+    optional=True,
+)
+"""Asks for the error that is allowed."""
 
 SIDES: Mapping[str, Vector | None] = {
     "-z": (0.0, 0.0, -1.0),
@@ -86,7 +95,7 @@ class Touches:
     Attributes:
         about: answers of the first step: ``touch_sigma``, and where the robot's pose is typed
             ``unit`` and ``side``, if they were asked for.
-        marks: those of the last picture.
+        marks: marks of the last picture.
         camera_unit: unit of the camera's positions.
     """
 
@@ -100,7 +109,7 @@ class Touches:
 
     @property
     def places(self) -> list[Vector]:
-        """Where the tip was at each touch, metres."""
+        """Positions of the tip at the touches, metres."""
         return [one.robot for one in self.touches]
 
     @property
@@ -119,12 +128,7 @@ class Touches:
         """Raise (SHAPE) where some more touches are too many."""
         count = len(self.touches) + more
         if count > most:
-            raise CalibrationError(
-                f"{count} {noun}, expected {most} at most",
-                code=Code.SHAPE,
-                got=count,
-                expected=most,
-            )
+            raise Code.SHAPE.refusal(f"{count} {noun}, expected {most} at most", most, count)
 
     async def add_marks(self, rows: Sequence[Mapping[str, Any]], most: int, noun: str) -> None:
         """Ask which marks of a picture are touched, and for their touches.

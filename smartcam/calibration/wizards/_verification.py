@@ -14,17 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
+from smartcam._extras import load
 from smartcam.calibration._files.store import read_document
-from smartcam.calibration._optional_imports import load
 from smartcam.calibration._plane.calibration import STALE_LEVEL, PlaneCalibration
+from smartcam.calibration._verdict import CalibrationVerdict
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._marks import MarkCamera
 from smartcam.calibration.wizards._sequence import Wizard, ask
-from smartcam.calibration.wizards._steps import Option, Step, StepVerdict
+from smartcam.calibration.wizards._steps import Option, Step
 from smartcam.calibration.wizards._touch_previews import compared
 from smartcam.calibration.wizards._touches import SIGMA, UNIT, Touches
-from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.calibration import Drift
     from smartcam.calibration.wizards._marks import Localize
     from smartcam.calibration.wizards._sequence import StepAnswer
     from smartcam.calibration.wizards._steps import Answers
     from smartcam.calibration.wizards._touches import ReadRobot
+    from smartcam.geometry._inside import Array
 
 WIZARD = "drift"
 """Name of the wizard."""
@@ -92,7 +92,7 @@ def drift_wizard(
         about = await ask(step, partial(_loaded, find, name, camera))
         return await _DriftCheck(about, read_robot, camera, name, record_to).run()
 
-    return Wizard(name=WIZARD, version=1, script=script)
+    return Wizard(name=WIZARD, version=1, script=script, steps=5)
 
 
 def touches_needed(
@@ -157,9 +157,8 @@ async def _loaded(
     calibration = PlaneCalibration.load(file)
     camera.check_y_down(calibration.y_down, f"{name} was made")
     if calibration.touch_sigma is None and answers["touch_sigma"] is None:
-        raise CalibrationError(
+        raise Code.WRONG_ANSWERS.refusal(
             f"{name} does not tell how well a touch repeats: expected the touches' sigma",
-            code=Code.WRONG_ANSWERS,
             got={"touch_sigma": "no answer, and the calibration has none: expected one"},
         )
     document = read_document(file)
@@ -212,12 +211,11 @@ class _DriftCheck(Touches):
         wanted = self.calibration.camera_frame
         frames = {row["frame_id"] for row in rows} - {wanted}
         if wanted is not None and frames:
-            raise CalibrationError(
+            raise Code.WRONG_FRAME.refusal(
                 f"the camera's localizations are in frame {min(frames)!r}, the calibration "
                 f"expected {wanted!r}",
-                code=Code.WRONG_FRAME,
-                got=min(frames),
-                expected=wanted,
+                wanted,
+                min(frames),
             )
         self.calibration.transform([(row["x"], row["y"]) for row in rows])
         return rows
@@ -249,9 +247,9 @@ class _DriftCheck(Touches):
             if stale
             else "",
             notes=tuple(_notes(figures)),
-            verdict=StepVerdict("poor", f"Stale: {figures['rms_mm']:.1f} mm rms off")
+            verdict=CalibrationVerdict("poor", f"Stale: {figures['rms_mm']:.1f} mm rms off")
             if stale
-            else StepVerdict("good", f"Still true: {figures['rms_mm']:.1f} mm rms off"),
+            else CalibrationVerdict("good", f"Still true: {figures['rms_mm']:.1f} mm rms off"),
             button="Go on",
             inputs=(
                 Option(
@@ -299,11 +297,10 @@ class _DriftCheck(Touches):
             if checks.header is None:
                 checks.start({"schema": CHECKS, "name": self.name})
             elif checks.header.get("schema") != CHECKS:
-                raise CalibrationError(
+                raise Code.BROKEN_FILE.refusal(
                     f"{file.name}: schema {checks.header.get('schema')!r}, expected {CHECKS!r}",
-                    code=Code.BROKEN_FILE,
-                    got=checks.header.get("schema"),
-                    expected=CHECKS,
+                    CHECKS,
+                    checks.header.get("schema"),
                 )
             checks.append(
                 {

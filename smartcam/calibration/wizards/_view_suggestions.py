@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._lens.guide import suggest_views
-from smartcam.calibration._lens.intrinsics import LEAST_VIEWS, calibrate_intrinsics
+from smartcam.calibration._lens.intrinsics import MIN_VIEWS, calibrate_intrinsics
 from smartcam.calibration.formats._robots import rotation_zyx
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._lens.guide import NextView
     from smartcam.calibration._targets import Target
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry._inside import Array
 
 
 class Look(NamedTuple):
@@ -58,11 +58,11 @@ LOOKS: Final = (
 """The views, in the order in which they are best taken."""
 
 ROLLS: Final = (0.0, math.pi / 2, -math.pi / 2)
-"""About the line of sight, one after the other: a robot's camera has need of it, a lens has not."""
+"""Turns about the line of sight, radians, one after the other: a robot's camera needs them."""
 
 
 class Suggestion(NamedTuple):
-    """What is suggested after some views."""
+    """The suggestion for the next view."""
 
     text: str  # for people
     outline: Array  # (4, 2), of the target in the image, pixels
@@ -70,9 +70,9 @@ class Suggestion(NamedTuple):
 
 
 def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
-    """Return what comes after views (one or more) of one target.
+    """Return the next view to take after views (one or more) of one target.
 
-    ``lens_known``: whether nothing of the lens is to be told from them.
+    ``lens_known``: True if the views need not tell anything of the lens.
     """
     guided = None if lens_known else _guided(views)
     if guided is None:
@@ -88,7 +88,7 @@ def suggestion(views: Sequence[TargetView], *, lens_known: bool) -> Suggestion:
 
 def _guided(views: Sequence[TargetView]) -> NextView | None:
     """Return the view that helps the lens most; None where the views do not tell it yet."""
-    if len(views) < LEAST_VIEWS:
+    if len(views) < MIN_VIEWS:
         return None
     try:
         lens = calibrate_intrinsics(views)

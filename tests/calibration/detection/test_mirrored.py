@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, Target
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
+from smartcam.calibration._inside import Target
 from tests.calibration.scenes import drawn, refused
 
 

@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration import fit_plane
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.homography import fit_homography
-from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
-from smartcam.calibration._hand_eye.equations import RobotSigmas
+from smartcam.calibration import Code, RobotSigmas, calibrate_hand_eye, fit_plane
+from smartcam.calibration._homography import fit_homography
 from tests.calibration.scenes import CAMERA, refused, scene
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 SIGMAS = RobotSigmas(1e-4, 1e-4)
 METHODS = ("tsai", "park", "horaud", "andreff", "daniilidis")

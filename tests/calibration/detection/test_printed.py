@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._printing.sheets import Rays, Sheet, make_sheet
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, Target
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Sheet, find_target, make_sheet
+from smartcam.calibration._inside import Target
+from smartcam.calibration._printing.sheets import Rays
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._targets import Charuco, CircleGrid
+from smartcam.calibration import Charuco, CircleGrid, find_target
 from tests.calibration.scenes import off_plane
 
 DATA = os.environ.get("SMARTCAM_DATA")

@@ -6,15 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
+from smartcam.calibration import CameraModel, Checkerboard, CircleGrid, Code, find_target
 from smartcam.calibration._detection.corners import UNREFINED, refine_corners
 from smartcam.calibration._detection.dots import UNREFINED as UNREFINED_DOT
 from smartcam.calibration._detection.dots import GridMap, refine_dots
-from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._detection.image import grey_image
-from smartcam.calibration._geometry.homography import apply_homography, fit_homography
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Checkerboard, CircleGrid
+from smartcam.calibration._homography import apply_homography, fit_homography
 from tests.calibration.scenes import BENT, STRAIGHT, drawn, facing, refused
 
 BOARD = Checkerboard(columns=9, rows=6, square=0.025)

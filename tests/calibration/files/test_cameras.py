@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code
-from smartcam.calibration._files.storage import motion_from_data, motion_to_data
-from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
-from smartcam.calibration._views import TargetView
+from smartcam.calibration import (
+    CameraModel,
+    Code,
+    IntrinsicCalibration,
+    StereoCalibration,
+    TargetView,
+    calibrate_intrinsics,
+    calibrate_stereo,
+)
+from smartcam.geometry._inside import motion_from_data, motion_to_data
 from tests.calibration.lenskit import BOARD, LEFT, pairs, poses, seen
 
 

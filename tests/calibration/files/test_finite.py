@@ -10,20 +10,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.calibration import fit_plane
-from smartcam.calibration._files.store import write
-from smartcam.calibration._geometry.solvers import (
-    CameraPosition2D,
+from smartcam.calibration import (
     Chain,
+    HandEyeCalibration,
+    PlaneCalibration,
     PlaneProjection,
+    RobotSigmas,
+    SheetCalibration,
+    StereoCalibration,
+    calibrate_hand_eye,
+    calibrate_sheet,
+    calibrate_stereo,
     chain_of,
+    fit_corners,
+    fit_plane,
 )
-from smartcam.calibration._hand_eye.calibration import calibrate_hand_eye
-from smartcam.calibration._hand_eye.equations import RobotSigmas
-from smartcam.calibration._hand_eye.result import HandEyeCalibration
-from smartcam.calibration._plane.calibration import PlaneCalibration
-from smartcam.calibration._sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
-from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
+from smartcam.calibration._files.store import write
+from smartcam.calibration._solvers import CameraPosition2D
 from smartcam.calibration.simulation import _scenes as scenes
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Localization

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from smartcam.calibration._files import store
+from smartcam import _whole_files
 from smartcam.calibration._files.store import keep_backup, read, replace_file, write
 from smartcam.exceptions import CalibrationError
 
@@ -71,7 +71,7 @@ def test_many_writers_at_once_leave_whole_files_and_the_last_ones(tmp_path: Path
 def test_many_threads_replace_without_locks_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "try_lock", lambda _: None)  # a file system that knows none
+    monkeypatch.setattr(_whole_files, "try_lock", lambda _: None)  # a file system that knows none
     path = tmp_path / "a"
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(lambda n: replace_file(path, b"%d" % n, backups=2), range(20)))
@@ -188,10 +188,10 @@ def test_write_that_the_disk_refuses_is_told_as_ours(tmp_path: Path) -> None:
 def test_write_waits_for_another_one_but_not_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "LOCK_TIMEOUT", 0.0)
+    monkeypatch.setattr(_whole_files, "LOCK_TIMEOUT", 0.0)
     path = tmp_path / "a.json"
     write(path, "plane", {"n": 1})
-    with store._writing(path):
+    with _whole_files._writing(path):
         assert refused(path)[0] == "IN_USE"
     assert read(path, "plane") == {"n": 1}
 

@@ -10,23 +10,16 @@ import pytest
 import yaml
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code
-from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._stereo.rectification import rectify
+from smartcam.calibration import CameraModel, Code, calibrate_intrinsics
+from smartcam.calibration._inside import parse_camera_info, rectify
+from smartcam.calibration.formats import CameraChain, read_cameras, write_camera_info, write_cameras
 from smartcam.calibration.formats._cameras import (
     FORMS,
-    CameraChain,
     CameraForm,
     compose_camchain,
     compose_camera_info,
     compose_opencv,
-    parse_camchain,
-    parse_camera_info,
     parse_opencv,
-    read_cameras,
-    write_camera_info,
-    write_cameras,
 )
 from tests.calibration.lenskit import FISHEYE, LEFT, RIG, RIGHT, WIDE, poses, seen
 
@@ -128,7 +121,7 @@ def test_opencv_file_is_read_by_opencv_and_pyyaml(tmp_path: Path, chain: CameraC
     if not single:
         assert storage.getNode("T").mat().ravel().tolist() == RIG.translation.tolist()
     storage.release()
-    assert parse_opencv(compose_opencv(chain)).cameras[0].distortion_model == "plumb_bob"
+    assert parse_opencv(compose_opencv(chain)).value.cameras[0].distortion_model == "plumb_bob"
 
 
 def test_opencv_file_of_its_own_storage_is_read(tmp_path: Path) -> None:
@@ -192,23 +185,30 @@ def test_chain_without_a_transform_between_cameras_raises() -> None:
 @pytest.mark.parametrize(
     ("form", "old", "new", "code", "text"),
     [
-        ("camera_info", "image_width: 640", "", Code.MALFORMED, "the keys image_width"),
-        ("camera_info", "640", "-640", Code.MALFORMED, "image_width: expected a whole number"),
-        ("camera_info", "640", "0", Code.MALFORMED, "image_width: expected 1 to 1000000"),
-        ("camera_info", "cols: 5", "cols: 4", Code.MALFORMED, "4 numbers for 1 x 4, got '5'"),
+        ("camera_info", "image_width: 640", "", Code.MALFORMED, "a list of 2"),
+        ("camera_info", "640", "-640", Code.MALFORMED, "size of the images: expected a whole num"),
+        ("camera_info", "640", "0", Code.MALFORMED, "size of the images: expected 1 to 1000000"),
+        (
+            "camera_info",
+            "cols: 5",
+            "cols: 4",
+            Code.MALFORMED,
+            "expected a list of 4, got a list of 5",
+        ),
         ("camera_info", "plumb_bob", "fov", Code.MALFORMED, "distortion_model: expected plumb_bob"),
         ("camera_info", "530.0", ".nan", Code.NOT_FINITE, "camera_matrix"),
         ("camera_info", "530.0", "-530.0", Code.SHAPE, "positive focal lengths"),
         ("camera_info", "rows: 3", "rows: 2", Code.MALFORMED, "camera_matrix: expected"),
         ("camera_info", '"camera"', "[a]", Code.MALFORMED, "camera_name: expected a text"),
         ("kalibr", "pinhole", "omni", Code.MALFORMED, "cam0.camera_model: expected pinhole"),
-        ("kalibr", "radtan", "fov", Code.MALFORMED, "radtan or equidistant, got 'fov'"),
+        ("kalibr", "radtan", "fov", Code.MALFORMED, "one of radtan, equidistant, got 'fov'"),
         ("kalibr", "cam1", "cam7", Code.MALFORMED, "the keys cam0, cam1"),
         ("kalibr", "T_cn_cnm1", "T_other", Code.MALFORMED, "the keys T_cn_cnm1"),
         ("kalibr", "[ 530.0, ", "[ ", Code.MALFORMED, "cam0.intrinsics: expected a list of 4"),
-        ("opencv", "image_height", "height", Code.MALFORMED, "the keys image_width"),
-        ("opencv", "M2", "M3", Code.MALFORMED, "the keys M2, D2"),
-        ("opencv", "R:", "Q:", Code.MALFORMED, "the keys R, T"),
+        ("opencv", "image_height", "height", Code.MALFORMED, "size: expected a list of 2"),
+        ("opencv", "M2", "M3", Code.MALFORMED, r"cameramatrix2 \(or"),
+        ("opencv", "D2", "M_2", Code.MALFORMED, "each name once, got 'M_2'"),
+        ("opencv", "R:", "Q:", Code.MALFORMED, "R and T from the first camera to the second"),
         ("opencv", "rows: 3\n   cols: 1", "rows: 1\n   cols: 2", Code.MALFORMED, "T: expected"),
     ],
 )
@@ -216,7 +216,7 @@ def test_read_cameras_of_a_spoiled_file_raises(
     tmp_path: Path, form: CameraForm, old: str, new: str, code: Code, text: str
 ) -> None:
     chain = ONE if form == "camera_info" else TWO
-    whole = FORMS[form].compose(chain)
+    whole = FORMS[form].text(chain)
     assert old in whole
     (tmp_path / "file").write_text(whole.replace(old, new, 1))
     with pytest.raises(CalibrationError, match=text) as caught:
@@ -236,7 +236,7 @@ def test_read_cameras_of_what_is_no_text_raises(tmp_path: Path, content: bytes, 
 
 def test_camchain_of_too_many_cameras_raises() -> None:
     with pytest.raises(CalibrationError, match="64 cameras at most, got '65'"):
-        parse_camchain("".join(f"cam{number}: {{}}\n" for number in range(65)))
+        FORMS["kalibr"].parse("".join(f"cam{number}: {{}}\n" for number in range(65)))
 
 
 def test_read_cameras_in_a_format_of_no_name_raises(tmp_path: Path) -> None:

@@ -19,10 +19,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from smartcam.calibration import Chain, PlaneCalibration, PlaneProjection, Transform, fit_plane
 from smartcam.calibration._files.store import write
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.solvers import Chain, PlaneProjection
-from smartcam.calibration._plane.calibration import PlaneCalibration, PlaneModel, fit_plane
+from smartcam.calibration._plane.calibration import PlaneModel
 from smartcam.calibration.formats import (
     SAMPLES,
     TRAJECTORIES,
@@ -41,9 +40,9 @@ from smartcam.calibration.formats import (
 )
 from smartcam.calibration.formats._opencv import compose_matrix
 from smartcam.calibration.formats._plain import real
-from smartcam.calibration.wizards._services import CalibrationService
+from smartcam.calibration.wizards import CalibrationService
 from tests import ROOT
-from tests.calibration.geometry.rigid import (
+from tests.geometry.rigid import (
     FEW,
     NOON,
     after,
@@ -54,6 +53,9 @@ from tests.calibration.geometry.rigid import (
 )
 
 MOVEIT = ROOT / "tests/data/moveit_calibration/pose_samples.json"
+
+WRITTEN = [name for name, form in TRANSFORMS.items() if form.compose is not None]
+"""Formats of transforms that are not only read."""
 
 TURNED = Transform(
     "base",
@@ -69,7 +71,7 @@ def written(tmp_path: Path, form: str, transform: Transform = TURNED) -> str:
     return (tmp_path / "file").read_text()
 
 
-def read(tmp_path: Path, form: str, text: str, **names: str) -> Transform:
+def read(tmp_path: Path, form: str, text: str, **names: Any) -> Transform:
     (tmp_path / "file").write_text(text)
     return read_transform(tmp_path / "file", form, **names)
 
@@ -89,7 +91,7 @@ def table(model: PlaneModel = "similarity", scale: float = 0.001) -> PlaneCalibr
 # ---------------------------------------------------------------------- transforms
 
 
-@pytest.mark.parametrize("form", TRANSFORMS)
+@pytest.mark.parametrize("form", WRITTEN)
 @FEW
 @given(transform=transforms("base", "cam"))
 def test_transform_written_and_read_is_the_same(
@@ -250,7 +252,7 @@ def test_matrix_that_opencv_writes_is_read(tmp_path: Path) -> None:
     storage.write("camera_matrix", np.eye(3))
     storage.write("T_base_cam", matrix)
     storage.release()
-    found = read_transform(tmp_path / "t.yaml", "opencv", target="base", source="cam")
+    found = read_transform(tmp_path / "t.yaml", "opencv", target="base", source="cam", unit="m")
     assert found.rotation.tolist() == TURNED.rotation.tolist()
     assert (found.label, found.translation.tolist()) == ("T_base_cam", [0.4, -1e-7, 1.0])
 
@@ -260,7 +262,7 @@ def test_rotation_printed_with_few_decimals_is_made_one(tmp_path: Path, decimals
     rows = [*np.column_stack([TURNED.rotation, TURNED.translation]).round(decimals), [0, 0, 0, 1]]
     data = ", ".join(str(value) for row in rows for value in row)
     text = f"%YAML:1.0\n---\nM: !!opencv-matrix {{rows: 4, cols: 4, dt: d, data: [{data}]}}\n"
-    found = read(tmp_path, "opencv", text)
+    found = read(tmp_path, "opencv", text + "unit: m\n")
     assert np.allclose(found.rotation, TURNED.rotation, rtol=0, atol=2 * 10.0**-decimals)
     assert np.allclose(found.rotation @ found.rotation.T, np.eye(3), rtol=0, atol=1e-6)
 
@@ -499,7 +501,7 @@ def test_plane_frame_of_a_map_that_has_none_is_refused(model: PlaneModel) -> Non
         plane_frame(table(model))
 
 
-@pytest.mark.parametrize("form", TRANSFORMS)
+@pytest.mark.parametrize("form", WRITTEN)
 def test_plane_in_every_format_has_its_scale_in_a_comment(tmp_path: Path, form: str) -> None:
     calibration = table(scale=0.00025)
     text = compose(form, calibration)
@@ -563,7 +565,8 @@ def test_export_in_a_format_is_the_frame_of_the_plane(tmp_path: Path, form: str)
     ("model", "target", "form", "code", "text"),
     [
         ("homography", "a.yaml", "opencv", "NOT_SIMILAR", "homography: expected one scale"),
-        ("rigid", "a.yaml", "urdf", "UNKNOWN_FORMAT", "no format is called 'urdf'"),
+        ("rigid", "a.yaml", "xacro", "UNKNOWN_FORMAT", "no format is called 'xacro'"),
+        ("rigid", "a.txt", "matrix", "UNKNOWN_FORMAT", "a bare matrix"),
         ("rigid", "a.json", "opencv", "BAD_NAME", "a name that ends in .yaml, got .json"),
         ("rigid", "a.yaml", "tf", "BAD_NAME", "a name that ends in .txt, got .yaml"),
     ],

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smartcam.calibration._geometry.frames import Transform
+from smartcam.calibration import Transform
 from smartcam.calibration.formats import ROBOTS, pose_from, pose_to
 from smartcam.calibration.formats._robots import angles_zyx, rotation_zyx
-from tests.calibration.geometry.rigid import FEW, angles, close, refused, transforms
+from tests.geometry.rigid import FEW, angles, close, refused, transforms
 
 EULER = {"kuka": "ZYX", "fanuc": "xyz", "meca500": "XYZ"}
 """SciPy's names: capitals turn about axes that move, small letters about axes that stand."""

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam.calibration import CameraModel, RobotSigmas
 from smartcam.calibration._hand_eye.closed_forms import LINEAR, check_motion, solve_linear
 from smartcam.calibration._hand_eye.equations import (
     Observations,
@@ -20,7 +20,6 @@ from smartcam.calibration._hand_eye.equations import (
     PoseObservations,
     RobotNoise,
     RobotPoses,
-    RobotSigmas,
     Solution,
     adjust,
     carried,
@@ -28,7 +27,7 @@ from smartcam.calibration._hand_eye.equations import (
     without_each,
 )
 from smartcam.calibration._hand_eye.robot_noise import adjust_noisy
-from smartcam.calibration._lens.model import CameraModel
+from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 vectors = st.tuples(*[st.floats(-1.7, 1.7)] * 3).map(np.array)

@@ -14,19 +14,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import exp_rotation
-from smartcam.calibration._hand_eye.calibration import (
+from smartcam.calibration import (
+    CameraModel,
+    Checkerboard,
+    Code,
+    HandEyeCalibration,
+    RobotSigmas,
+    TargetView,
+    Transform,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
+    calibrate_stereo,
+    locate,
 )
-from smartcam.calibration._hand_eye.equations import RobotSigmas, Setup
-from smartcam.calibration._hand_eye.result import HandEyeCalibration
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Checkerboard
-from smartcam.calibration._views import TargetView
-from smartcam.calibration.simulation._scenes import hand_eye_scene
+from smartcam.calibration._hand_eye.equations import Setup
+from smartcam.calibration._lens.poses import half_turned
+from smartcam.calibration.simulation import hand_eye_scene, view
+from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import exp_rotation
 from tests.calibration.scenes import CAMERA, SHEET, refused, scene
 
 SETUPS: list[Setup] = ["eye-in-hand", "eye-to-hand"]
@@ -164,6 +169,143 @@ def test_hand_eye_finds_the_scale_of_a_print() -> None:
     assert truth.errors(found.camera_pose)[1] < truth.errors(kept.camera_pose)[1] / 3
 
 
+def printed(setup: Setup, factor: float) -> tuple[list[Any], list[Any]]:
+    """Return poses and views of a target that is said to be ``factor`` times as large as it is."""
+    poses, views = measured(setup, 0.1, NOISE, poses=10)
+    said = Checkerboard(columns=5, rows=4, square=0.03 * factor)
+    return poses, [dataclasses.replace(one, target=said) for one in views]
+
+
+def ratio(count: int, *, known: bool, bent: float = 0.0, board: Checkerboard = SHEET) -> float:
+    """Return the rms expected error of the camera's place over the rms of those found.
+
+    ``known``: whether the lens is given. ``bent``: rms height of a sheet, metres, which bends anew
+    in each view where the lens is given, and else once.
+    """
+    expected, found = [], []
+    for seed in range(count):
+        random = np.random.default_rng([seed, 41])
+        setup = SETUPS[seed % 2]
+        truth = hand_eye_scene(
+            board, CAMERA, setup=setup, poses=12, tilt=0.6, distance=0.5, random=random
+        )
+        poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+        if bent:
+            heights = random.normal(0.0, bent, 12 if known else 1)
+            views = [bowed(one, heights[i % len(heights)]) for i, one in enumerate(views)]
+        one = calibrate_hand_eye(
+            poses, views, setup=setup, camera=CAMERA if known else None, adjust="nothing"
+        )
+        expected.append(one.translation_error)
+        found.append(truth.errors(one.camera_pose)[1])
+    return math.sqrt(float(np.mean(np.square(expected)) / np.mean(np.square(found))))
+
+
+def bowed(view: TargetView, height: float) -> TargetView:
+    """Return a view of the sheet as it looks when its middle is lifted."""
+    pose = locate(view, CAMERA).transform
+    flat = view.object_points
+    across = (flat[:, :2] - flat[:, :2].mean(axis=0)) / np.ptp(flat[:, :2], axis=0).max()
+    lifted = flat + np.outer(height * (4.0 * (across**2).sum(axis=1) - 1.0), [0.0, 0.0, 1.0])
+    moved = CAMERA.project(pose.apply(lifted)) - CAMERA.project(pose.apply(flat))
+    return dataclasses.replace(view, points=view.points + moved)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("known", "bent"), [(True, 0.0), (True, 5e-4), (False, 0.0)])
+def test_hand_eye_expects_the_errors_that_are_found(known: bool, bent: float) -> None:
+    """Noise, a sheet that bends anew, and a lens from the same views; sixteen give 18 % or so."""
+    assert 0.65 < ratio(16, known=known, bent=bent) < 1.5
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bent", [1.5e-4, 5e-4])
+def test_hand_eye_expects_what_a_sheet_does_that_is_bent_once(bent: float) -> None:
+    """With the lens from the same views; taken as exact where views tell no more: 0.42, 0.49."""
+    board = Checkerboard(columns=9, rows=6, square=0.02)
+    assert 0.7 < ratio(16, known=False, bent=bent, board=board) < 1.4
+
+
+def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> None:
+    """A bent sheet leaves more residuals than a lens that is fitted to it as flat."""
+    random = np.random.default_rng([0, 41])
+    board = Checkerboard(columns=9, rows=6, square=0.02)
+    truth = hand_eye_scene(
+        board, CAMERA, setup=SETUPS[0], poses=12, tilt=0.6, distance=0.5, random=random
+    )
+    poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+    views = [bowed(one, 2e-3) for one in views]
+    found = calibrate_hand_eye(poses, views, setup=SETUPS[0], adjust="nothing")
+    assert {one.code for one in found.warnings} == {Code.SHEET_NOT_EXACT}
+
+
+@pytest.mark.parametrize("setup", ONE_LONG)
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_hand_eye_numbers_a_target_that_looks_alike_after_half_a_turn(
+    setup: Setup, known: bool
+) -> None:
+    board = Checkerboard(columns=8, rows=6, square=0.02)
+    random = np.random.default_rng(3)
+    truth = hand_eye_scene(
+        board, CAMERA, setup=setup, poses=9, tilt=0.6, distance=0.5, random=random
+    )
+    poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+    said = [half_turned(one) if number in (1, 4, 8) else one for number, one in enumerate(views)]
+    camera = CAMERA if known else None
+    found = calibrate_hand_eye(poses, said, setup=setup, camera=camera, adjust="nothing")
+    assert found.warnings == ()
+    assert truth.errors(found.camera_pose)[1] < 3.0 * found.translation_error
+    assert [one.ids[0] for one in found.views] == [one.ids[0] for one in views]
+    off, as_numbered = found.point_errors(poses, said), found.point_errors(poses, views)
+    np.testing.assert_allclose(off[4], as_numbered[4][::-1], rtol=1e-9)
+
+
+@pytest.mark.long
+def test_hand_eye_of_a_bent_sheet_does_not_bend_its_lens() -> None:
+    """A sheet that is bent by 0.7 mm; taken as exact it puts cameras 12 mm off, rms (measured)."""
+    off = []
+    for seed in range(6):
+        random = np.random.default_rng([seed, 44])
+        truth = hand_eye_scene(
+            SHEET, CAMERA, setup=SETUPS[seed % 2], poses=12, tilt=0.6, distance=0.5, random=random
+        )
+        poses, views = truth.measured(pixel_sigma=0.1, robot_sigmas=NOISE, random=random)
+        bent = [bowed(one, 7e-4) for one in views]
+        found = calibrate_hand_eye(poses, bent, setup=truth.setup, adjust="nothing")
+        assert Code.SHEET_NOT_EXACT in {one.code for one in found.warnings}
+        off.append(truth.errors(found.camera_pose)[1])
+    assert math.sqrt(float(np.mean(np.square(off)))) < 5e-3
+
+
+@pytest.mark.parametrize("setup", ONE_LONG)
+@pytest.mark.parametrize("factor", [0.5, 0.8, 1.27, 2.0])
+def test_hand_eye_refuses_a_print_of_quite_another_size(setup: Setup, factor: float) -> None:
+    poses, views = printed(setup, factor)
+    with pytest.raises(CalibrationError, match="times as large by the robot's motions") as caught:
+        calibrate_hand_eye(poses, views, setup=setup, camera=CAMERA)
+    assert caught.value.code == Code.SCALE_MISMATCH
+    assert caught.value.got == pytest.approx(1 / factor, rel=0.01)
+
+
+@pytest.mark.parametrize("setup", ONE_LONG)
+def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> None:
+    poses, views = printed(setup, 1.27)
+    found = calibrate_hand_eye(poses, views, setup=setup, camera=CAMERA, most_scale=0.3)
+    assert found.target_scale == pytest.approx(1 / 1.27, rel=0.01)
+    assert Code.SCALE_MISMATCH in {one.code for one in found.warnings}
+    assert scene(setup, poses=10).errors(found.camera_pose)[1] < 2e-3
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.05, True)])
+def test_hand_eye_tells_a_size_that_was_not_to_be_adjusted(factor: float, told: bool) -> None:
+    poses, views = printed("eye-in-hand", factor)
+    ways: list[dict[str, Any]] = [{"adjust": "nothing"}, {"method": "park"}]
+    for options in ways:
+        found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, **options)
+        assert (Code.SCALE_MISMATCH in {one.code for one in found.warnings}) == told
+        assert found.target_scale == 1.0
+
+
 @pytest.mark.long
 def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
     """Of few poses and much noise: a chi-square test would have the sheet 0.9 % larger."""
@@ -185,6 +327,23 @@ def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
     found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=camera)
     assert found.target_scale == 1.0
     assert truth.errors(found.camera_pose)[1] < 1e-3
+
+
+def test_second_camera_on_the_hand_is_where_the_pair_has_it() -> None:
+    truth, random = scene("eye-in-hand", poses=9), np.random.default_rng(5)
+    poses, views = measured("eye-in-hand", 0.1, NOISE)
+    turn, shift = exp_rotation(np.array([0, -0.1, 0])), np.array([-0.06, 0, 0])
+    beside = Transform("right", "camera", turn, shift)
+    seen = [(beside @ truth.seen(pose)).rigid for pose in truth.robot_poses]
+    placed = [Transform("camera", "target", *one) for one in seen]
+    others = [view(SHEET, CAMERA, one, sigma=0.1, random=random) for one in placed]
+    hand = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
+    pair = calibrate_stereo(views, others, left=CAMERA, right=CAMERA, sheet="exact")
+    first = Transform("camera", "left", np.eye(3), np.zeros(3))
+    second = hand.camera_pose @ first @ pair.transform.inverse()
+    assert second.label == "T_flange_right"
+    off = second.translation - (truth.camera_pose @ beside.inverse()).translation
+    assert np.linalg.norm(off) < 3.0 * hand.translation_error
 
 
 def test_hand_eye_without_a_camera_calibrates_it_from_the_views() -> None:
@@ -359,13 +518,13 @@ def test_hand_eye_of_turns_about_one_axis_is_refused() -> None:
 
 def test_hand_eye_of_wrong_inputs_is_refused() -> None:
     poses, views = measured("eye-in-hand", 0.0, EXACT)
-    with refused("SHAPE", "as many views as poses of the robot, 200 at most, got 8 and 9"):
+    with refused("SHAPE", "as many views as poses of the robot, got 8 and 9"):
         calibrate_hand_eye(poses, views[:-1], setup="eye-in-hand", camera=CAMERA)
-    with refused("SHAPE", "setup eye-in-hand or eye-to-hand, got 'hand'"):
+    with refused("SHAPE", "setup: expected one of", "got 'hand'"):
         calibrate_hand_eye(poses, views, setup="hand", camera=CAMERA)  # type: ignore[arg-type]
-    with refused("SHAPE", "method: expected auto or one of", "got 'best'"):
+    with refused("SHAPE", "method: expected one of ['auto', ", "got 'best'"):
         calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, method="best")
-    with refused("SHAPE", "adjust: expected auto or one of", "got 'robot'"):
+    with refused("SHAPE", "adjust: expected one of ['auto', ", "got 'robot'"):
         calibrate_hand_eye(
             poses,
             views,
@@ -562,3 +721,11 @@ def test_hand_eye_from_other_data_is_refused(
         return
     with refused("SHAPE", f"stored hand-eye calibration: {text}"):
         HandEyeCalibration.from_data(data)
+
+
+@pytest.mark.long
+def test_hand_eye_of_more_than_200_poses_is_as_good_as_it_expects() -> None:
+    poses, views = measured("eye-in-hand", 0.1, NOISE, poses=240)
+    found = calibrate_hand_eye(poses, views, setup="eye-in-hand", camera=CAMERA, adjust="nothing")
+    shift = scene("eye-in-hand", poses=240).errors(found.camera_pose)[1]
+    assert shift < 3 * found.translation_error < 3e-4

@@ -1,8 +1,7 @@
-"""What lies between two ways of solving, and how far."""
+"""Which of two ways of solving is taken."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import numpy as np
@@ -10,47 +9,23 @@ import pytest
 
 from benchmarks import robots
 from benchmarks.robots import Kind
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
-from smartcam.calibration._hand_eye.calibration import (
+from smartcam.calibration import (
+    Code,
+    RobotSigmas,
+    Transform,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
 )
 from smartcam.calibration._hand_eye.closed_forms import second_turn, second_turns
-from smartcam.calibration._hand_eye.equations import RobotPoses, RobotSigmas
-from smartcam.calibration._hand_eye.model_selection import BETWEEN, _part
-from smartcam.calibration._hand_eye.sights import locate_all
-from smartcam.calibration._lens.poses import locate
-from tests.calibration.scenes import CAMERA, scene
+from smartcam.calibration._hand_eye.equations import RobotPoses
+from smartcam.geometry._inside import Rigid, exp_rotation
+from tests.calibration.scenes import scene
 
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)
 
 
-def test_part_of_a_way_that_every_pose_gains_by_is_all_of_it() -> None:
-    along = np.linspace(1.0, 1.2, 12)
-    assert _part(along, along) == pytest.approx(1.0)
-    assert _part(along, 2.0 * along) == pytest.approx(0.0)  # half of it; the whole gains nothing
-    assert _part(along, 0.5 * along) == 1.0  # beyond the other method nothing is known
-    assert _part(along, 1.25 * along) == pytest.approx(0.8)
-
-
-def test_part_of_a_way_that_leads_off_is_none() -> None:
-    along = np.linspace(-1.2, -1.0, 12)
-    assert _part(along, -along) == 0.0
-    assert _part(np.zeros(12), np.zeros(12)) == 0.0
-
-
-def test_part_that_chance_gives_is_shrunk() -> None:
-    squares = np.full(12, 1.0)
-    along = np.array([6.0, *[0.5] * 11])  # one pose gains, the others neither gain nor lose
-    assert _part(along, squares) == 0.0
-    two = np.array([3.0, 3.0, 3.0, *[0.5] * 9])
-    assert 0.0 < _part(two, squares) < float(two.sum() / squares.sum())
-
-
 @pytest.mark.long
-def test_calibration_of_a_robot_that_errs_by_more_than_noise_goes_between() -> None:
+def test_calibration_of_a_robot_that_errs_by_more_than_noise_takes_its_poses_as_said() -> None:
     """Its joints are off by a tenth of a degree, which no noise of single poses explains."""
     arm = Kind("offsets", offsets=0.1).measured("eye-in-hand", 1009)
     poses, views = ([some[i] for i in arm.used] for some in (arm.poses, arm.views))
@@ -67,33 +42,11 @@ def test_calibration_of_a_robot_that_errs_by_more_than_noise_goes_between() -> N
     }
     held_out = {name: one.held_out_error or math.nan for name, one in found.items()}
     auto = found["auto"]
-    assert auto.method in {BETWEEN, "reprojection"}
+    assert auto.method == "reprojection"
     assert held_out["auto"] < 0.9 * held_out["robot"]
-    assert held_out["auto"] < 1.15 * held_out["reprojection"]
     assert held_out["auto"] < held_out["park"]
     assert auto.candidates["robot"] == pytest.approx(held_out["robot"], rel=1e-6)
     assert np.isfinite(auto.covariance).all()
-
-
-def test_poses_of_all_views_at_once_are_those_of_each() -> None:
-    _, views = scene("eye-in-hand", poses=6).measured(
-        pixel_sigma=0.3, robot_sigmas=NOISE, random=np.random.default_rng(4)
-    )
-    # some points are missing, and one view has more noise than its covariance says
-    views[2] = dataclasses.replace(
-        views[2],
-        ids=views[2].ids[3:],
-        points=views[2].points[3:],
-        covariance=views[2].covariance[3:],
-    )
-    views[4] = dataclasses.replace(views[4], covariance=views[4].covariance / 100.0)
-    for found, one in zip(locate_all(views, CAMERA), views, strict=True):
-        alone = locate(one, CAMERA)
-        assert found.rms == pytest.approx(alone.rms, rel=1e-4)
-        assert found.ambiguity == pytest.approx(alone.ambiguity, rel=1e-2)
-        assert float(found.transform.rigid.angle_to(alone.transform.rigid)) < 1e-5
-        np.testing.assert_allclose(found.covariance, alone.covariance, rtol=1e-2)
-    assert locate_all([], CAMERA) == []
 
 
 def test_second_turns_are_those_without_each_pose() -> None:

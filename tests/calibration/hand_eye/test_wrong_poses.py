@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._hand_eye.calibration import (
+from smartcam.calibration import (
+    Code,
+    RobotSigmas,
+    Transform,
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
+    fit_tool_tip,
 )
-from smartcam.calibration._hand_eye.equations import RobotSigmas
-from smartcam.calibration._plane.tool import fit_tool_tip
 from tests.calibration.scenes import CAMERA, refused, scene
 
 if TYPE_CHECKING:
+    from smartcam.calibration import TargetView
     from smartcam.calibration._hand_eye.equations import Setup
-    from smartcam.calibration._views import TargetView
 
 TRUTH = scene("eye-in-hand", poses=6)
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)

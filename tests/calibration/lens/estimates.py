@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
+from smartcam.calibration import CameraModel, IntrinsicCalibration, Transform
 from smartcam.calibration._lens.coverage import Coverage
-from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, ViewFit
-from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration._lens.intrinsics import ViewFit
 from smartcam.calibration._lens.projection import linearize, pose_changes
+from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration import lenskit
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 SIGMA = 0.05
 

@@ -7,12 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import IDENTITY, exp_rotation
-from smartcam.calibration._lens.comparison import Lens, compare, compare_lenses, rig_difference
-from smartcam.calibration._lens.model import CameraModel
+from smartcam.calibration import CameraModel, Code, Transform, compare
+from smartcam.calibration._inside import compare_lenses, rig_difference
+from smartcam.calibration._lens.comparison import Lens
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import IDENTITY, exp_rotation
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, rms, spread_poses
 
@@ -43,9 +42,8 @@ def test_lens_that_is_another_is_told_from_noise() -> None:
     found = compare(FIRST.calibration(1), moved)
     assert found.same is False
     assert found.chance is not None
-    assert found.chance < 1e-6
+    assert found.chance < 1e-5
     assert found.verdict.startswith("they differ by more than their noise explains: ")
-    assert "chance below 1e-09" in found.verdict
 
 
 def test_lens_of_another_model_is_told_by_what_no_values_explain() -> None:
@@ -136,7 +134,8 @@ def test_chance_is_one() -> None:
         for seed in range(150)
     ]
     chances = np.array([one.chance for one in found])
-    # Bonferroni errs to the safe side; of 150 a part of 0.05 has a standard deviation of 0.018
-    assert 0.01 <= (chances < 0.05).mean() <= 0.09
+    # as few views tell how large the noise is, it errs to the safe side
+    assert (chances < 0.05).mean() <= 0.05
+    assert 0.2 < (chances < 0.5).mean() < 0.6
     assert (chances < 0.01).mean() <= 0.03
     assert 0.9 < rms(np.array([one.ratio for one in found])) < 1.15

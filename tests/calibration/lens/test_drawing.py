@@ -12,13 +12,18 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from smartcam.calibration import draw_scene, draw_uncertainty, draw_views
-from smartcam.calibration._codes import Code
+from smartcam.calibration import (
+    Code,
+    HandEyeCalibration,
+    IntrinsicCalibration,
+    StereoCalibration,
+    compare,
+    draw_scene,
+    draw_uncertainty,
+    draw_views,
+)
 from smartcam.calibration._drawing.bars import short_names
-from smartcam.calibration._hand_eye.result import HandEyeCalibration
-from smartcam.calibration._lens.comparison import compare
-from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
-from smartcam.calibration._stereo.calibration import PairFit, StereoCalibration
+from smartcam.calibration._stereo.calibration import PairFit
 from smartcam.exceptions import CalibrationError
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, spread_poses
@@ -236,6 +241,12 @@ def test_map_says_its_figures_and_where_it_has_none() -> None:
     covariance[0, 0] = np.nan
     svg = draw_uncertainty(dataclasses.replace(found, covariance=covariance))
     assert "beyond the model" in svg
+    assert "the model of the lens ends before 0.1% of the image" in svg
+
+
+def test_map_of_a_calibration_shows_the_points_that_were_seen() -> None:
+    (dots,) = re.findall(r'<path d="([^"]*)" class="seen"/>', draw_uncertainty(LENS, distance=0.5))
+    assert dots.count("M") == sum(len(one.view.ids) for one in LENS.views)
 
 
 def test_map_of_a_lens_that_is_exact_is_drawn() -> None:

@@ -7,13 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import exp_rotation
-from smartcam.calibration._lens.guide import NextView, candidates, suggest_views
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._targets import Charuco, Target
+from smartcam.calibration import CameraModel, Charuco, Code, NextView, Transform, suggest_views
+from smartcam.calibration._inside import Target
+from smartcam.calibration._lens.guide import candidates
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry._inside import exp_rotation
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import Bench, spread_poses
 

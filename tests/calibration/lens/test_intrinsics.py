@@ -11,31 +11,34 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid
+from smartcam.calibration import (
+    Charuco,
+    Checkerboard,
+    Code,
+    IntrinsicCalibration,
+    Transform,
+    calibrate_intrinsics,
+)
 from smartcam.calibration._lens.bundle import (
     Bundle,
     Sight,
     adjust,
     adjust_weighted,
-    held_out,
+    leave_out,
     lens_values,
     residuals,
     with_lens,
 )
 from smartcam.calibration._lens.coverage import Coverage, coverage
-from smartcam.calibration._lens.intrinsics import IntrinsicCalibration, calibrate_intrinsics
-from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, shape_doubt
+from smartcam.calibration._lens.sheet_shape import adjust_shape, as_meant, choose_shape
 from smartcam.calibration._lens.start import fit_lens, lens_basis, parameter_names
-from smartcam.calibration._targets import Charuco, Checkerboard
+from smartcam.geometry._inside import Rigid
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, RIG, RIGHT, WIDE, pairs, poses, seen
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration._views import TargetView
+    from smartcam.calibration import CameraModel, TargetView
 
 
 @functools.cache
@@ -47,20 +50,11 @@ def _calibrated(first: int = 0) -> IntrinsicCalibration:
 def test_calibrate_intrinsics_finds_the_lens_as_well_as_it_says() -> None:
     found = calibrate_intrinsics(seen(LEFT, poses(9)), sheet="auto")
     off = lens_values(found.camera) - lens_values(LEFT)
-    assert off @ np.linalg.solve(found.covariance, off) < 27.9  # chi-square of 9, 1 in 1000
+    deviations = np.array(list(found.deviations.values()))
+    assert np.abs(off / deviations).max() < 4.0
     assert found.deviations["fx"] == pytest.approx(0.3, abs=0.2)
     assert list(found.deviations) == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
     assert (found.sheet, found.sigma, found.bad_views) == (None, 0.0, ())
-
-
-@pytest.mark.long
-def test_calibrate_intrinsics_covariance_is_that_of_its_errors() -> None:
-    squares = []
-    for seed in range(9):
-        found = calibrate_intrinsics(seen(LEFT, poses(6, seed=seed), seed=seed), sheet="exact")
-        off = lens_values(found.camera) - lens_values(LEFT)
-        squares.append(off @ np.linalg.solve(found.covariance, off))
-    assert np.mean(squares) == pytest.approx(9.0, abs=4.3)  # 3 sigma of the mean
 
 
 def test_calibrate_intrinsics_residuals_are_the_noise_and_held_out_a_little_more() -> None:
@@ -316,10 +310,10 @@ def test_fit_lens_of_views_of_different_noise_trusts_the_sharp_ones() -> None:
     around = poses(12)
     views = [*seen(LEFT, around[:6], sigma=0.02), *seen(LEFT, around[6:], sigma=1.0, seed=3)]
     sharp, all_of_them = fit_lens(views[:6], "plumb_bob"), fit_lens(views, "plumb_bob")
-    deviations = np.sqrt(np.diag(sharp.covariance))
+    deviations = np.sqrt(np.diag(sharp.by_noise))
     off = lens_values(all_of_them.bundle.cameras[0]) - lens_values(sharp.bundle.cameras[0])
     assert np.abs(off / deviations).max() < 0.5
-    assert (np.diag(all_of_them.covariance) < np.diag(sharp.covariance)).all()
+    assert (np.diag(all_of_them.by_noise) < np.diag(sharp.by_noise)).all()
 
 
 def test_fit_lens_with_fixed_coefficients_leaves_them_at_zero() -> None:
@@ -383,7 +377,7 @@ def test_held_out_is_that_of_a_fit_without_the_views(count: int, *, free: bool) 
     whole = fit_lens(views, "plumb_bob")
     if free:
         whole = adjust_shape(whole.bundle, sights, whole.more)
-    for one in held_out(whole, sights, range(count)):
+    for one in leave_out(whole, sights):
         others = [sight for sight in sights if sight.pose != one.pose]
         again = adjust(whole.bundle, others, whole.more).bundle
         only = dataclasses.replace(again, poses=again.poses.taken([one.pose])).known()
@@ -398,11 +392,11 @@ def test_held_out_of_a_view_does_not_know_it() -> None:
     spoiled = [*views[:3], dataclasses.replace(views[3], points=shaken), *views[4:]]
     (fitted, again) = ([Sight(0, n, view) for n, view in enumerate(s)] for s in (views, spoiled))
     whole = fit_lens(views, "plumb_bob")
-    true = next(one for one in held_out(whole, fitted, range(8)) if one.pose == 3)
+    true = next(one for one in leave_out(whole, fitted) if one.pose == 3)
     moved = adjust(whole.bundle, again, whole.more)
-    other = next(one for one in held_out(moved, again, range(8)) if one.pose == 3)
+    other = next(one for one in leave_out(moved, again) if one.pose == 3)
     lenses = [lens_values(one.bundle.cameras[0]) for one in (true, other)]
-    deviations = np.sqrt(np.diag(whole.covariance))
+    deviations = np.sqrt(np.diag(whole.by_noise))
     assert np.abs((lenses[0] - lenses[1]) / deviations).max() < 1.0
     assert np.abs((lens_values(moved.bundle.cameras[0]) - lenses[0]) / deviations).max() > 5.0
 
@@ -416,39 +410,27 @@ def test_calibrate_intrinsics_of_a_stretched_sheet_finds_by_how_much_both_ways()
     off = found.sheet - (STRETCHED - BOARD.points)
     assert np.sqrt((off**2).mean()) < 2.5e-5
     error = lens_values(found.camera) - lens_values(LEFT)
-    assert error @ np.linalg.solve(found.covariance, error) < 27.9  # chi-square of 9, 1 in 1000
+    assert np.abs(error / np.array(list(found.deviations.values()))).max() < 4.0
 
 
 def test_calibrate_intrinsics_of_a_stretched_sheet_taken_as_exact_says_so() -> None:
-    found = calibrate_intrinsics(seen(LEFT, poses(8), points=STRETCHED))
+    found = calibrate_intrinsics(seen(LEFT, poses(8), points=STRETCHED), sheet="exact")
     assert found.sheet is None
     (remark,) = [one for one in found.warnings if one.code == Code.SHEET_NOT_EXACT]
-    assert remark.text.startswith("the sheet's points are 0.45 mm rms from")
-    assert remark.text.endswith("it is taken as exact all the same, which sheet='free' does not")
+    assert remark.text.startswith("the sheet's points are 0.46 mm rms from")
+    assert remark.text.endswith("it is taken as exact all the same, which sheet='auto' does not")
 
 
-@pytest.mark.parametrize(
-    "fixed", [(), pytest.param(("k2", "k3"), marks=pytest.mark.long), ("k1", "k2", "k3")]
-)
-def test_shape_doubt_of_an_exact_sheet_is_none_even_of_a_lens_that_is_not_of_its_model(
+@pytest.mark.parametrize("fixed", [(), pytest.param(("k2", "k3"), marks=pytest.mark.long)])
+def test_exact_sheet_stays_exact_even_before_a_lens_that_is_not_of_its_model(
     fixed: tuple[str, ...],
 ) -> None:
     for seed in range(2):
         views = seen(LEFT, poses(8, seed=seed), seed=seed)
         sights = [Sight(0, number, view) for number, view in enumerate(views)]
-        assert shape_doubt(fit_lens(views, "plumb_bob", fixed), sights) is None
-
-
-def test_shape_doubt_of_too_few_views_to_tell_is_none() -> None:
-    whole = seen(LEFT, poses(4, seed=3), points=STRETCHED)
-    views = [
-        dataclasses.replace(
-            one, ids=one.ids[::6], points=one.points[::6], covariance=one.covariance[::6]
-        )
-        for one in whole
-    ]
-    sights = [Sight(0, number, view) for number, view in enumerate(views)]
-    assert shape_doubt(fit_lens(views, "plumb_bob"), sights) is None
+        found = choose_shape(fit_lens(views, "plumb_bob", fixed), sights, "auto")
+        assert found.off is None
+        assert found.remarks == []
 
 
 def test_calibrate_intrinsics_with_more_points_free_than_fit_in_memory_is_refused() -> None:
@@ -471,7 +453,7 @@ def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
         fitted = fit_lens(views, "plumb_bob")
         found = adjust_shape(fitted.bundle, sights, fitted.more)
         off = lens_values(found.bundle.cameras[0]) - lens_values(LEFT)
-        squares.append(off @ np.linalg.solve(found.covariance, off))
+        squares.append(off @ np.linalg.solve(found.by_noise, off))
     assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
 
 
@@ -607,7 +589,7 @@ def test_adjust_of_points_behind_the_camera_gives_up() -> None:
     away = Bundle(bundle.cameras, bundle.rig, behind, bundle.basis)
     found = adjust(away, _sights(3, 0.0), 0.0)
     assert math.isinf(found.weighted)
-    assert np.isnan(found.covariance).all()
+    assert np.isnan(found.by_noise).all()
 
 
 def test_adjust_weighted_finds_what_the_covariance_does_not_say() -> None:

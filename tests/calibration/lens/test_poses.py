@@ -8,16 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import exp_rotation
-from smartcam.calibration._lens.poses import locate
+from smartcam.calibration import Code, Transform, locate
 from smartcam.calibration._lens.projection import excess, linearize, pose_changes, whitening
+from smartcam.geometry._inside import exp_rotation
 from tests.calibration.lenskit import BOARD, FISHEYE, LEFT, TURNED, WIDE, poses, seen
 
 if TYPE_CHECKING:
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.calibration import CameraModel
+    from smartcam.geometry._inside import Array
 
 NEAR = Transform("camera", "target", TURNED, np.array([-0.1, 0.06, 0.5]))
 

@@ -10,10 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from smartcam.calibration._geometry.rotations import (
-    Array,
-    rotate_ccw,
-)
+from smartcam.geometry._inside import Array, rotate_ccw
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 __all__ = ["GRID", "SIGMA", "Scene", "grid", "part", "scenes", "spread"]

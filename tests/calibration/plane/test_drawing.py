@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration._plane.drawing import draw
-from tests.calibration.geometry.rigid import localization, rotation_about, yaw
+from smartcam.calibration import PlaneCalibration, fit_plane
+from smartcam.calibration._inside import draw
+from tests.geometry.rigid import localization, rotation_about, yaw
 
 GOLDEN = Path(__file__).with_name("drawing.svg")
 

@@ -8,11 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from smartcam.calibration._geometry.frames import PoseHistory, Transform
-from smartcam.calibration._geometry.solvers import Chain, Poses, RealWorldPosition, chain_of
-from smartcam.calibration._plane.calibration import fit_plane
-from smartcam.calibration._plane.moving_camera import Moved, MovingCamera
-from tests.calibration.geometry.rigid import (
+from smartcam.calibration import Chain, MovingCamera, PoseHistory, Transform, chain_of, fit_plane
+from smartcam.calibration._plane.moving_camera import Moved
+from smartcam.calibration._solvers import Poses, RealWorldPosition
+from tests.geometry.rigid import (
     NOON,
     after,
     angles,

@@ -11,7 +11,7 @@ import pytest
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration._geometry.rotations import Array, matrix_from_quaternion
+from smartcam.geometry._inside import Array, matrix_from_quaternion
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene, grid, part, spread
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
@@ -69,8 +69,8 @@ def test_fit_plane_of_a_tilted_camera_chooses_homography(degrees: float) -> None
 
 def test_fit_plane_similarity_of_a_tilted_camera_warns() -> None:
     found = fit_plane(tilted(3.0), SCENE.touched(GRID, 1), model="similarity", tool_z=DOWN)
-    assert [one.code for one in found.warnings] == ["NOT_SIMILAR"]
-    assert found.warnings[0].text.endswith("its lens distorts; similarity was asked for")
+    assert [one.code for one in found.warnings] == ["POOR_FIT", "NOT_SIMILAR"]
+    assert found.warnings[1].text.endswith("its lens distorts; similarity was asked for")
 
 
 @pytest.mark.long
@@ -89,12 +89,45 @@ def test_fit_plane_auto_leaves_out_a_model_that_is_not_determined() -> None:
     assert "without point 5 the others give no" in said(found, "NOT_HELD_OUT")
 
 
-def test_fit_plane_weights_count_like_repeated_touches() -> None:
+def test_fit_plane_weights_move_the_map_to_the_point() -> None:
     touches = SCENE.touched(GRID, 1)
-    weighted = fit_plane(GRID, touches, weights=[2] + [1] * 8, model="similarity")
-    again = [0, *range(9)]
-    repeated = fit_plane(GRID[again], touches[again], model="similarity")
-    assert spread(weighted.transform(GRID), repeated.transform(GRID)) < 1e-12
+    even, heavy = (
+        fit_plane(GRID, touches, weights=[weight] + [1] * 8, model="similarity")
+        for weight in (1.0, 100.0)
+    )
+    off = [np.linalg.norm(one.residuals[0]) for one in (even, heavy)]
+    assert off[1] < 0.2 * off[0]
+
+
+@pytest.mark.parametrize("seen_again", [0.0, 1e-4])
+def test_fit_plane_counts_what_is_touched_again_once(seen_again: float) -> None:
+    """The camera's part of a point's error is in all of its touches, as the robot's in pictures."""
+    touches, again = SCENE.touched(GRID, 1), np.repeat(np.arange(9), 3)
+    seen = GRID[again] + seen_again * np.tile([-1.0, 0.0, 1.0], 9)[:, None]
+    once = fit_plane(GRID, touches, tool_z=DOWN)
+    thrice = fit_plane(seen, touches[again], tool_z=DOWN)
+    assert spread(thrice.transform(GRID), once.transform(GRID)) < 1e-12
+    assert thrice.freedom == once.freedom
+    assert thrice.touch_sigma == pytest.approx(once.touch_sigma)
+    assert thrice.held_out_error == pytest.approx(once.held_out_error)
+    assert np.allclose(thrice.leave_one_out, once.leave_one_out[again])
+
+
+def test_fit_plane_of_touches_of_one_point_that_disagree_says_so() -> None:
+    again = [*range(9), 4]
+    touches = SCENE.touched(GRID, 1)[again]
+    touches[9] += 0.02 * SCENE.turn[:, 0]
+    found = fit_plane(GRID[again], touches, tool_z=DOWN)
+    assert any("was touched 10 mm from the mean of its" in one.text for one in found.warnings)
+    assert found.verdict.level == "poor"
+
+
+def test_fit_plane_of_three_points_recorded_thrice_promises_nothing() -> None:
+    again = np.repeat([0, 2, 6], 3)
+    found = fit_plane(GRID[again], SCENE.touched(GRID, 1)[again], tool_z=DOWN)
+    assert found.held_out_error is None
+    assert found.predicted_error(GRID).min() > 1e-4
+    assert found.verdict.level == "unknown"
 
 
 REFUSED: list[tuple[Any, Any, dict[str, Any], str, str]] = [

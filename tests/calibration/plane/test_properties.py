@@ -37,20 +37,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam import CalibrationError
-from smartcam.calibration import PlaneCalibration, fit_plane, fit_touches
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rotations import (
+from smartcam.calibration import (
+    MovingCamera,
+    PlaneCalibration,
+    Transform,
+    chain_of,
+    fit_plane,
+    fit_touches,
+)
+from smartcam.geometry._inside import (
     Array,
     matrix_from_quaternion,
     quaternion_about_z,
     quaternion_multiply,
     rotate_ccw,
 )
-from smartcam.calibration._geometry.solvers import chain_of
-from smartcam.calibration._plane.moving_camera import MovingCamera
 from smartcam.models import Localization
-from tests.calibration.geometry.rigid import FEW, rotations, transforms, yaw
 from tests.calibration.plane.planekit import GRID, SIGMA, Scene, part, scenes, spread
+from tests.geometry.rigid import FEW, rotations, transforms, yaw
 
 CLOSE = 1e-9
 """Metres."""

@@ -12,14 +12,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam import CalibrationError
-from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.rotations import Array
+from smartcam.calibration import Code, PlaneCalibration, fit_plane
 from smartcam.calibration._plane import robust as robust_module
 from smartcam.calibration._plane.fitting import Fit, fit
-from smartcam.calibration._plane.robust import BEST, MOST_SUBSETS, PROPOSALS, agreeing
-from tests.calibration.geometry.rigid import FEW, refused
+from smartcam.calibration._plane.robust import BEST, MAX_SUBSETS_TRIED, PROPOSALS, agreeing
+from smartcam.geometry._inside import Array
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene, grid, scenes, spread
+from tests.geometry.rigid import FEW, refused
 
 SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
 DOWN = -SCENE.turn[:, 2]
@@ -191,7 +190,7 @@ def test_fit_plane_robust_p10_order_of_points_is_irrelevant(
 ) -> None:
     marks = grid(4, 4)
     seen, touches = scene.camera(marks), with_wrong(marks, [0, 5, 6, 11], seed, scene)
-    assert math.comb(16, 4) > MOST_SUBSETS  # they are drawn
+    assert math.comb(16, 4) > MAX_SUBSETS_TRIED  # they are drawn
     options: dict[str, Any] = {"robust": True, "touch_sigma": SIGMA if given_sigma else None}
     first = fit_plane(seen, touches, **options)
     second = fit_plane(seen[order], touches[order], **options)
@@ -227,7 +226,9 @@ def test_plane_data_holds_what_version_1_0_does() -> None:
         *("unit_covariance", "leave_one_out", "freedom", "touch_sigma", "sigma_given"),
         *("candidates", "nominal_scale", "robot_frame", "warnings"),
     }
-    assert {*data} - required == {"tool_z", "height", "camera_frame", "y_down"}
+    assert {*data} - required == {
+        *("tool_z", "height", "camera_frame", "y_down", "allowed_error"),
+    }
     kept = {name: data[name] for name in required}
     assert PlaneCalibration.from_data(kept).to_data() == data
     for name in required:
@@ -303,7 +304,7 @@ def test_agreeing_of_200_points_takes_few_maps(monkeypatch: pytest.MonkeyPatch) 
     mask = agreeing(marks, touches, np.ones(200), SIGMA)
     assert np.flatnonzero(~mask).tolist() == [*range(0, 180, 2)]
     assert len(proposed) == 2
-    assert max(proposed) <= MOST_SUBSETS
+    assert max(proposed) <= MAX_SUBSETS_TRIED
     assert (
         len(fitted) <= 2 * BEST * 3
     )  # a round of each, one that judges anew, and one that confirms

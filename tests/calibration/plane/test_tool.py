@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.solvers import Poses, ToolOffset
-from smartcam.calibration._plane.tool import fit_rotation_centre, fit_tool_tip
-from tests.calibration.geometry.rigid import (
+from smartcam.calibration import ToolOffset, Transform, fit_tool_tip
+from smartcam.calibration._plane.tool import fit_rotation_centre
+from smartcam.calibration._solvers import Poses
+from tests.calibration.plane.planekit import part
+from tests.geometry.rigid import (
     angles,
     localization,
     refused,
@@ -21,7 +22,6 @@ from tests.calibration.geometry.rigid import (
     transforms,
     yaw,
 )
-from tests.calibration.plane.planekit import part
 
 TIP = np.array([0.012, -0.007, 0.145])
 POINT = np.array([0.4, -0.2, 0.1])

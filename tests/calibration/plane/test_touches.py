@@ -8,7 +8,7 @@ import pytest
 
 from smartcam import CalibrationError
 from smartcam.calibration import PlaneCalibration, fit_touches
-from smartcam.calibration._geometry.rotations import Array, rotate_ccw
+from smartcam.geometry._inside import Array, rotate_ccw
 from tests.calibration.plane.planekit import SIGMA, SPECIAL, Scene, part, spread
 
 SCENE = Scene(SPECIAL[4], np.array([1.0, -2.0, 0.5]))

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import PlaneCalibration, fit_plane, fit_touches
-from smartcam.calibration._geometry.rotations import Array, matrix_from_quaternion
+from smartcam.geometry._inside import Array, matrix_from_quaternion
 from tests import ROOT
-from tests.calibration.geometry.rigid import AXES, rotation_about, yaw
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene, grid, part, spread
+from tests.geometry.rigid import AXES, rotation_about, yaw
 
 ELSEWHERE = {
     "t4": ("test_camera_position_subtracts_before_it_turns", "test_plane_p1_*"),
@@ -62,7 +62,8 @@ def tilted(degrees: float) -> Array:
 def test_traps_each_one_has_a_test(trap: str) -> None:
     names = {
         name
-        for path in (ROOT / "tests" / "calibration").rglob("test_*.py")
+        for room in ("calibration", "geometry")
+        for path in (ROOT / "tests" / room).rglob("test_*.py")
         for name in re.findall(r"^def (test_\w+)", path.read_text("utf-8"), re.MULTILINE)
     }
     wanted = ELSEWHERE.get(trap, (f"test_trap_{trap}_*",))

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
+from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code
+from smartcam.calibration._inside import Target
 from smartcam.calibration._printing.page import (
     Disc,
     Label,
@@ -23,7 +24,6 @@ from smartcam.calibration._printing.page import (
     svg,
 )
 from smartcam.calibration._printing.shapes import Box, ink, outlines, quartered
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, Target
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

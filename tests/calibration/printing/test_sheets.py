@@ -5,30 +5,28 @@ from __future__ import annotations
 import json
 import os
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._printing.page import Disc, Label, Polygon
-from smartcam.calibration._printing.page_layout import BORDER
-from smartcam.calibration._printing.sheets import (
-    Rays,
-    Sheet,
-    make_sheet,
-    on_paper,
-    page_size,
-    scaled,
-)
-from smartcam.calibration._targets import (
+from smartcam.calibration import (
     Charuco,
     Checkerboard,
     CircleGrid,
-    Target,
+    Code,
+    MarkerGrid,
+    Sheet,
+    make_sheet,
+    scaled,
     target_from_data,
 )
+from smartcam.calibration._inside import Target, on_paper
+from smartcam.calibration._printing.page import Disc, Label, Polygon
+from smartcam.calibration._printing.page_layout import BORDER
+from smartcam.calibration._printing.sheets import Rays, page_size
 from smartcam.exceptions import CalibrationError
 from tests import ROOT
 
@@ -252,6 +250,8 @@ def test_scaled_changes_every_length_and_no_count() -> None:
     assert (real.columns, real.rows, real.asymmetric) == (4, 3, False)
     plain = CircleGrid(columns=4, rows=3, spacing=1, diameter=0.5)
     assert scaled(plain, (98, 98)).origin_diameter is None
+    markers = MarkerGrid(columns=3, rows=2, marker=0.02, gap=0.01, border=2, first_id=5)
+    assert scaled(markers, (101, 101)) == replace(markers, marker=0.0202, gap=0.0101)
     assert scaled(Rays(), (99, 99)) == Rays(diameter=0.0198)
 
 

@@ -10,10 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
-from smartcam.calibration._stereo.calibration import calibrate_stereo
-from smartcam.calibration._views import TargetView
+from smartcam.calibration import TargetView, calibrate_intrinsics, calibrate_stereo, find_target
 from tests.calibration.scenes import PAIRS_BOARD, check_pair
 
 FOLDER = Path(os.environ.get("SMARTCAM_PAIRS", "/usr/share/doc/opencv-doc/examples/data"))

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from smartcam import CalibrationError
-from smartcam.calibration import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rotations import Array
-from smartcam.calibration._stereo.rectification import rectify
+from smartcam.calibration import Code, Transform
+from smartcam.calibration._inside import rectify
 from smartcam.calibration._stereo.triangulation import CameraPair, epipolar_distances, triangulate
+from smartcam.geometry._inside import Array
 from tests.calibration.lenskit import FISHEYE, LEFT, RIG, RIGHT
 
 if TYPE_CHECKING:
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration._stereo.rectification import Rectification
+    from smartcam.calibration import CameraModel
+    from smartcam.calibration._inside import Rectification
 
 POINTS = np.array([[0.05, -0.04, 0.4], [-0.05, 0.08, 0.5], [0.02, 0.01, 0.6]])
 

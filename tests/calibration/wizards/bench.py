@@ -13,7 +13,7 @@ from smartcam.models import Header, Localization, Pose, Position, Quaternion
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration.wizards._sequence import WizardSession
+    from smartcam.calibration.wizards import WizardSession
 
 GRID = [(0.05 + 0.1 * i, 0.04 + 0.08 * j) for j in range(3) for i in range(3)]
 """Marks over a field of 0.3 x 0.24 m, in the camera's frame, metres."""

@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from smartcam.calibration._files.directory import Folder
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._hand_eye.result import HandEyeCalibration
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration.formats._robots import ROBOTS, pose_to
-from smartcam.calibration.simulation._images import render
-from smartcam.calibration.wizards._hand_eye import SUGGESTIONS, hand_eye_wizard
+from smartcam.calibration import CameraModel, Folder, HandEyeCalibration, Transform
+from smartcam.calibration._inside import listing
+from smartcam.calibration.formats import ROBOTS, pose_to
+from smartcam.calibration.simulation import render
+from smartcam.calibration.wizards import WizardSession, hand_eye_wizard
+from smartcam.calibration.wizards._hand_eye import SUGGESTIONS
 from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._listing import listing
-from smartcam.calibration.wizards._sequence import WizardSession
 from tests.calibration.scenes import SHEET, scene
 from tests.calibration.wizards.bench import say
 from tests.processes import printed_by
@@ -213,3 +210,27 @@ async def test_pose_typed_that_is_none_costs_no_picture(tmp_path: Path) -> None:
 
 def typed(pose: Transform) -> dict[str, float]:
     return dict(zip(ROBOTS["kuka"].numbers, pose_to("kuka", pose), strict=True))
+
+
+async def test_touches_of_the_sheet_verify_a_calibration_or_refute_it(tmp_path: Path) -> None:
+    session = begin(tmp_path, Cell())
+    view = await say(session, {"setup": "eye-in-hand", "allowed": 4.0})
+    for _ in range(8):
+        view = await say(session)
+    await say(session, {"next": "calculate"})
+    view = await say(session)
+    assert view["verdict"]["text"].endswith("4 mm are allowed")
+    corners = TRUTH.target_pose.apply(SHEET.points[[0, -1, SHEET.columns - 1]])
+    for off, level, chosen in ((0.0, "good", "accept"), (0.008, "poor", "more")):
+        view = await say(session, {"next": "verify"})
+        for number, corner in enumerate(corners):
+            assert view["title"] == f"Touch {number + 1} of 3"
+            place = 1e3 * (corner + np.array([off, 0.0, 0.0]))
+            view = await say(session, dict(zip("xyz", place.tolist(), strict=True)))
+        assert (view["step"], view["verdict"]["level"]) == ("review", level)
+        assert view["defaults"]["next"] == chosen
+        assert "the tip touched the sheet " in view["notes"][-1]
+    await say(session, {"next": "accept"})
+    await say(session)
+    found = HandEyeCalibration.load(tmp_path / "gripper.json")
+    assert found.verdict.text.startswith("Not good enough: touches of the sheet are off")

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration._files.directory import Folder
+from smartcam.calibration import Folder, PlaneCalibration, fit_plane
 from smartcam.calibration._files.store import read_document, write
-from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration.wizards._listing import listing
-from smartcam.calibration.wizards._services import CalibrationService
+from smartcam.calibration._inside import listing
+from smartcam.calibration.wizards import CalibrationService
 
 if TYPE_CHECKING:
     from pathlib import Path

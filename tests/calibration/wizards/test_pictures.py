@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
+from smartcam.calibration._inside import decode_picture
+from smartcam.calibration.wizards import PictureFolder
 from smartcam.calibration.wizards import _pictures as pictures
-from smartcam.calibration.wizards._pictures import PictureFolder, decode_picture, taker
+from smartcam.calibration.wizards._pictures import taker
 from smartcam.exceptions import FrameTimeoutError, LocalProtocolError
 from tests.calibration.scenes import refused
 from tests.frames.drivers import GoneError, frame, scripted

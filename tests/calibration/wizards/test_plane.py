@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from smartcam.calibration import PlaneCalibration
 from smartcam.calibration._files.store import read_document
-from smartcam.calibration._plane.calibration import PlaneCalibration
+from smartcam.calibration.wizards import WizardSession, plane_wizard
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._marks import MAX_MARKS
-from smartcam.calibration.wizards._plane import plane_wizard
-from smartcam.calibration.wizards._sequence import WizardSession
 from tests.calibration.wizards.bench import GRID, OFFSET, Bench, say, where
 from tests.processes import printed_by
 
@@ -89,10 +88,8 @@ async def test_marks_with_a_robot_that_is_read_need_no_typing(tmp_path: Path) ->
         assert (view["type"], view["button"]) == ("confirm", "It is there")
         bench.touch(*mark)
         view = await say(session)
-    assert (view["step"], view["verdict"]) == (
-        "review",
-        {"level": "unknown", "text": "Not known how good: touch more points"},
-    )
+    assert (view["step"], view["verdict"]["level"]) == ("review", "unknown")
+    assert "3 points can look right: touch 5 or more" in view["verdict"]["text"]
     assert view["defaults"]["next"] == "more"
     await say(session, {"next": "accept"})
     await say(session)
@@ -134,6 +131,45 @@ async def test_wrong_touch_is_named_the_worst_and_touched_again(tmp_path: Path) 
     assert view["result"]["held_out_mm"] < 0.4
 
 
+async def test_exchanged_touches_are_put_right_by_one_answer(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0001)
+    session = begin(tmp_path, bench)
+    for _ in range(3):
+        view = await say(session)
+    for number in (0, 1, 5, 3, 4, 2, 6, 7, 8):
+        view = await say(session, bench.touch_mm(*GRID[number]))
+    assert view["defaults"]["next"] == "reorder"
+    assert view["verdict"]["level"] == "poor"
+    assert any("points 3 and 6 look exchanged" in note for note in view["notes"])
+    view = await say(session)
+    assert (view["verdict"]["level"], view["defaults"]["next"]) == ("good", "accept")
+    await say(session)
+    view = await say(session)
+    assert view["result"]["held_out_mm"] < 0.4
+
+
+async def test_touches_in_an_order_that_a_grid_does_not_tell_are_touched_again(
+    tmp_path: Path,
+) -> None:
+    bench = Bench(sigma=0.0001)
+    session = begin(tmp_path, bench)
+    for _ in range(3):
+        view = await say(session)
+    for number in (1, 2, 3, 4, 5, 6, 7, 8, 0):
+        view = await say(session, bench.touch_mm(*GRID[number]))
+    assert "reorder" not in [one["const"] for one in view["schema"]["properties"]["next"]["oneOf"]]
+    assert (view["verdict"]["level"], view["defaults"]["next"]) == ("poor", "redo")
+
+
+async def test_error_beyond_what_the_user_allows_is_not_good(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    await say(session, {"touch_sigma": 0.2, "allowed": 0.5})
+    view = await touch_all(session, bench)
+    assert (view["verdict"]["level"], view["defaults"]["next"]) == ("poor", "more")
+    assert "but 0.5 mm are allowed" in view["verdict"]["text"]
+
+
 async def touch_some_wrong(session: WizardSession, bench: Bench, wrong: set[int]) -> dict[str, Any]:
     """Touch all nine marks, those of these numbers 5 mm off; return the review."""
     await say(session, {"touch_sigma": 0.2})
@@ -144,6 +180,20 @@ async def touch_some_wrong(session: WizardSession, bench: Bench, wrong: set[int]
         view = await say(session, {**answer, "x": answer["x"] + 5.0 * (number in wrong)})
     assert view["step"] == "review"
     return view
+
+
+async def test_one_wrong_touch_again_and_again_gets_another_advice(tmp_path: Path) -> None:
+    bench = Bench(sigma=0.0002)
+    session = begin(tmp_path, bench)
+    view = await touch_some_wrong(session, bench, {4})
+    assert view["defaults"] == {"next": "redo", "point": 4}
+    await say(session, {"next": "redo", "point": 4})
+    answer = bench.touch_mm(*GRID[3])
+    view = await say(session, {**answer, "x": answer["x"] + 5.0})
+    assert view["defaults"] == {"next": "remove", "point": 4}
+    assert "point 4 was touched again, and still does not agree" in view["verdict"]["text"]
+    view = await say(session, {"next": "remove", "point": 4})
+    assert view["verdict"]["level"] == "good"
 
 
 def choices(view: dict[str, Any]) -> list[str]:

@@ -12,10 +12,9 @@ from typing import Any
 
 import pytest
 
+from smartcam.calibration.wizards import Step, Wizard, WizardSession, ask
 from smartcam.calibration.wizards import _journal as module
 from smartcam.calibration.wizards._journal import MAX_LINE, Journal
-from smartcam.calibration.wizards._sequence import Wizard, WizardSession, ask
-from smartcam.calibration.wizards._steps import Step
 from smartcam.exceptions import CalibrationError, NotRunningError
 from tests.calibration.wizards import wizards
 from tests.calibration.wizards.wizards import ANSWERS, Trigger, answer_all, survey

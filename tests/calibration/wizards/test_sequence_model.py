@@ -13,9 +13,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from smartcam.calibration.wizards import Number, Step, Wizard, WizardSession, ask
 from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._sequence import Wizard, WizardSession, ask
-from smartcam.calibration.wizards._steps import Number, Step
 from smartcam.exceptions import CalibrationError
 
 LENGTH = 6

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
-from smartcam.calibration._files.directory import Folder
-from smartcam.calibration._files.store import write
-from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration.wizards._plane import plane_wizard
-from smartcam.calibration.wizards._services import CalibrationService
+from smartcam.calibration import Folder, PlaneCalibration, fit_plane
+from smartcam.calibration.wizards import CalibrationService, plane_wizard
 from smartcam.exceptions import CalibrationError
+from tests.calibration import lenskit
+from tests.calibration.lens import estimates as lenses
 from tests.calibration.wizards.bench import GRID, Bench, say, where
 
 BAD_NAMES = [
@@ -38,7 +37,7 @@ def saved(service: CalibrationService, name: str) -> None:
         GRID, [where(*mark) for mark in GRID], touch_sigma=0.0002, tool_z=(0, 0, -1),
         robot_frame="base",
     )  # fmt: skip
-    write(service.folder.calibration(name), "plane", calibration.to_data())
+    calibration.save(service.folder.calibration(name))
 
 
 def tree(path: Path) -> list[str]:
@@ -271,7 +270,8 @@ def test_export_to_another_kind_of_file_is_refused(tmp_path: Path) -> None:
 
 def test_load_of_another_kind_is_refused(tmp_path: Path) -> None:
     service = served(tmp_path)
-    write(service.folder.calibration("lens"), "camera", {})
+    lens = lenses.Bench(lenskit.LEFT, lenses.spread_poses(lenskit.LEFT, 4)).calibration()
+    lens.save(service.folder.calibration("lens"))
     with pytest.raises(CalibrationError, match="holds 'camera', expected 'plane'"):
         service.load("lens")
 

@@ -8,15 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from smartcam.calibration.wizards._steps import (
-    Flag,
-    Number,
-    Option,
-    Step,
-    Text,
-    as_lists,
-    from_lists,
-)
+from smartcam.calibration.wizards import Flag, Number, Option, Step, Text, as_lists, from_lists
 from smartcam.exceptions import CalibrationError
 
 jsonschema = pytest.importorskip("jsonschema", reason="needs jsonschema, of the extra dev")

@@ -16,22 +16,20 @@ import cv2
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration._targets import Checkerboard
-from smartcam.calibration._views import TargetView
+from smartcam.calibration import Checkerboard, Code, PlaneCalibration, TargetView, fit_plane
+from smartcam.calibration._inside import LOOKS
 from smartcam.calibration.wizards._marks import Mark
 from smartcam.calibration.wizards._target_drawing import MAX_SIDE, cell_counts, draw
 from smartcam.calibration.wizards._touch_previews import CELLS, before, compared, plain
 from smartcam.calibration.wizards._touches import Touch
-from smartcam.calibration.wizards._view_suggestions import LOOKS, Look, outline
+from smartcam.calibration.wizards._view_suggestions import Look, outline
 from smartcam.exceptions import CalibrationError
 from tests.calibration.plane.planekit import GRID, SIGMA, SPECIAL, Scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 GOLDEN = Path(__file__).with_name("target_drawing.svg")
 TARGET = Checkerboard(columns=4, rows=3, square=0.025)

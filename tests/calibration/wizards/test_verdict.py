@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._plane.calibration import fit_plane
+from smartcam.calibration import Code, fit_plane
+from smartcam.calibration._verdict import CURES, VIEW_CURES, Allowed, judge, refused
 from smartcam.calibration.wizards._points import calibrated_plane
-from smartcam.calibration.wizards._verdict import CURES, VIEW_CURES, judge, refused
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 FIELD = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
 SHIFT = np.array([0.4, -0.1])
+ALLOWED = Allowed(30.0, said=True)
 
 
 @pytest.mark.parametrize(
@@ -33,30 +33,47 @@ SHIFT = np.array([0.4, -0.1])
 def test_verdict_names_twice_the_held_out_error_rounded_up(
     held_out: float, good_for: float, text: str
 ) -> None:
-    judged = judge(held_out, [(Code.SIDE_UNKNOWN, "not checked")], worst=1)
+    judged = judge(held_out, [(Code.NOT_SIMILAR, "tilted")], worst=1, allowed=ALLOWED)
     assert (judged.good_for, judged.option) == (good_for, "accept")
     assert (judged.verdict.level, judged.verdict.text[: len(text)]) == ("good", text)
 
 
 def test_verdict_promises_no_less_than_the_noise_leads_to() -> None:
-    judged = judge(0.01, [], worst=1, predicted=0.16, where=" without point 3")
+    judged = judge(0.01, [], worst=1, predicted=0.16, allowed=ALLOWED, where=" without point 3")
     assert judged.good_for == 0.4
     assert judged.verdict.text.startswith("Good for 0.4 mm without point 3: 95 of 100")
 
 
+def test_verdict_is_not_good_beyond_what_is_allowed() -> None:
+    for allowed, why in (
+        (Allowed.of(0.003, 0.4), "but 3 mm are allowed: "),
+        (Allowed.of(None, 0.25), "but 2.5 mm are allowed, 1 % of the field, as nobody said: "),
+    ):
+        judged = judge(1.6, [], worst=1, allowed=allowed)
+        assert (judged.verdict.level, judged.good_for, judged.option) == ("poor", None, "more")
+        assert why in judged.verdict.text
+        assert judge(1.2, [], worst=1, allowed=allowed).verdict.level == "good"
+
+
+def test_verdict_is_not_known_where_all_may_be_mirrored() -> None:
+    judged = judge(0.1, [(Code.SIDE_UNKNOWN, "not checked")], worst=1, allowed=ALLOWED)
+    assert (judged.verdict.level, judged.good_for) == ("unknown", None)
+    assert "say where the tool points" in judged.verdict.text
+
+
 def test_verdict_without_a_held_out_error_is_not_known() -> None:
-    judged = judge(None, [(Code.NOT_HELD_OUT, "too few")], worst=1)
+    judged = judge(None, [(Code.NOT_HELD_OUT, "too few")], worst=1, allowed=ALLOWED)
     assert (judged.verdict.level, judged.option, judged.good_for) == ("unknown", "more", None)
     assert judged.verdict.text == "Not known how good: touch more points"
 
 
 def test_verdict_names_the_point_of_the_warning_that_is_to_be_mended_first() -> None:
     wrong = [(Code.POOR_FIT, "the residuals"), (Code.OUTLIER, "point 3 fits far worse")]
-    judged = judge(0.1, wrong, worst=5)
+    judged = judge(0.1, wrong, worst=5, allowed=ALLOWED)
     assert (judged.verdict.text, judged.option, judged.number) == (
         "Not good enough: touch point 3 again", "redo", 3,
     )  # fmt: skip
-    assert judge(0.1, wrong[:1], worst=5).number == 5
+    assert judge(0.1, wrong[:1], worst=5, allowed=ALLOWED).number == 5
 
 
 @pytest.mark.parametrize("cures", [CURES, VIEW_CURES])
@@ -69,7 +86,7 @@ def test_verdict_of_each_thing_that_is_wrong_says_what_to_do(
         assert "{" not in judged.verdict.text
         assert judged.option == option
         assert judged.chosen(["accept", option]) == option
-        assert judged.chosen(["accept"]) is None
+        assert judged.chosen(["accept", "more"]) == ("more" if option != "accept" else option)
 
 
 @pytest.mark.long

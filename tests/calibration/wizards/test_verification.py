@@ -12,13 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.calibration._files.directory import Folder
+from smartcam.calibration import Folder, PlaneCalibration, fit_plane, fit_touches
 from smartcam.calibration._files.store import write
-from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration._plane.touches import fit_touches
+from smartcam.calibration.wizards import WizardSession, drift_wizard
 from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._sequence import WizardSession
-from smartcam.calibration.wizards._verification import MAX_TOUCHES, drift_wizard, touches_needed
+from smartcam.calibration.wizards._verification import MAX_TOUCHES, touches_needed
 from smartcam.exceptions import CalibrationError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 from tests.calibration.wizards.bench import GRID, Bench, say, where

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from smartcam.calibration.wizards._view_suggestions import LOOKS, outline, suggestion
+from smartcam.calibration._inside import LOOKS, suggestion
+from smartcam.calibration.wizards._view_suggestions import outline
 from tests.calibration import lenskit
 from tests.calibration.lens.estimates import spread_poses
 

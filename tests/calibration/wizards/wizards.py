@@ -8,9 +8,17 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from smartcam.calibration.wizards import (
+    Flag,
+    Number,
+    Option,
+    Step,
+    Text,
+    Wizard,
+    WizardSession,
+    ask,
+)
 from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._sequence import Wizard, WizardSession, ask
-from smartcam.calibration.wizards._steps import Flag, Number, Option, Step, Text
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:

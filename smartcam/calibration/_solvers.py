@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, overload, runtime_checka
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.homography import apply_homography, derivatives, tangent_frames
-from smartcam.calibration._geometry.rotations import (
+from smartcam._argument_checks import a_finite_number, a_list, numbers, of_class, takes
+from smartcam.calibration._homography import apply_homography, derivatives, tangent_frames
+from smartcam.calibration._plane.validation import check_positive
+from smartcam.geometry import Code, Transform
+from smartcam.geometry._inside import (
     as_points,
     as_vector,
     check_finite,
@@ -30,8 +31,6 @@ from smartcam.calibration._geometry.rotations import (
     quaternion_multiply,
     rotate,
 )
-from smartcam.calibration._plane.validation import check_positive
-from smartcam.exceptions import CalibrationError
 from smartcam.models import Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
@@ -39,8 +38,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._plane.calibration import PlaneCalibration
+    from smartcam.geometry._inside import Array
 
 
 class Poses(NamedTuple):
@@ -68,11 +67,10 @@ class Poses(NamedTuple):
         flat = np.atleast_2d(np.asarray(points, dtype=np.float64))
         angles = np.zeros(len(flat)) if thetas is None else np.asarray(thetas, dtype=np.float64)
         if flat.shape != (len(angles), 2):
-            raise CalibrationError(
-                f"poses on a plane: expected points of shape ({len(angles)}, 2), got {flat.shape}",
-                code=Code.SHAPE,
-                expected=(len(angles), 2),
-                got=flat.shape,
+            raise Code.SHAPE.unexpected(
+                f"poses on a plane: expected points of shape ({len(angles)}, 2)",
+                (len(angles), 2),
+                flat.shape,
             )
         return cls(np.column_stack([flat, np.zeros(len(flat))]), quaternion_about_z(angles))
 
@@ -120,7 +118,7 @@ class CameraPosition2D:
 
     Args:
         origin: (2,), the origin mark as the camera sees it, in the camera's unit.
-        theta: its angle there, radians, counter-clockwise with y up.
+        theta: angle of the origin mark as the camera sees it, radians, counter-clockwise with y up.
         scale: metres in one of the camera's units; 1 where the camera gives metres.
 
     Raises:
@@ -207,31 +205,24 @@ class PlaneProjection:
     def __init__(self, matrix: ArrayLike) -> None:
         rows = as_points(matrix, 3, "projection")
         if len(rows) != 4:
-            raise CalibrationError(
-                f"projection: expected shape (4, 3), got {rows.shape}",
-                code=Code.SHAPE,
-                expected=(4, 3),
-                got=rows.shape,
-            )
+            raise Code.SHAPE.unexpected("projection: expected shape (4, 3)", (4, 3), rows.shape)
         self.matrix: Array = rows.copy()
 
     def solve(self, poses: Poses) -> Poses:
         """Return the poses in the robot's frame."""
         points, (x, y, z, w) = poses.points, poses.quaternions.T
         if points[:, 2].any() or x.any() or y.any():
-            raise CalibrationError(
+            raise Code.OUT_OF_PLANE.refusal(
                 "projection: expected poses in the camera's plane, turned about its z, got some "
-                "with a height or a tilt",
-                code=Code.OUT_OF_PLANE,
+                "with a height or a tilt"
             )
         seen = points[:, :2]
         depth = seen @ self.matrix[3, :2] + self.matrix[3, 2]
         if not np.all(depth > 0):
             hidden = seen[int(np.argmin(depth))].tolist()
-            raise CalibrationError(
+            raise Code.OUT_OF_FIELD.refusal(
                 f"projection: expected points that the camera can see, got {hidden}: behind the "
                 "plane's horizon",
-                code=Code.OUT_OF_FIELD,
                 got=hidden,
             )
         # The x axis (cos, sin) = (w^2 - z^2, 2 z w) goes where the map's derivative takes it; the
@@ -268,11 +259,8 @@ class Height:
         direction = as_vector(normal, 3, "normal")
         length = float(np.linalg.norm(direction))
         if not length > 0:
-            raise CalibrationError(
-                f"height: expected a normal, got {direction.tolist()}",
-                code=Code.SHORT_LEVER,
-                expected="a length above 0",
-                got=length,
+            raise Code.SHORT_LEVER.refusal(
+                f"height: expected a normal, got {direction.tolist()}", "a length above 0", length
             )
         self.height: float = float(as_vector([height], 1, "height")[0])
         self.normal: Array = direction / length
@@ -290,12 +278,11 @@ class Height:
         rays = self.viewpoint - points
         above = rays @ self.normal
         if not np.all(above > max(self.height, 0.0)):
-            raise CalibrationError(
+            raise Code.SHORT_LEVER.refusal(
                 f"height: expected the viewpoint more than {max(self.height, 0.0):g} m above each "
                 f"point, got {float(above.min()):g} m",
-                code=Code.SHORT_LEVER,
-                expected=self.height,
-                got=float(above.min()),
+                self.height,
+                float(above.min()),
             )
         return Poses(points + rays * (self.height / above)[:, None], poses.quaternions)
 
@@ -355,13 +342,14 @@ class Chain:
     """Solvers, one behind the other; itself a solver, so chains can be parts of chains.
 
     Args:
-        solvers: in the order in which they are applied.
+        solvers: solvers in the order in which they are applied.
         frame: name of the frame that they lead to; it stands in the headers of :meth:`to_robot`.
         camera_frame: name of the frame that localizations must come in; None for any.
         y_down: whether the camera's y axis points down and is turned up before they come, as
             :func:`smartcam.connect` does and compares; None: not known.
     """
 
+    @takes(solvers=a_list)
     def __init__(
         self,
         solvers: Sequence[Solver],
@@ -437,21 +425,19 @@ def check_frames(localizations: Sequence[Localization], frame: str | None, what:
     frames = {part.pose.header.frame_id for part in localizations}
     if frame is not None and not frames <= {frame}:
         got = ", ".join(sorted(frames - {frame}))
-        raise CalibrationError(
-            f"{what}expected poses in the frame {frame!r}, got some in {got!r}",
-            code=Code.WRONG_FRAME,
-            expected=frame,
-            got=got,
+        raise Code.WRONG_FRAME.refusal(
+            f"{what}expected poses in the frame {frame!r}, got some in {got!r}", frame, got
         )
 
 
+@takes(calibration=of_class("PlaneCalibration"), origin=numbers, theta=a_finite_number)
 def chain_of(
     calibration: PlaneCalibration, *, origin: ArrayLike = (0.0, 0.0), theta: float = 0.0
 ) -> Chain:
     """Return the chain that does what a plane's calibration does.
 
     Args:
-        calibration: from :func:`~smartcam.calibration.fit_plane`.
+        calibration: calibration from :func:`~smartcam.calibration.fit_plane`.
         origin: (2,), the camera's point that becomes the plane's origin between the two solvers;
             where it is changes nothing in the robot's frame, but solvers that are put in between
             see their poses from there.

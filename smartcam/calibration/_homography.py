@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
 
 def fit_homography(flat: Array, pixels: Array) -> Array | None:

@@ -14,20 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.solvers import (
-    CameraPosition2D,
+from smartcam.calibration import (
     Chain,
     Height,
     PlaneProjection,
-    Poses,
-    RealWorldPosition,
-    Solver,
     ToolOffset,
+    Transform,
     chain_of,
+    fit_plane,
 )
-from smartcam.calibration._plane.calibration import PlaneModel, fit_plane
-from tests.calibration.geometry.rigid import (
+from smartcam.calibration._plane.calibration import PlaneModel
+from smartcam.calibration._solvers import CameraPosition2D, Poses, RealWorldPosition, Solver
+from tests.geometry.rigid import (
     angles,
     localization,
     refused,

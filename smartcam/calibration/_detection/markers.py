@@ -1,0 +1,206 @@
+"""Square markers in images: read, and held against the map of the board that they stand on.
+
+A marker that was misread, or that belongs to another board, stands elsewhere than its number says.
+Its neighbours tell: two markers agree where the way between their middles in the image is the way
+that the board's map has between them, as both of them see the board turned and scaled. Those that
+agree hang together; of a board that is what its description says, all of them do.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.calibration._homography import apply_homography, derivatives, fit_homography
+from smartcam.geometry import Code, Remark
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+NEIGHBOUR_PITCHES = 2.9
+"""Distance on the board, in distances of next neighbours, up to which two markers are compared."""
+
+MAX_ASIDE = 0.15
+"""Part of the way between two markers by which it may differ from the map's. A number that is one
+off moves a marker by a third of the longest way or more."""
+
+MAX_TURNED = 0.5
+"""Part by which the turns and scales of two neighbouring markers may differ."""
+
+MAX_PITCHES_OFF = 0.35
+"""Distances of next neighbours by which a marker that has no neighbour may lie off the place that
+the others give it."""
+
+MIN_PITCHES_AGAINST = 0.6
+"""Distances of next neighbours by which a group of markers lies off the others' places that speaks
+against the map, beside MAX_ASIDE of its distance from them."""
+
+MIN_CONTRARY = 3
+"""Markers of a group that speaks against the description of the target, at least."""
+
+MAX_NAMED = 8
+"""Numbers of markers in a text at most."""
+
+MIN_AGREEING = 2
+"""Markers that agree at least: the number of a single one rests on one reading."""
+
+
+class Markers(NamedTuple):
+    """Markers that were read."""
+
+    quads: Array  # (N, 4, 2), corners in OpenCV's order, pixels
+    ids: NDArray[np.intp]  # (N,)
+
+    def some(self, which: NDArray[np.bool_]) -> Markers:
+        """Return some of them."""
+        return Markers(self.quads[which], self.ids[which])
+
+
+class MarkerAgreement(NamedTuple):
+    """Markers held against a map."""
+
+    good: NDArray[np.bool_]  # (N,), which stand as the map says
+    contrary: int  # how many others stand so to each other, elsewhere
+
+
+def marker_dictionary(name: str, needed: int, what: str) -> Any:
+    """Return one of OpenCV's dictionaries by its name, of ``needed`` markers or more.
+
+    ``what`` names the target. Raises SHAPE: no such dictionary, or too few markers in it.
+    """
+    cv2 = load("cv2")
+    number = getattr(cv2.aruco, name, None)
+    if not (name.startswith("DICT_") and isinstance(number, int)):
+        raise Code.SHAPE.refusal(
+            f"{what}: expected the name of one of OpenCV's dictionaries such as "
+            f"DICT_5X5_250, got {name!r}",
+            "DICT_5X5_250",
+            name,
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    there = len(dictionary.bytesList)
+    if needed > there:
+        raise Code.SHAPE.unexpected(
+            f"{what}: expected at least {needed} markers in {name}", needed, there
+        )
+    return dictionary
+
+
+def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
+    """Return the agreement of markers with the map of a board, each number counted once.
+
+    ``board`` (M, 4, 2): the corners of the markers by their numbers, in any unit. Where fewer than
+    MIN_AGREEING agree, none does.
+    """
+    good = np.zeros(len(markers.ids), dtype=np.bool_)
+    known = np.flatnonzero((markers.ids >= 0) & (markers.ids < len(board)))
+    if len(known) < MIN_AGREEING:
+        return MarkerAgreement(good, 0)
+    ids, quads = markers.ids[known], markers.quads[known]
+    flat = board[ids]
+    seen, mapped, slopes = quads.mean(axis=1), flat.mean(axis=1), _slopes(quads, flat)
+    pitch = _pitch(board.mean(axis=1))
+    groups = _hanging_together(_agreements(slopes, seen, mapped, NEIGHBOUR_PITCHES * pitch))
+    largest = groups == np.bincount(groups).argmax()
+    matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
+    if largest.sum() < MIN_AGREEING or matrix is None:
+        return MarkerAgreement(good, 0)
+    off = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
+    off /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
+    away = np.linalg.norm(mapped[:, None] - mapped[largest], axis=2).min(axis=1) / pitch
+    upright = _alike(slopes, derivatives(matrix, mapped))
+    joined = largest | ((off < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
+    good[known[joined]] = True
+    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_ASIDE * away)
+    return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
+
+
+def check_one_board(agreed: int, contrary: int, what: str) -> None:
+    """Raise (WRONG_TARGET) where markers stand as on a board that is another one, or several.
+
+    ``agreed`` of them stand to each other as on the board, and ``contrary`` others do as well, but
+    not to these. ``what`` names the target.
+    """
+    if contrary >= MIN_CONTRARY and 2 * contrary >= agreed:
+        raise Code.WRONG_TARGET.refusal(
+            f"{what}: expected markers of one such board, got {agreed} that stand to each other as "
+            f"on it and {contrary} others that do so elsewhere: columns and rows are others, or "
+            "several boards with the same numbers are in the picture",
+            f"{agreed + contrary} markers of one board",
+            agreed,
+        )
+
+
+def seen_from_nearest(quads: Array, flat: Array, at: Array) -> tuple[Array, Array]:
+    """Return the pixels where the nearest markers see places (N, 2) of a board, and a unit's there.
+
+    ``quads`` (M, 4, 2): the corners of markers in the image, ``flat`` on the board.
+    """
+    slopes, seen, mapped = _slopes(quads, flat), quads.mean(axis=1), flat.mean(axis=1)
+    ways = at[:, None] - mapped
+    apart = np.linalg.norm(ways, axis=2)
+    expected = seen + np.einsum("jkl,ijl->ijk", slopes, ways)
+    # a corner of a square lies between the two next markers, and perspective beside one of them
+    # is about the opposite of that beside the other
+    near = apart < 1.1 * apart.min(axis=1, keepdims=True)
+    shares = near / near.sum(axis=1, keepdims=True)
+    places: Array = np.einsum("ij,ijk->ik", shares, expected)
+    return places, shares @ np.sqrt(np.abs(np.linalg.det(slopes)))
+
+
+def strays_told(numbers: Sequence[int]) -> tuple[Remark, ...]:
+    """Return the remark about markers that were left out, by their numbers; none of none."""
+    if not numbers:
+        return ()
+    shown = ", ".join(map(str, numbers[:MAX_NAMED])) + (", ..." if numbers[MAX_NAMED:] else "")
+    text = f"markers left out, which do not stand where the board has them: {shown}"
+    return (Code.OUTLIER.remark(text),)
+
+
+def _slopes(quads: Array, flat: Array) -> Array:
+    """Return (N, 2, 2): how the image moves along the board's x and y at each marker."""
+    around = flat - flat.mean(axis=1, keepdims=True)
+    seen = quads - quads.mean(axis=1, keepdims=True)
+    squares = (around**2).sum(axis=(1, 2)) / 2  # of a square's corners, the same along x and y
+    slopes: Array = seen.transpose(0, 2, 1) @ around / squares[:, None, None]
+    return slopes
+
+
+def _pitch(middles: Array) -> float:
+    """Return the distance of a marker of a board from its next neighbour."""
+    apart = np.linalg.norm(middles - middles[0], axis=1)
+    return float(apart[1:].min()) if len(middles) > 1 else 0.0
+
+
+def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDArray[np.bool_]:
+    """Return (N, N): which two markers confirm each other."""
+    ways = mapped[None] - mapped[:, None]
+    apart = np.linalg.norm(ways, axis=2)
+    # the mean of both slopes leads from one to the other exactly to second order
+    both = (slopes[:, None] + slopes[None]) / 2
+    expected = np.einsum("ijkl,ijl->ijk", both, ways)
+    off = np.linalg.norm(seen[None] - seen[:, None] - expected, axis=2)
+    return np.asarray(
+        (apart > 0)
+        & (apart <= reach)
+        & (off < MAX_ASIDE * np.linalg.norm(expected, axis=2))
+        & _alike(slopes[:, None], slopes[None])
+    )
+
+
+def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Return True for each pair of slopes (..., 2, 2) with about the same turn and scale."""
+    differ = np.linalg.norm(one - other, axis=(-2, -1))
+    return np.asarray(differ < MAX_TURNED * np.linalg.norm((one + other) / 2, axis=(-2, -1)))
+
+
+def _hanging_together(agreed: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the number (N,) of the group that each belongs to."""
+    _, parts = load("scipy.sparse.csgraph").connected_components(agreed, directed=False)
+    return np.asarray(parts, dtype=np.intp)

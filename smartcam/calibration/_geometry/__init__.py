@@ -1,1 +1,0 @@
-"""Rotations, frames and homographies."""

@@ -1,0 +1,164 @@
+"""The offset between the clocks of a robot and a camera, told by a robot that moves.
+
+A robot at 250 mm/s whose pose is taken 20 ms late is 5 mm off. A camera on it, or the target on its
+hand, sees where it was: of all offsets of time that one is right with which poses and views fit
+one camera's place best.
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import timedelta
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam._argument_checks import a_number, of_class, takes
+from smartcam._extras import load
+from smartcam.calibration._hand_eye.closed_forms import check_motion, solve_linear
+from smartcam.calibration._hand_eye.equations import RobotPoses, carried, is_in_hand
+from smartcam.calibration._hand_eye.validation import seen_poses
+from smartcam.calibration._jackknife import jackknife
+from smartcam.calibration._plane.validation import check_positive
+from smartcam.geometry import Code
+from smartcam.geometry._inside import Rigid
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._hand_eye.equations import Setup
+    from smartcam.geometry import PoseHistory, Transform
+
+STEPS = 41
+"""Offsets that are tried first, over the whole range."""
+
+FOLDS = 20
+"""Parts of the views that the offset is told without, for its sigma."""
+
+MIN_VIEWS_FOR_OFFSET = 10
+"""Views that an offset takes: it is one unknown more, of which each view tells a little."""
+
+TOLD = 0.25
+"""Largest sigma of an offset that is told, as a part of the range."""
+
+
+class TimeOffset(NamedTuple):
+    """An offset between the clocks of a robot and a camera, with its sigma.
+
+    Attributes:
+        seconds: time to add to a picture's time to ask the robot's history for its pose.
+        sigma: standard deviation of ``seconds``, by the scatter between views, seconds.
+        before: rms difference of poses and views without the offset, metres.
+        after: rms difference of poses and views with the offset, metres.
+    """
+
+    seconds: float
+    sigma: float
+    before: float
+    after: float
+
+
+@takes(history=of_class("PoseHistory"), most=a_number)
+def estimate_time_offset(
+    history: PoseHistory, target_poses: Sequence[Transform], *, setup: Setup, most: float = 0.2
+) -> TimeOffset:
+    """Estimate by how much the times of pictures differ from those of a robot's poses.
+
+    ::
+
+        offset = estimate_time_offset(history, seen, setup="eye-in-hand")
+        poses = [history.at(one.at + timedelta(seconds=offset.seconds)) for one in seen]
+
+    Args:
+        history: ``T_base_flange`` while the pictures were taken, and ``most`` before and after.
+        target_poses: ``T_camera_target`` by each picture, with its time (``at``): ten or more,
+            taken while the robot moves and turns, fast enough to matter and in several directions.
+        setup: place of the camera, as for :func:`~smartcam.calibration.calibrate_hand_eye`.
+        most: the largest offset that is looked for, seconds.
+
+    Raises:
+        CalibrationError: TOO_FEW; BAD_TIME: a view without a time, a history that does not reach
+            far enough, or views that tell no offset in the range, as of a robot that stood still;
+            and what ``calibrate_hand_eye`` says of poses.
+    """
+    check_positive(most, "most", "seconds")
+    views = seen_poses(target_poses)
+    if len(views) < MIN_VIEWS_FOR_OFFSET:
+        raise Code.TOO_FEW.unexpected(
+            f"time offset: expected {MIN_VIEWS_FOR_OFFSET} views or more",
+            MIN_VIEWS_FOR_OFFSET,
+            len(views),
+        )
+    fit = _Moving(history, views, setup, most)
+    everything = np.arange(len(views))
+    found = fit.best(everything)
+    part = everything % FOLDS
+    folds = np.unique(part)
+    others = [fit.refined(everything[part != fold], found) for fold in folds]
+    scatter = math.sqrt(float(jackknife(np.array(others)[:, None])[0, 0]))
+    sigma = max(scatter, fit.least_sigma(found, everything))
+    if abs(found) > 0.99 * most or sigma > TOLD * most:
+        raise Code.BAD_TIME.refusal(
+            f"time offset: expected views that tell one within {most:g} s, got {found:.3g} s with "
+            f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",
+            most,
+            found,
+        )
+    return TimeOffset(found, sigma, fit.error(0.0, everything), fit.error(found, everything))
+
+
+class _Moving:
+    """A moving robot and the views of its camera, compared at one offset after another."""
+
+    def __init__(
+        self, history: PoseHistory, views: Sequence[Transform], setup: str, most: float
+    ) -> None:
+        self._history, self._most = history, most
+        self._in_hand = is_in_hand(setup, "time offset")
+        self._seen = Rigid.stacked(one.rigid for one in views)
+        for number, one in enumerate(views):
+            if one.at is None:
+                raise Code.BAD_TIME.refusal(
+                    f"time offset: expected view {number} with a time, got none", got=None
+                )
+        self._times = [one.at for one in views if one.at is not None]
+        self._arm = float(np.median(np.linalg.norm(self._seen.translation, axis=1)))
+        check_motion(self._robot(0.0, np.arange(len(views))))
+
+    def _robot(self, offset: float, index: NDArray[np.intp]) -> RobotPoses:
+        step = timedelta(seconds=offset)
+        poses = [self._history.at(self._times[i] + step).rigid for i in index.tolist()]
+        return RobotPoses(Rigid.stacked(poses), self._in_hand)
+
+    def error(self, offset: float, index: NDArray[np.intp]) -> float:
+        """Return the rms of what poses and views of some numbers differ by, metres."""
+        robot, seen = self._robot(offset, index), self._seen.taken(index)
+        found = solve_linear("shah", robot, seen)
+        if found is None:
+            return math.inf
+        turn, shift = np.split(seen.after(carried(found[0], robot, found[1])), 2, axis=1)
+        squares = (shift**2).sum(axis=1) + self._arm**2 * (turn**2).sum(axis=1)
+        return math.sqrt(float(squares.mean()))
+
+    def least_sigma(self, found: float, index: NDArray[np.intp]) -> float:
+        """Return the sigma of an offset if all errors were noise; infinite where none is better."""
+        # A mean square m + c x^2 of n values, m of noise, has its least at x with a variance m/cn.
+        step = math.copysign(4.0 * self._most / (STEPS - 1), -found)
+        least, beside = (self.error(one, index) ** 2 for one in (found, found + step))
+        rise = (beside - least) / step**2
+        return math.sqrt(least / (rise * 6 * len(index))) if rise > 0 else math.inf
+
+    def best(self, index: NDArray[np.intp]) -> float:
+        """Return the best offset of the whole range."""
+        tried = np.linspace(-self._most, self._most, STEPS)
+        return self.refined(index, min(tried.tolist(), key=lambda one: self.error(one, index)))
+
+    def refined(self, index: NDArray[np.intp], near: float) -> float:
+        """Return the best offset near to one."""
+        step = 2.0 * self._most / (STEPS - 1)
+        low, high = max(near - step, -self._most), min(near + step, self._most)
+        search = load("scipy.optimize").minimize_scalar
+        found = search(lambda one: self.error(one, index), bounds=(low, high), method="bounded")
+        return float(found.x)

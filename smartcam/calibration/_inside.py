@@ -1,0 +1,94 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.calibration._drawing.files import draw_file
+    from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.calibration._lens.comparison import compare_lenses, rig_difference
+    from smartcam.calibration._lens.uncertainty import MapFigures
+    from smartcam.calibration._plane.drawing import draw
+    from smartcam.calibration._printing.sheets import on_paper
+    from smartcam.calibration._stereo.rectification import Rectification, rectify
+    from smartcam.calibration._targets import Target
+    from smartcam.calibration._units import METRES
+    from smartcam.calibration._verdict import doubt_of
+    from smartcam.calibration.formats._cameras import MAX_FILE, CameraInfo, parse_camera_info
+    from smartcam.calibration.formats._lenses import StoredLenses, read_lenses
+    from smartcam.calibration.wizards._listing import listing
+    from smartcam.calibration.wizards._pictures import MAX_PICTURE, SUFFIXES, decode_picture
+    from smartcam.calibration.wizards._steps import Input
+    from smartcam.calibration.wizards._thesis import (
+        CalibrationCamera,
+        CalibrationDesks,
+        CalibrationStart,
+        PixelPoseRequest,
+        StepRequest,
+        ThesisCalibration,
+    )
+    from smartcam.calibration.wizards._verification import WIZARD
+    from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
+
+__all__ = [
+    "LOOKS",
+    "MAX_FILE",
+    "MAX_PICTURE",
+    "METRES",
+    "SUFFIXES",
+    "WIZARD",
+    "AnyCalibration",
+    "CalibrationCamera",
+    "CalibrationDesks",
+    "CalibrationStart",
+    "CameraInfo",
+    "Input",
+    "MapFigures",
+    "PixelPoseRequest",
+    "Rectification",
+    "StepRequest",
+    "StoredLenses",
+    "Target",
+    "ThesisCalibration",
+    "compare_lenses",
+    "decode_picture",
+    "doubt_of",
+    "draw",
+    "draw_file",
+    "listing",
+    "on_paper",
+    "parse_camera_info",
+    "read_lenses",
+    "rectify",
+    "rig_difference",
+    "suggestion",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_drawing.files": "draw_file",
+            "_files.load": "AnyCalibration",
+            "_lens.comparison": "compare_lenses rig_difference",
+            "_lens.uncertainty": "MapFigures",
+            "_plane.drawing": "draw",
+            "_printing.sheets": "on_paper",
+            "_stereo.rectification": "Rectification rectify",
+            "_targets": "Target",
+            "_units": "METRES",
+            "_verdict": "doubt_of",
+            "formats._cameras": "CameraInfo MAX_FILE parse_camera_info",
+            "formats._lenses": "StoredLenses read_lenses",
+            "wizards._listing": "listing",
+            "wizards._pictures": "MAX_PICTURE SUFFIXES decode_picture",
+            "wizards._steps": "Input",
+            "wizards._thesis": "CalibrationCamera CalibrationDesks CalibrationStart "
+            "PixelPoseRequest StepRequest ThesisCalibration",
+            "wizards._verification": "WIZARD",
+            "wizards._view_suggestions": "LOOKS suggestion",
+        },
+    )

@@ -1,0 +1,304 @@
+"""Explanations of views that fit a lens worse than noise would: flipped pictures, a zoom, or else.
+
+What is likely is no proof. So it is a remark, and says what else was tried: sheets that bend anew,
+a shutter that rolls, a lens of another model. All is told by what the pose of each view cannot make
+up for: its part of the residuals, and of what any of these would change, is taken off first.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._least_squares import solve_scaled
+from smartcam.calibration._lens.bundle import lens_values
+from smartcam.calibration._lens.projection import (
+    SMOOTH,
+    linearize,
+    pose_changes,
+    smooth_changes,
+    whitening,
+)
+from smartcam.geometry import Code, Remark
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.calibration._views import TargetView
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array, Rigid
+
+    Mask = NDArray[np.bool_]
+
+WAYS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
+"""Ways to flip a picture, each with the axes of the image whose direction changes."""
+
+DEFORMATIONS: Final = 5
+"""Number of ways in which a sheet deforms: x stretches, y leans, and three ways to bend."""
+
+SHUTTER: Final = 2
+"""Ways in which a picture leans and stretches from row to row, where the shutter rolls."""
+
+FURTHER: Final = DEFORMATIONS + SHUTTER + SMOOTH
+"""Values beside a lens' own by which its misfit may be explained."""
+
+MIN_VIEWS_TO_EXPLAIN: Final = 4
+"""Views, of which the misfit is explained at all."""
+
+ZOOMED: Final = 1.5
+"""Squares over those with two focal lengths, from which on these are told: recorded views reach
+1.08, a shutter that rolls 1.32, a zoom of 3 % 1.87 (measured)."""
+
+FITTED: Final = 1.2
+"""Squares over those with a lens that is fitted to the views, from which on a known one is wrong:
+lenses from other views reach 1.04 on recorded pairs, a focal length that is 1 % off 2 where noise
+is 0.05 pixels."""
+
+MIN_VIEWS_FOR_LENS: Final = 3
+"""Views that such a lens is fitted to at least."""
+
+TURNS: Final = 20
+"""Most rounds in which lens and flips are chosen in turn."""
+
+
+class Fitted(NamedTuple):
+    """A view and what was fitted to it."""
+
+    view: TargetView
+    camera: CameraModel
+    pose: Rigid  # ``T_camera_target``
+    points: Array  # (T, 3), of the target, metres
+
+    def equations(self, more: float) -> Equations:
+        """Return the view's equations; ``more``: variance beside the points' own, pixels^2."""
+        flat = self.points[self.view.ids]
+        turned = flat @ self.pose.rotation.T
+        seen = linearize(turned + self.pose.translation, self.camera)
+        white = whitening(self.view.covariance, more)
+        by_sheet = seen.by_point @ self.pose.rotation @ _deformations(flat)
+        rows = seen.pixels[:, 1, None, None] / self.camera.size[1]
+        further = by_sheet, rows * np.eye(2), smooth_changes(seen.pixels, self.camera.size)
+        return Equations(
+            white @ pose_changes(seen.by_point, turned),
+            white @ np.concatenate([seen.by_lens, *further], axis=2),
+            (white @ (self.view.points - seen.pixels)[..., None])[..., 0],
+            np.sqrt(more + self.view.sigmas**2),
+        )
+
+
+def _deformations(flat: Array) -> Array:
+    """Return the moves of points (N, 3) as the sheet stretches, shears and bends (N, 3, D)."""
+    x, y = (flat[:, :2] / np.ptp(flat, axis=0).max()).T
+    moves = np.zeros((len(flat), 3, DEFORMATIONS))
+    moves[:, 0, 0], moves[:, 0, 1] = x, y
+    moves[:, 2, 2], moves[:, 2, 3], moves[:, 2, 4] = x**2, x * y, y**2
+    return moves
+
+
+class Equations(NamedTuple):
+    """The linear equations of one view, in standard deviations."""
+
+    by_pose: Array  # (N, 2, 6)
+    # (N, 2, ...), by the lens' values, deformations of the sheet, a shutter that rolls, and smooth
+    # changes of the image
+    by_shared: Array
+    residuals: Array  # (N, 2), seen minus projected
+    deviations: Array  # (N,), what one of them is, pixels
+
+
+def lens_alone(equations: Equations) -> Mask:
+    """Return a mask of the shared unknowns that are a lens' values."""
+    count = equations.by_shared.shape[2]
+    of_lens: Mask = np.arange(count) < count - FURTHER
+    return of_lens
+
+
+class Reduced(NamedTuple):
+    """Normal equations of views for the values of a lens and a sheet, without their poses.
+
+    Where the values change by x, the weighted squares of view i are
+    ``squares[i] - 2 right[i] x + x matrix[i] x``.
+    """
+
+    matrix: Array  # (V, L, L)
+    right: Array  # (V, L)
+    squares: Array  # (V,)
+
+    @classmethod
+    def of(cls, equations: Sequence[Equations]) -> Reduced:
+        """Return the reduced equations of views, the best pose of each taken in."""
+        parts = []
+        for one in equations:
+            rows = one.by_pose.reshape(-1, 6)
+            rest = np.column_stack([one.by_shared.reshape(len(rows), -1), one.residuals.ravel()])
+            rest = rest - rows @ solve_scaled(rows.T @ rows, rows.T @ rest)
+            parts.append(rest.T @ rest)
+        found = np.array(parts)
+        return cls(found[:, :-1, :-1], found[:, :-1, -1], found[:, -1, -1])
+
+    def misfits(self, change: Array) -> Array:
+        """Return the weighted squares of each view (V,) where the values change by (L,)."""
+        misfits: Array = self.squares - 2.0 * self.right @ change + self.matrix @ change @ change
+        return misfits
+
+    def best(self, free: Mask, places: Sequence[int] = ()) -> tuple[Array, float]:
+        """Return the change of the free values (L,) with the least squares, and these.
+
+        At some places each view may have a value of its own.
+        """
+        # Schur's complement once more: x_own = M_oo^-1 (b_o - M_o x)
+        matrix, right, squares = self.matrix.sum(axis=0), self.right.sum(axis=0), self.squares.sum()
+        for whole, side in zip(self.matrix, self.right, strict=True) if places else ():
+            own = whole[np.ix_(places, places)]
+            both = solve_scaled(own, np.column_stack([whole[places], side[places]]))
+            matrix = matrix - whole[:, places] @ both[:, :-1]
+            right = right - whole[:, places] @ both[:, -1]
+            squares = squares - side[places] @ both[:, -1]
+        basis = np.eye(len(right))[:, free]
+        change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
+        return change, float(squares - change @ right)
+
+
+class _FlippedLens(NamedTuple):
+    """Change of a lens' values by a flip: by ``shift``, and of their changes by ``mirror``."""
+
+    mirror: Array  # (L,), 1 or -1
+    shift: Array  # (L,)
+
+    @classmethod
+    def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
+        """Return the changes of a lens' values that flipping pictures along some axes makes."""
+        values = np.concatenate([lens_values(camera), np.zeros(FURTHER)])
+        mirror, goal = np.ones(len(values)), values.copy()
+        for axis in axes:
+            mirror[2 + axis], goal[2 + axis] = -1.0, camera.size[axis] - 1 - values[2 + axis]
+            if camera.distortion_model != "equidistant":
+                place = (7, 6)[axis]  # p2 stands for a tilt along x, p1 for one along y
+                mirror[place], goal[place] = -1.0, -values[place]
+        return cls(mirror, goal - values)
+
+    def best(self, reduced: Reduced, free: Mask, flipped: Mask) -> tuple[Mask, float]:
+        """Return a mask of views that are better flipped, from a guess, and the squares of all."""
+        # Lens and flips are chosen in turn, which only lowers the squares.
+        # Source: Lloyd, Least Squares Quantization in PCM (1982).
+        basis = np.eye(len(self.mirror))[:, free]
+        as_is = mirrored = reduced.squares
+        for _ in range(TURNS):
+            plain, other = (reduced.matrix[one].sum(axis=0) for one in (~flipped, flipped))
+            back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
+            matrix = plain + self.mirror[:, None] * other * self.mirror
+            right = reduced.right[~flipped].sum(axis=0) + back
+            change = basis @ solve_scaled(basis.T @ matrix @ basis, basis.T @ right)
+            as_is = reduced.misfits(change)
+            mirrored = reduced.misfits(self.shift + self.mirror * change)
+            better = mirrored < as_is
+            if (better == flipped).all():
+                break
+            flipped = better
+        return flipped, float(np.minimum(as_is, mirrored).sum())
+
+
+def misfit_remarks(
+    fitted: Sequence[Fitted], more: float, free: Mask, names: Sequence[str]
+) -> Iterator[Remark]:
+    """Yield a remark if flipped pictures, or a zoom, explain the views better than all else.
+
+    A picture of a board that looks the same in a mirror is found when it is flipped, too; its
+    points are then what a camera with a mirrored lens sees. But so large a misfit has other causes,
+    too: each is fitted as well, and what explains it best counts.
+
+    ``more``: variance beside the points' own, pixels^2. ``free`` (4 + K,): the lens' values that
+    were fitted. ``names``: of the views.
+    """
+    if len(fitted) < MIN_VIEWS_TO_EXPLAIN:
+        return
+    equations = [one.equations(more) for one in fitted]
+    reduced, count = Reduced.of(equations), sum(one.residuals.size for one in equations)
+    lens, views = len(free), len(fitted)
+    places = np.split(lens + np.arange(FURTHER), np.cumsum([DEFORMATIONS, SHUTTER]))
+    sheet, shutter, smooth = (one.tolist() for one in places)
+    usual = np.zeros(lens + FURTHER, dtype=np.bool_)
+    usual[:lens], usual[sheet] = free, True
+    other = usual.copy()
+    other[smooth] = True
+
+    def score(squares: float, unknowns: float) -> float:
+        # Schwarz, Estimating the Dimension of a Model (1978)
+        return count * math.log(max(squares, 1e-300)) + unknowns * math.log(count)
+
+    before = reduced.best(usual)[1]
+    explained = {
+        "sheets that bend anew in each view": (reduced.best(usual, sheet)[1], views * len(sheet)),
+        "a shutter that rolls": (reduced.best(usual, shutter)[1], views * len(shutter)),
+        "a lens of another model": (reduced.best(other)[1], len(smooth)),
+    }
+    best = min(score(before, 0), *(score(*one) for one in explained.values()))
+    others = ", ".join(
+        f"{what} {before / max(after, 1e-300):.3g}" for what, (after, _) in explained.items()
+    )
+    told = f"times smaller so; what else was tried explains less for what it takes: {others}"
+    changed, after = _zoomed(reduced, usual)
+    if before > ZOOMED * after and score(after, 3) < best:
+        yield Code.WRONG_LENS.remark(
+            f"views of two focal lengths: those from {names[changed]} on are of another one than "
+            f"those before, was the zoom or the focus moved? The squares of all are "
+            f"{before / max(after, 1e-300):.3g} {told}"
+        )
+        return
+    flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in WAYS.values()]
+    tried = [
+        (how, *min((flip.best(reduced, usual, one) for one in guesses), key=lambda one: one[1]))
+        for (how, axes), flip in zip(WAYS.items(), flips, strict=True)
+        for guesses in [list(_guesses(reduced, [2 + axis for axis in axes]))]
+    ]
+    how, flipped, after = min(tried, key=lambda one: one[2])
+    if flipped.any() and not flipped.all() and score(after, views) < best:
+        fewer = flipped if 2 * flipped.sum() <= len(flipped) else ~flipped
+        which = ", ".join(itertools.compress(names, fewer.tolist()))
+        yield Code.MIRRORED.remark(
+            f"pictures that look flipped {how} against the others, or those of another camera: "
+            f"{which}. The squares of all are {before / max(after, 1e-300):.3g} {told}"
+        )
+
+
+def _zoomed(reduced: Reduced, free: Mask) -> tuple[int, float]:
+    """Return from which view on focal lengths of their own explain most, and the squares then."""
+    found = []
+    for first in range(2, len(reduced.squares) - 1):
+        parts = [slice(None, first), slice(first, None)]
+        sums = Reduced(*(np.array([part[some].sum(axis=0) for some in parts]) for part in reduced))
+        found.append((first, sums.best(free, [0, 1])[1]))
+    return min(found, key=lambda one: one[1])
+
+
+def _guesses(reduced: Reduced, places: Sequence[int]) -> Iterator[Mask]:
+    """Yield views that may be flipped: those that want the principal point elsewhere."""
+    for place in places:
+        weight = np.maximum(reduced.matrix[:, place, place], np.finfo(np.float64).tiny)
+        wish = reduced.right[:, place] / weight
+        yield wish < np.median(wish)
+        yield wish < 0
+        yield np.abs(wish) > 3 * np.median(np.abs(wish))
+
+
+def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[Remark]:
+    """Yield a remark if a known lens is not the camera's (``WRONG_LENS``).
+
+    ``fitted``: the views that it shows; ``what``: it is, for texts; ``more``: variance beside their
+    points' own, pixels^2.
+    """
+    if len(fitted) < MIN_VIEWS_FOR_LENS:
+        return
+    equations = [one.equations(more) for one in fitted]
+    reduced = Reduced.of(equations)
+    before, after = float(reduced.squares.sum()), reduced.best(lens_alone(equations[0]))[1]
+    if before > FITTED * after:
+        yield Code.WRONG_LENS.remark(
+            f"the {what} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "
+            "the residuals of one that is fitted to its views: is it this camera's, at this focus?"
+        )

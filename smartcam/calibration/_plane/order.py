@@ -1,0 +1,174 @@
+"""Touches that belong to other marks than they were given for: exchanged, shifted or turned about.
+
+Where the touches of two marks are exchanged, or all of them are shifted by one, least squares
+spread the mistake over all points. Here the order itself is looked for: from the order as given,
+from each shift of it, and from each of these backwards, the exchange of two touches that makes the
+sum of squares least is made, until none makes it less. An order is worth a word only where a
+simple map explains it and the order as given is far from that.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from smartcam.calibration._plane.model_selection import NEGLIGIBLE
+from smartcam.calibration._statistics import Noise
+from smartcam.geometry import Code, Remark
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+    Order = NDArray[np.intp]
+
+LEVEL = 1e-6
+"""Largest chance that noise alone makes another order look far better than the one given."""
+
+PLAUSIBLE = 0.001
+"""Least chance that the noise of touches is as large as what the better order leaves over."""
+
+MAX_POINTS_TO_ORDER = 40
+"""Points up to which an order is looked for: a step compares the square of their number."""
+
+SURE = 2
+"""An order is sure if every other one that does as well moves as many times the touches."""
+
+MIN_POINTS_FOR_AFFINE = 6
+"""Points from which an affine map may explain another order; it fits any four nearly."""
+
+
+class Reordered(NamedTuple):
+    """An order that explains the touches better.
+
+    Attributes:
+        order: (N,), for each mark the index of the touch that belongs to it.
+        before: sigma of a touch that the order as given speaks of, in the unit of the touches.
+        after: sigma of a touch that the better order speaks of, in the unit of the touches.
+        sure: True if every other order that does as well moves far more touches: marks in a regular
+            grid look alike from several sides.
+    """
+
+    order: Order
+    before: float
+    after: float
+    sure: bool
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        """Indices of the marks that get another touch."""
+        return tuple(np.flatnonzero(self.order != np.arange(len(self.order))).tolist())
+
+    def remark(self, numbers: NDArray[np.intp], mm: float = 1e3) -> Remark:
+        """Return a remark that tells of the better order.
+
+        ``numbers`` (N,): what texts call the points. ``mm``: millimetres for each unit of touches.
+        """
+        moved = [int(numbers[i]) for i in self.moved]
+        which = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
+        how = "exchanged" if len(moved) == 2 else "in the wrong order"
+        several = "" if self.sure else "; more than one order does as well: touch them anew"
+        return Code.WRONG_ORDER.remark(
+            f"the touches of points {which} look {how}: as given they speak of a touch with a "
+            f"sigma of {mm * self.before:.3g} mm, put right of {mm * self.after:.3g} mm{several}"
+        )
+
+
+def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
+    """Return the order of touches that explains them far better than the one given, if any does.
+
+    ``camera`` (N, 2), ``robot`` (N, 3), in the order as given. ``sigma``: the most that one
+    coordinate of a touch may be off, in the robot's unit.
+    """
+    count = len(camera)
+    if not 3 < count <= MAX_POINTS_TO_ORDER:
+        return None
+    models = [_Similarity(camera, robot)]
+    if count >= MIN_POINTS_FOR_AFFINE:
+        models.append(_Affine(camera, robot))
+    for model in models:
+        given, freedom = model.squares(np.arange(count)[None])[0], 3 * count - model.parameters
+        if Noise(sigma**2).chance(given, freedom) > LEVEL:
+            return None  # a simple map explains the order as given
+        orders, squares = model.search()
+        scale = max(squares.min() / freedom, (NEGLIGIBLE * model.extent) ** 2)
+        noise = Noise(scale, freedom)
+        if Noise(sigma**2).chance(squares.min(), freedom) < PLAUSIBLE or (
+            noise.chance(given, freedom) > LEVEL
+        ):
+            continue
+        alike = np.array([noise.chance(one, freedom) > PLAUSIBLE for one in squares])
+        moved = np.where(alike, (orders != np.arange(count)).sum(axis=1), 2 * count)
+        first, *others = np.argsort(moved, kind="stable").tolist()
+        sure = all(SURE * moved[first] <= moved[one] for one in others)
+        after = max(squares[first] / freedom, scale)
+        return Reordered(orders[first], float((given / freedom) ** 0.5), float(after**0.5), sure)
+    return None
+
+
+class _Similarity:
+    """Sums of squares of similarities, for many orders at once."""
+
+    parameters = 7
+
+    def __init__(self, camera: Array, robot: Array) -> None:
+        self._marks, self._touches = camera - camera.mean(axis=0), robot - robot.mean(axis=0)
+        self._camera = self._basis()
+        self._total = float((self._touches**2).sum())
+        self.extent = self._total**0.5
+
+    def _basis(self) -> Array:
+        return np.asarray(self._marks / np.linalg.norm(self._marks))
+
+    def squares(self, orders: Order) -> Array:
+        """Return the sums of squares (K,) of orders (K, N)."""
+        return self._left(np.einsum("kni,nj->kij", self._touches[orders], self._camera))
+
+    def _left(self, cross: Array) -> Array:
+        """Return the rest of the touches' squares, by sums of products (..., 3, 2)."""
+        # With marks of squares 1 the best scale is the sum of the singular values of C = sum p u^T,
+        # and takes its square off. (s1 + s2)^2 = tr C^T C + 2 sqrt(det C^T C).
+        # Source: Umeyama, Least-Squares Estimation of Transformation Parameters (1991).
+        inner = np.swapaxes(cross, -1, -2) @ cross
+        root = np.sqrt(np.maximum(np.linalg.det(inner), 0.0))
+        left = self._total - np.trace(inner, axis1=-2, axis2=-1) - 2.0 * root
+        return np.asarray(np.maximum(left, 0.0))
+
+    def search(self) -> tuple[Order, Array]:
+        """Return the orders (K, N) that no exchange improves, and their sums of squares (K,)."""
+        rows = np.arange(len(self._marks))
+        starts = [np.roll(way, by) for way in (rows, rows[::-1]) for by in rows]
+        orders = np.unique([self._descended(one) for one in starts], axis=0)
+        return orders, self.squares(orders)
+
+    def _descended(self, order: Order) -> Order:
+        """Return an order after all exchanges that make its sum of squares less."""
+        first, second = np.triu_indices(len(order), 1)
+        order, least = order.copy(), float(self.squares(order[None])[0])
+        while True:
+            touched = self._touches[order]
+            cross = touched.T @ self._camera
+            # exchanging the touches of i and j adds (p_j - p_i) (u_i - u_j)^T
+            moves = (touched[second] - touched[first])[:, :, None] * (
+                self._camera[first] - self._camera[second]
+            )[:, None, :]
+            squares = self._left(cross + moves)
+            best = int(np.argmin(squares))
+            if not squares[best] < least * (1.0 - 1e-9):
+                return order
+            least, (i, j) = float(squares[best]), (first[best], second[best])
+            order[[i, j]] = order[[j, i]]
+
+
+class _Affine(_Similarity):
+    """Sums of squares of affine maps, as of a camera that is tilted, for many orders at once."""
+
+    parameters = 9
+
+    def _basis(self) -> Array:
+        return np.linalg.qr(self._marks)[0]
+
+    def _left(self, cross: Array) -> Array:
+        return np.asarray(np.maximum(self._total - (cross**2).sum(axis=(-2, -1)), 0.0))

@@ -1,0 +1,74 @@
+"""Units of length: said by a file, by its format or by the user, and never guessed.
+
+Programs write the same files in metres and in millimetres. Where neither the file nor its format
+says which, the user has to; where one does, values that no robot's cell has are refused all the
+same, with the question whether they are in another unit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+from smartcam.geometry import Code
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from smartcam.exceptions import CalibrationError
+
+LengthUnit: TypeAlias = Literal["m", "cm", "mm", "inch"]
+"""Names of units of length."""
+
+METRES: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+"""Metres of each unit."""
+
+MAX_UNASKED_M: Final = 20.0
+"""Metres from a frame to another, or from a sensor to a point, beyond which the unit has to be
+said: 20 mm and more are then asked for, and a robot's cell is smaller than 20 m."""
+
+MAX_ANGLE: Final = 2 * math.pi + 1e-3
+"""Radians beyond which an angle is taken for degrees."""
+
+
+def metres_of(unit: object, what: str) -> float:
+    """Return the metres of a unit; else UNIT_UNKNOWN. ``what`` has its lengths in it."""
+    if not isinstance(unit, str) or unit not in METRES:
+        raise Code.UNIT_UNKNOWN.refusal(
+            f"{what}: expected a unit of length of {', '.join(METRES)}, got {unit!r}",
+            list(METRES),
+            unit,
+        )
+    return METRES[unit]
+
+
+def no_unit(what: str) -> CalibrationError:
+    """Return the error about a file that may be in metres or in millimetres."""
+    return Code.UNIT_UNKNOWN.refusal(
+        f"{what}: expected to know the unit of its lengths, which neither the file nor its format "
+        'says; give it as unit="m" or unit="mm", or as --unit on the command line',
+        list(METRES),
+    )
+
+
+def check_length(metres: float, what: str) -> None:
+    """Raise (UNIT_UNKNOWN) where a length in metres is none that a robot's cell has."""
+    if metres > MAX_UNASKED_M:
+        raise Code.UNIT_UNKNOWN.refusal(
+            f"{what}: expected at most {MAX_UNASKED_M:g} m, got {metres:g} m; is it in "
+            'millimetres? Give unit="mm" then, or unit="m" if it is not',
+            MAX_UNASKED_M,
+            metres,
+        )
+
+
+def check_angles(radians: Sequence[float], what: str) -> None:
+    """Raise (UNIT_UNKNOWN) where angles are more than a whole turn."""
+    largest = max(map(abs, radians))
+    if largest > MAX_ANGLE:
+        raise Code.UNIT_UNKNOWN.refusal(
+            f"{what}: expected angles in radians, a whole turn at most, got {largest:g}; are they "
+            "in degrees? Multiply them by pi / 180",
+            2 * math.pi,
+            largest,
+        )

@@ -1,0 +1,186 @@
+"""Verdicts on what came out: whether it is good, for how many millimetres, and what to do next.
+
+"Good" takes three things: nothing is wrong that has a cure, points that were left out tell the
+error, and twice that error is within what the user allows, or without a word of theirs within
+:data:`PART` of the field. Whoever loads a calibration that is not good is told so in the log.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+from smartcam.geometry import Code
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+_log = logging.getLogger(__name__)
+
+PART: Final = 0.01
+"""Largest error that is allowed where the user does not say, as a part of the field."""
+
+_WITHIN: Final = 2.0
+"""Twice an rms error holds 95 of 100 errors or more, in one direction as in three."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationVerdict:
+    """A judgement of a calibration, or of the outcome of a wizard's step.
+
+    Attributes:
+        level: ``good``, ``poor`` (not good enough), or ``unknown``.
+        text: the judgement in words, and what to do about it.
+    """
+
+    level: Literal["good", "poor", "unknown"]
+    text: str
+
+
+class Allowed(NamedTuple):
+    """The largest error that is allowed."""
+
+    error: float  # mm, of 95 of 100 new points
+    said: bool  # whether the user said so
+
+    @classmethod
+    def of(cls, error: float | None, field: float) -> Allowed:
+        """Return the allowed error: the user's, or a part of the ``field``, both in metres."""
+        return cls(1e3 * (PART * field if error is None else error), error is not None)
+
+    @property
+    def text(self) -> str:
+        """The error that is allowed, and who said so, in words."""
+        if self.said:
+            return f"{self.error:.3g} mm are allowed"
+        return f"{self.error:.3g} mm are allowed, {100 * PART:g} % of the field, as nobody said"
+
+
+_LOOK: Final = ("see the warning", "more")
+_AGAIN: Final = "touch point {number} again"
+
+CURES: Final[Mapping[Code, tuple[str, str]]] = {
+    Code.MIRRORED: ("begin anew with --y-down, or say where the tool points", "more"),
+    Code.COLLINEAR: ("touch points that are not in a line", "more"),
+    Code.SHORT_LEVER: ("touch points that are farther apart", "more"),
+    Code.COINCIDENT: ("a point was touched twice: remove one", "remove"),
+    Code.TOO_FEW: ("touch more points", "more"),
+    Code.WRONG_ORDER: ("exchange the touches that are named, or touch the points again", "reorder"),
+    Code.OUTLIER: (_AGAIN, "redo"),
+    Code.NOT_PLANAR: (_AGAIN, "redo"),
+    Code.POOR_FIT: (_AGAIN, "redo"),
+    Code.SCALE_MISMATCH: ("measure the print, and check the units", "more"),
+}
+"""Advice and the option that follows it, by what is wrong; the first that applies counts."""
+
+VIEW_CURES: Final[Mapping[Code, tuple[str, str]]] = {
+    Code.REFUTED: ("touches of the sheet are off: is the tip right? Else take more views", "more"),
+    Code.SCALE_MISMATCH: ("measure the print", "more"),
+    Code.WRONG_LENS: ("calibrate the lens as it is set now", "more"),
+    Code.MIRRORED: ("see that no picture is flipped", "more"),
+    Code.BAD_VIEW: ("remove view {number}", "remove"),
+    Code.POOR_FIT: ("remove view {number}", "remove"),
+    Code.INSUFFICIENT_ROTATION: ("take views that are tilted more to both sides", "more"),
+    Code.POSES_TOO_SIMILAR: ("take views that are tilted more to both sides", "more"),
+}
+"""Advice and option for calibrations from views, as :data:`CURES`."""
+
+
+class Judgement(NamedTuple):
+    """A verdict, and what is advisable."""
+
+    verdict: CalibrationVerdict
+    good_for: float | None = None  # mm, of 95 of 100 new points; None: not good, or not known
+    option: str = "accept"  # the advisable one
+    number: int | None = None  # the point or view that it is about, from 1
+
+    def chosen(self, options: Iterable[str]) -> str:
+        """Return the advisable one of some options; what is not good is never just accepted."""
+        return next(one for one in (self.option, "redo", "more") if one in options)
+
+    @property
+    def figures(self) -> dict[str, Any]:
+        """The fields of a wizard's result that say it."""
+        return {"good_for_mm": self.good_for}
+
+
+def judge(
+    held_out: float | None,
+    wrong: Iterable[tuple[Code, str]],
+    *,
+    worst: int,
+    predicted: float | None = None,
+    allowed: Allowed,
+    cures: Mapping[Code, tuple[str, str]] = CURES,
+    more: str = "touch more points",
+    where: str = "",
+) -> Judgement:
+    """Return the judgement of a calibration.
+
+    ``held_out``: rms error at points that were left out, mm. ``wrong``: warnings; those that have
+    no cure do not count. ``worst``: number of the point to blame where a warning names none.
+    ``predicted``: rms error that noise leads to, mm; what is promised is not below it.
+    ``allowed``: what may be promised at most. ``more``: what tells how good it is. ``where``: of
+    what the promise is, for people.
+    """
+    wrong = list(wrong)
+    texts = dict(reversed(wrong))
+    for code in cures:
+        if code in texts:
+            return refused(code, texts[code], worst=worst, cures=cures)
+    if held_out is None:
+        return Judgement(
+            CalibrationVerdict("unknown", f"Not known how good: {more}"), option="more"
+        )
+    good_for = _rounded_up(_WITHIN * max(held_out, predicted or 0.0))
+    promise = f"95 of 100 new points lie within {good_for:g} mm{where}"
+    if good_for > max(allowed.error, _rounded_up(0.0)):
+        text = f"Not good enough: {promise}, but {allowed.text}: {more}"
+        return Judgement(CalibrationVerdict("poor", text), option="more")
+    if Code.SIDE_UNKNOWN in texts:
+        text = f"Not known how good: say where the tool points. If y is not mirrored, {promise}"
+        return Judgement(CalibrationVerdict("unknown", text))
+    text = f"Good for {good_for:g} mm{where}: 95 of 100 new points lie within it; {allowed.text}"
+    return Judgement(CalibrationVerdict("good", text), good_for)
+
+
+def refused(
+    code: str,
+    text: str,
+    *,
+    worst: int = 1,
+    cures: Mapping[Code, tuple[str, str]] = CURES,
+) -> Judgement:
+    """Return the judgement that a calibration is not good; ``text`` says what is wrong with it."""
+    named = re.search(r"\bpoints? (\d+)", text)
+    number = int(named[1]) if named else worst
+    cure, option = next((how for one, how in cures.items() if one == code), _LOOK)
+    said = CalibrationVerdict("poor", f"Not good enough: {cure.format(number=number)}")
+    return Judgement(said, option=option, number=number)
+
+
+def _rounded_up(value: float) -> float:
+    """Return a value rounded up to one decimal, below 0.1 to one digit."""
+    digits = 1 if value > 0.1 else -math.floor(math.log10(max(value, 0.001)))
+    factor = 10.0**digits
+    return max(math.ceil(round(value * factor, 6)), 1) / factor
+
+
+def doubt_of(calibration: Any) -> str:
+    """Return a warning for users of a calibration that is not good; else an empty text.
+
+    ``calibration``: one with a ``verdict``; any other gives an empty text.
+    """
+    verdict: CalibrationVerdict | None = getattr(calibration, "verdict", None)
+    if verdict is None or verdict.level == "good":
+        return ""
+    return f"this calibration is not known to be good. {verdict.text}"
+
+
+def warn(calibration: Any, name: str) -> None:
+    """Log a warning where the calibration of a file is not known to be good."""
+    if doubt := doubt_of(calibration):
+        _log.warning("%s: %s", name, doubt)

@@ -1,0 +1,675 @@
+"""A camera's calibrations as the thesis' five services have them: one wizard, without tokens.
+
+The steps are those of the page and of the terminal. In front of them stands one that asks what no
+field of the request says: the name, where the camera is, where pictures come from. A request names
+no step, so one call answers at a time, and a sequence belongs to whoever has started it until it
+ends, is aborted or is left alone.
+
+Source: thesis 2.2.2, Figures 2.8 to 2.12 (published) for the services and their fields.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
+
+from smartcam.calibration._files.directory import MAX_NAME, NAME, Folder
+from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
+from smartcam.calibration.wizards._plane import plane_wizard
+from smartcam.calibration.wizards._services import CalibrationService
+from smartcam.calibration.wizards._sheet import sheet_wizard
+from smartcam.calibration.wizards._steps import Number, Option, Step, Text, as_lists, from_lists
+from smartcam.exceptions import CalibrationError, SmartCamError
+from smartcam.geometry import Code, Transform
+from smartcam.models import Header, Pose
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.calibration.wizards._sequence import Wizard, WizardSession
+    from smartcam.calibration.wizards._steps import Answers, Input
+    from smartcam.geometry import CameraModel
+    from smartcam.models import Localization
+
+SMARTCAMERA: Final = "SMARTCAMERA"
+"""Text in place of a topic that means the smart camera itself."""
+
+ABANDONED: Final = 1800.0
+"""Seconds without a call after which a calibration under way is given up; its journal stays."""
+
+FIXED: Final[Mapping[str, str]] = {
+    "True": "fixed in the cell, beside the robot",
+    "False": "on the flange of the robot",
+}
+"""Places of a camera, for people, by what a request says of it."""
+
+
+_ABORTED: Final = Step(
+    id="aborted",
+    title="Aborted",
+    description="There is no calibration. What was measured stays in the journal.",
+    button="",
+)
+"""Step that tells the end of a calibration that was aborted."""
+
+T = TypeVar("T")
+
+
+class CalibrationCamera(Protocol):
+    """The smart camera that is calibrated, as the face of a call reaches it.
+
+    Attributes:
+        name: name of the camera.
+        y_down: whether its localizations have a y axis that was turned up.
+        unit: unit of its positions, ``m`` or ``px``.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def y_down(self) -> bool: ...
+
+    @property
+    def unit(self) -> str: ...
+
+    async def localize(self) -> list[Localization]:
+        """Trigger; return the localizations in the camera's own frame."""
+        ...
+
+    async def take_picture(self) -> Any:
+        """Take a picture; return its grey levels."""
+        ...
+
+
+class RobotGraph(Protocol):
+    """The part of ROS beside the camera: pictures on topics, and the frames of TF."""
+
+    def check_topic(self, topic: str) -> None:
+        """Raise ConfigurationError where there can be no such topic."""
+
+    def listen(self) -> None:
+        """Hear transforms from now on."""
+
+    async def picture(self, topic: str) -> tuple[Any, float | None]:
+        """Return the grey levels of a picture that is taken from now on, and its time, UTC."""
+        ...
+
+    async def lens(self, topic: str) -> CameraModel | None:
+        """Return the lens of the camera whose pictures are on a topic; None where nobody says."""
+        ...
+
+    async def pose(self, frame: str, base: str, utc: float | None) -> Transform:
+        """Return the pose of a frame in another one, at a time or, for None, now."""
+        ...
+
+    async def root(self, frame: str) -> str:
+        """Return the root of the tree that a frame is in."""
+        ...
+
+
+class CalibrationStart(NamedTuple):
+    """A request of StartCalibration; the names are the thesis'."""
+
+    topic_image1: str = ""
+    topic_image2: str = ""
+    checkerboard_squaresize_m: float = 0.0
+    tf_frame_robot_tcp: str = ""
+    tf_frame_robot_base: str = ""
+    fixed_camera: str = ""
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics with pictures that are named, the preferred one first."""
+        said = (self.topic_image2, self.topic_image1)
+        return [one for one in said if one not in {"", SMARTCAMERA}]
+
+    @property
+    def source(self) -> str:
+        """The source of pictures: a topic, SMARTCAMERA, or an empty text for neither."""
+        if self.topic_image2 == SMARTCAMERA and self.fixed_camera == "True":
+            return SMARTCAMERA
+        smart = SMARTCAMERA if SMARTCAMERA in {self.topic_image1, self.topic_image2} else ""
+        return next(iter(self.topics), smart)
+
+
+class StepRequest(NamedTuple):
+    """A request of PerformCurrentAndGetNextStep; the names are the thesis'."""
+
+    repeat_last_step: bool = False
+    abort: bool = False
+    value_inputs: Sequence[float] = ()
+    text_inputs: Sequence[str] = ()
+    option_inputs: Sequence[str] = ()
+
+
+class PixelPoseRequest(NamedTuple):
+    """A request of TransformPixelPose.
+
+    Attributes:
+        x: coordinate to the right, in the unit of the calibration.
+        y: coordinate upwards, in the same unit.
+        theta: angle, counter-clockwise, radians.
+        frame: frame that the pose was seen in; empty for the calibration's.
+        reference: frame that the pose is wanted in; empty for the calibration's.
+        seq: number of the call.
+        utc: time at which the pose was seen; None for now.
+    """
+
+    x: float
+    y: float
+    theta: float = 0.0
+    frame: str = ""
+    reference: str = ""
+    seq: int = 0
+    utc: float | None = None
+
+
+@dataclass(eq=False)
+class _Sequence:
+    """A calibration under way: the step in front, then the wizard.
+
+    Attributes:
+        asked: request that began the sequence, with the base that was found.
+        first: step in front of the wizard.
+        service: the running wizard; None before it was chosen.
+        shown: whether the current step was told to anybody.
+        aborted: whether a call has ended it.
+        pictured: time of the last picture, UTC; None where that is not known.
+    """
+
+    asked: CalibrationStart
+    first: Step
+    service: CalibrationService | None = None
+    shown: bool = False
+    aborted: bool = False
+    pictured: float | None = field(default=None)
+
+    @property
+    def session(self) -> WizardSession | None:
+        """The wizard's sequence; None before it was chosen."""
+        return None if self.service is None else self.service.session
+
+    @property
+    def step(self) -> Step | None:
+        """The current step, with the answers that were undone; None at the end."""
+        session = self.session
+        if session is None:
+            return self.first
+        step = session.step
+        return None if step is None else step.with_defaults(session.current["defaults"])
+
+    def close(self) -> None:
+        """Free the wizard; its journal stays."""
+        if self.service is not None:
+            self.service.close()
+        self.service = None
+
+
+class ThesisCalibration:
+    """The calibrations of one camera, and the one that is under way; for all faces together.
+
+    Args:
+        folder: folder that calibrations and journals are in; nothing is written beside it.
+        name: name of the camera.
+        abandoned: seconds without a call after which a calibration under way is given up.
+
+    Attributes:
+        graph: topics and frames of ROS; None where the camera is not seen in ROS.
+
+    Raises:
+        OSError: the folder cannot be made.
+    """
+
+    def __init__(
+        self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED
+    ) -> None:
+        self._files = CalibrationService(Folder(folder))
+        self._name, self._abandoned = name, abandoned
+        self.graph: RobotGraph | None = None
+        self._sequence: _Sequence | None = None
+        self._loaded: AnyCalibration | None = None
+        self._camera: CalibrationCamera | None = None
+        self._busy = False
+        self._last = "none was started"
+        self._called = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+
+    # ------------------------------------------------------------------ StartCalibration
+
+    async def start(self, asked: CalibrationStart) -> None:
+        """Begin a calibration; its first step is told by :meth:`perform`.
+
+        Raises:
+            CalibrationError: ``IN_USE``: one is under way; ``NOT_POSSIBLE``: topics or frames are
+                named, and there is no ROS; ``WRONG_FRAME``: TF does not know the frame.
+            ConfigurationError: there can be no such topic.
+        """
+        self._check_free()
+        graph = self.graph
+        self._check_graph(asked.topics, asked.tf_frame_robot_tcp)
+        base = asked.tf_frame_robot_base
+        if graph is not None and asked.tf_frame_robot_tcp and not base:
+            with self._alone("StartCalibration"):
+                base = await graph.root(asked.tf_frame_robot_tcp)
+            self._check_free()
+        asked = asked._replace(tf_frame_robot_base=base)
+        self._sequence = _Sequence(asked, _first_step(asked, self._name))
+        self._touch()
+
+    def _check_free(self) -> None:
+        if self._sequence is not None:
+            since = asyncio.get_running_loop().time() - self._called
+            raise Code.IN_USE.refusal(
+                f"{self._name}: a calibration is under way, whose last call came {since:.0f} s ago;"
+                " expected PerformCurrentAndGetNextStep to go on with it or, with abort, to end "
+                f"it. It is given up after {self._abandoned:g} s without a call"
+            )
+
+    def _check_graph(self, topics: Sequence[str], frame: str) -> None:
+        """Refuse topics and frames of ROS where there is none, and topics that cannot be."""
+        named = [*topics, *((frame,) if frame else ())]
+        if named and self.graph is None:
+            raise Code.NOT_POSSIBLE.refusal(
+                f"{self._name}: {', '.join(named)}: this camera is not seen in ROS; expected "
+                f"{SMARTCAMERA} or no topic, and no frames, or ros2: in the fleet file",
+                got=named,
+            )
+        for topic in topics:
+            if self.graph is not None:
+                self.graph.check_topic(topic)
+
+    # ------------------------------------------------------- PerformCurrentAndGetNextStep
+
+    async def perform(self, asked: StepRequest, camera: CalibrationCamera) -> dict[str, Any]:
+        """Answer the step that was told last; return the fields of the answer, the next step's.
+
+        Args:
+            asked: the request.
+            camera: the camera, as it is reached for this call.
+
+        Raises:
+            CalibrationError: ``NO_SEQUENCE``; ``NOT_POSSIBLE``: another call is under way.
+
+        Cancellation: an action under way is cancelled, and the step stays.
+        """
+        sequence = self._sequence
+        if sequence is None:
+            raise Code.NO_SEQUENCE.refusal(
+                f"{self._name}: no calibration is under way ({self._last}); expected "
+                "StartCalibration first"
+            )
+        if asked.abort:
+            return await self._abort(sequence)
+        with self._alone("PerformCurrentAndGetNextStep"):
+            self._camera = camera
+            errors = await self._performed(sequence, asked)
+        if sequence.aborted:
+            return _fields(_ABORTED, f"{self._name}: another call has aborted the calibration")
+        return self._told(sequence, errors)
+
+    @contextlib.contextmanager
+    def _alone(self, what: str) -> Iterator[None]:
+        """Refuse a call while another one is under way, whose answer nobody has seen."""
+        if self._busy:
+            raise Code.NOT_POSSIBLE.refusal(
+                f"{self._name}: another call is under way; {what} was not done. Expected its "
+                "answer to come first, or abort"
+            )
+        self._busy = True
+        self._touch()
+        try:
+            yield
+        finally:
+            self._busy = False
+            self._touch()
+
+    async def _performed(self, sequence: _Sequence, asked: StepRequest) -> Mapping[str, str]:
+        """Do what a request says; return its errors by the inputs' names."""
+        first, sequence.shown = not sequence.shown, True
+        try:
+            if self.graph is not None and sequence.asked.tf_frame_robot_tcp:
+                self.graph.listen()  # so that it is known where the robot was meanwhile
+            if asked.repeat_last_step:
+                return await self._back(sequence)
+            if first:
+                return _unasked(asked)
+            return await self._answered(sequence, asked)
+        except SmartCamError as exc:
+            return {"base": str(exc)}
+        except OSError as exc:
+            return {"base": f"the journal: {exc.strerror or exc}"}
+
+    async def _answered(self, sequence: _Sequence, asked: StepRequest) -> Mapping[str, str]:
+        step, session = sequence.step, sequence.session
+        if step is None:
+            return {}
+        given = from_lists(step, asked.value_inputs, asked.text_inputs, asked.option_inputs)
+        if session is None:
+            await self._begin(sequence, step.checked(given))
+            return {}
+        view = await session.submit(session.token, given)
+        errors: Mapping[str, str] = view["errors"]
+        return errors
+
+    async def _back(self, sequence: _Sequence) -> Mapping[str, str]:
+        """Go back to the step before."""
+        session = sequence.session
+        if session is None:
+            return {"base": "repeat_last_step: there is no step before this one"}
+        if "undo" in session.current["can"]:
+            await session.undo(session.token)
+        else:
+            sequence.close()
+        return {}
+
+    async def _abort(self, sequence: _Sequence) -> dict[str, Any]:
+        sequence.aborted = True
+        session = sequence.session
+        if session is not None and session.state == "asking":
+            await session.abort(session.token)
+        self._end(sequence, "the last one was aborted")
+        return _fields(_ABORTED, "")
+
+    # ------------------------------------------------------------------ the wizard
+
+    async def _begin(self, sequence: _Sequence, answers: Answers) -> None:
+        """Start the wizard that the answers of the first step choose.
+
+        Raises:
+            CalibrationError: as :meth:`CalibrationService.start`.
+        """
+        asked, name = sequence.asked, answers["name"]
+        self._files.folder.calibration(name)  # told before anything is measured
+        fixed = asked.fixed_camera or answers["fixed_camera"]
+        source = asked._replace(fixed_camera=fixed).source or answers["pictures"]
+        if source != SMARTCAMERA:
+            self._check_graph([source], "")
+        lens = None
+        if self.graph is not None and source != SMARTCAMERA:
+            lens = await self.graph.lens(source)
+            if sequence.aborted:
+                return
+        wizard = self._wizard(sequence, fixed == "True", source, lens)
+        parameters = {**_parameters(asked, self._camera), "asked": [fixed, source, *asked]}
+        service = CalibrationService(self._files.folder, [wizard])
+        _start(service, name, wizard.name, parameters)
+        sequence.service = service
+        sequence.first = sequence.first.with_defaults(answers)
+
+    def _wizard(
+        self, sequence: _Sequence, fixed: bool, source: str, lens: CameraModel | None
+    ) -> Wizard:
+        """Return the wizard for a camera in this place with this source of pictures."""
+        save_to = self._files.folder.calibration
+        read = bool(sequence.asked.tf_frame_robot_tcp)
+
+        async def take() -> Any:
+            return await self._picture(sequence, source)
+
+        async def tip() -> Pose:
+            found = await self._tool(sequence, None)
+            return replace(found, at=found.at or datetime.now(UTC)).pose()
+
+        async def flange() -> Transform:
+            return await self._tool(sequence, sequence.pictured)
+
+        if not fixed:
+            return hand_eye_wizard(
+                take_picture=take,
+                save_to=save_to,
+                read_robot=flange if read else None,
+                camera=lens,
+            )
+        if source != SMARTCAMERA:
+            return sheet_wizard(
+                take_picture=take, save_to=save_to, read_robot=tip if read else None, camera=lens
+            )
+        return plane_wizard(
+            localize=self._localize,
+            save_to=save_to,
+            read_robot=tip if read else None,
+            y_down=None if self._camera is None else self._camera.y_down,
+        )
+
+    async def _localize(self) -> list[Localization]:
+        return await _there(self._camera).localize()
+
+    async def _picture(self, sequence: _Sequence, source: str) -> Any:
+        sequence.pictured = None
+        if source == SMARTCAMERA:
+            return await _there(self._camera).take_picture()
+        image, sequence.pictured = await _there(self.graph).picture(source)
+        return image
+
+    async def _tool(self, sequence: _Sequence, utc: float | None) -> Transform:
+        asked = sequence.asked
+        return await _there(self.graph).pose(
+            asked.tf_frame_robot_tcp, asked.tf_frame_robot_base, utc
+        )
+
+    # ------------------------------------------------------------------ its end
+
+    def _told(self, sequence: _Sequence, errors: Mapping[str, str]) -> dict[str, Any]:
+        """Return the fields that tell the current step, or the end."""
+        error = "; ".join(
+            text if name == "base" else f"{name}: {text}" for name, text in errors.items()
+        )
+        step, session = sequence.step, sequence.session
+        if step is None and session is not None:
+            view, name = session.current, str(session.parameters["name"])
+            step = _last_step(name, view)
+            if session.state == "ended":
+                self._end(sequence, f"{name!r} was finished")
+                with contextlib.suppress(CalibrationError, OSError):  # one that maps no pixels
+                    self.load(name)
+        return _fields(step or sequence.first, error)
+
+    def _end(self, sequence: _Sequence, how: str) -> None:
+        sequence.close()
+        self._sequence, self._last = None, how
+        self._touch()
+
+    def _touch(self) -> None:
+        """Give a calibration under way its time from now on."""
+        loop = asyncio.get_running_loop()
+        self._called = loop.time()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None
+        if self._sequence is not None and not self._busy:
+            self._timer = loop.call_later(self._abandoned, self._give_up)
+
+    def _give_up(self) -> None:
+        if self._sequence is not None:
+            text = f"the last one was left for {self._abandoned:g} s; it goes on where it was when "
+            self._end(self._sequence, text + "the same is started under the same name")
+
+    def close(self) -> None:
+        """End what is under way; it can be resumed. Idempotent."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None
+        sequence, self._sequence = self._sequence, None
+        if sequence is not None:
+            sequence.close()
+
+    # ------------------------------------------------------------------ the other three
+
+    def export(self, name: str, target: str) -> None:
+        """Copy a calibration into the folder's ``exports``.
+
+        Raises:
+            CalibrationError: as :meth:`CalibrationService.export`.
+        """
+        self._files.export(name, target)
+
+    def load(self, name_or_path: str) -> None:
+        """Load a calibration, which :meth:`transform` uses from then on.
+
+        Raises:
+            CalibrationError, OSError: as :meth:`CalibrationService.load`.
+        """
+        self._loaded = self._files.load(name_or_path)
+
+    async def transform(self, seen: PixelPoseRequest) -> Pose:
+        """Return the robot's pose for what a camera sees, in the frame that is wanted.
+
+        Raises:
+            CalibrationError: ``NO_CALIBRATION``, ``WRONG_FRAME``, ``OUT_OF_FIELD``, ``BAD_TIME``.
+        """
+        calibration = self._loaded
+        if calibration is None:
+            raise Code.NO_CALIBRATION.refusal(
+                f"{self._name}: no calibration is loaded; expected LoadCalibration first"
+            )
+        pose = self._files.transform(seen.x, seen.y, seen.theta)
+        if seen.frame and calibration.camera_frame not in {None, seen.frame}:
+            raise Code.WRONG_FRAME.unexpected(
+                f"frame_id: expected {calibration.camera_frame!r}, the camera's frame",
+                calibration.camera_frame,
+                seen.frame,
+            )
+        robot, wanted = calibration.robot_frame, seen.reference or calibration.robot_frame
+        at = datetime.now(UTC) if seen.utc is None else datetime.fromtimestamp(seen.utc, UTC)
+        if wanted != robot:
+            lead = await self._lead(robot, wanted, seen.utc)
+            part = lead.undated() @ Transform.from_pose(pose, "part").undated()
+            pose = replace(part, at=at).pose()
+        return pose._replace(header=Header(seen.seq, at, wanted))
+
+    async def _lead(self, robot: str, wanted: str, utc: float | None) -> Transform:
+        """Return the pose of the robot's frame in the frame that is wanted."""
+        if self.graph is None:
+            raise Code.WRONG_FRAME.unexpected(
+                f"tf_frame_reference: expected {robot!r}, since this camera is not seen in ROS, "
+                "whose TF would lead elsewhere",
+                robot,
+                wanted,
+            )
+        return await self.graph.pose(robot, wanted, utc)
+
+
+class CalibrationDesks:
+    """The calibrations of an agent's cameras, in one folder.
+
+    Args:
+        folder: folder that calibrations and journals are in; made if need be.
+
+    Raises:
+        OSError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        self._folder = Folder(folder).path
+        self._desks: dict[str, ThesisCalibration] = {}
+
+    def of(self, camera: str) -> ThesisCalibration:
+        """Return the calibrations of a camera."""
+        desk = self._desks.get(camera)
+        if desk is None:
+            desk = self._desks[camera] = ThesisCalibration(self._folder, camera)
+        return desk
+
+    def close(self) -> None:
+        """End what is under way; it can be resumed."""
+        for desk in self._desks.values():
+            desk.close()
+
+
+def _there(value: T | None) -> T:
+    """Return a value that the checks before have made sure of."""
+    if value is None:
+        raise Code.NOT_POSSIBLE.refusal(
+            "the camera is not seen in ROS any more; expected it to come back, or abort"
+        )
+    return value
+
+
+def _first_step(asked: CalibrationStart, camera: str) -> Step:
+    """Return the step that asks for what a request does not say."""
+    inputs: list[Input] = [
+        Text(
+            name="name",
+            label="Name of the calibration",
+            default=re.sub("[^A-Za-z0-9]+", "-", camera)[:MAX_NAME].strip("-") or "camera",
+            pattern=NAME,
+            expected="letters, digits, '-' and '_'",
+            max_length=MAX_NAME,
+        )
+    ]
+    if not asked.source:
+        label = f"Topic with pictures of the camera, or {SMARTCAMERA} for this camera itself"
+        inputs.append(Text(name="pictures", label=label, default=SMARTCAMERA))
+    if not asked.fixed_camera:
+        inputs.append(Option(name="fixed_camera", label="Where the camera is", options=FIXED))
+    text = "A calibration of this name that was broken off goes on where it was."
+    return Step(id="first", title="Calibration", description=text, inputs=tuple(inputs))
+
+
+def _parameters(asked: CalibrationStart, camera: CalibrationCamera | None) -> dict[str, Any]:
+    """Return the defaults of a wizard's steps that a request says."""
+    found: dict[str, Any] = {"setup": "eye-in-hand"}
+    if camera is not None:
+        found["camera_unit"] = camera.unit
+    if asked.tf_frame_robot_base:
+        found["robot_frame"] = asked.tf_frame_robot_base
+    if asked.checkerboard_squaresize_m:
+        found["square"] = 1e3 * asked.checkerboard_squaresize_m
+    return found
+
+
+def _start(
+    service: CalibrationService, name: str, wizard: str, parameters: Mapping[str, Any]
+) -> None:
+    """Start a wizard, or go on with one that was started in the same way and broken off."""
+    try:
+        service.start(name, wizard, parameters)
+        same = service.session.parameters["asked"] == parameters["asked"]
+    except CalibrationError as exc:
+        if exc.code not in {Code.WRONG_JOURNAL, Code.BROKEN_FILE}:
+            raise
+        same = False
+    if not same:
+        service.start(name, wizard, parameters, fresh=True)
+
+
+def _unasked(asked: StepRequest) -> Mapping[str, str]:
+    """Return the error of answers to a step that was told to nobody."""
+    if asked.value_inputs or asked.text_inputs or asked.option_inputs:
+        return {"base": "this step was not shown before; expected no inputs in the first call"}
+    return {}
+
+
+def _last_step(name: str, view: Mapping[str, Any]) -> Step:
+    """Return a step that tells what came out."""
+    verdict, file = view["verdict"], view["result"]["file"]
+    said = "" if verdict is None else f"{verdict['text']} "
+    text = f"{said}It is in the file {file}, and loaded where it maps pixels."
+    return Step(id="done", title=f"The calibration {name} is done", description=text, button="")
+
+
+def _fields(step: Step, error: str) -> dict[str, Any]:
+    """Return the fields that tell a step."""
+    texts = [step.description]
+    for one in step.inputs:
+        if isinstance(one, Option):
+            texts.append(f"{one.label}:")
+            texts += [f"  {key}: {text}" for key, text in one.options.items()]
+    if any(one.optional and one.minimum > 0 for one in step.inputs if isinstance(one, Number)):
+        texts.append("Where a number may be missing, 0 stands for no answer.")
+    if step.verdict is not None:
+        texts.append(step.verdict.text)
+    return {
+        "error": error,
+        "header_text": step.title,
+        "description_text": "\n".join(one for one in (*texts, *step.notes) if one),
+        "button_text": step.button,
+        **as_lists(step),
+    }

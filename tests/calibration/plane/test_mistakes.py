@@ -1,0 +1,131 @@
+"""Touches that are mistakes are never called good with an error beyond what is allowed."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from smartcam.calibration import fit_plane
+from smartcam.calibration._plane.order import better_order
+from smartcam.exceptions import CalibrationError
+from tests.calibration.plane.planekit import SIGMA, SPECIAL, Scene
+from tests.calibration.scenes import refused
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.geometry._inside import Array
+
+SCENE = Scene(SPECIAL[3], np.array([1.0, -2.0, 0.5]))
+DOWN = -SCENE.turn[:, 2]
+FIELD = np.stack(np.meshgrid(np.linspace(0, 1, 7), np.linspace(0, 1, 6)), axis=-1).reshape(-1, 2)
+
+
+def layout(count: int, random: np.random.Generator) -> Array:
+    """Return marks as a hand lays them: apart, and in no line."""
+    while True:
+        marks = random.uniform((0.0, 0.0), (0.3, 0.24), (count, 2))
+        apart = np.linalg.norm(marks[:, None] - marks, axis=2) + np.eye(count)
+        extents = np.linalg.svd(marks - marks.mean(axis=0), compute_uv=False)
+        if apart.min() > 0.04 and extents[1] > 0.4 * extents[0]:
+            return marks
+
+
+def mistakes(touches: Array, random: np.random.Generator, offs: int) -> Iterator[Array]:
+    """Yield touches with pairs exchanged, with all shifted, and with ``offs`` a kind off."""
+    count = len(touches)
+    for pair in itertools.combinations(range(count), 2):
+        order = np.arange(count)
+        order[[*pair]] = order[[*pair[::-1]]]
+        yield touches[order]
+    for by in range(1, count):
+        yield np.roll(touches, by, axis=0)
+    for off, wrong, _ in itertools.product((0.005, 0.01, 0.03, 0.1), (1, 2), range(offs)):
+        moved, way = touches.copy(), random.normal(size=(wrong, 3))
+        if random.random() < 0.5:
+            way[:] = way[0]  # the same mistake twice
+        if random.random() < 0.7:
+            way = way - np.outer(way @ SCENE.turn[:, 2], SCENE.turn[:, 2])  # in the plane
+        way *= off / np.linalg.norm(way, axis=1, keepdims=True)
+        moved[random.choice(count, wrong, replace=False)] += way
+        yield moved
+
+
+def outcome(marks: Array, touches: Array, sigma: float | None) -> str:
+    """Return the level of the verdict, ``error``, or ``beyond``: good, and off by too much."""
+    try:
+        found = fit_plane(marks, touches, touch_sigma=sigma, tool_z=DOWN)
+    except CalibrationError:
+        return "error"
+    if found.verdict.level != "good":
+        return found.verdict.level
+    low, extent = marks.min(axis=0), np.ptp(marks, axis=0)
+    field = low + extent * FIELD
+    off = np.linalg.norm(found.transform(field) - SCENE.robot(field), axis=1)
+    allowed = 0.01 * float(np.linalg.norm(extent))
+    return "beyond" if np.percentile(off, 95) > 1.05 * allowed else "good"
+
+
+@pytest.mark.parametrize(
+    ("counts", "offs"),
+    [
+        ((4, 5, 7), 1),
+        pytest.param(range(4, 13), 12, marks=pytest.mark.long),
+    ],
+)
+def test_no_mistake_is_called_good_beyond_what_is_allowed(counts: list[int], offs: int) -> None:
+    random, found = np.random.default_rng(41), Counter[str]()
+    for count in counts:
+        marks = layout(count, random)
+        touches = SCENE.touched(marks, count)
+        found += Counter(outcome(marks, one, None) for one in mistakes(touches, random, offs))
+    assert found["beyond"] == 0, found
+    assert found["poor"] + found["error"] > 0.9 * sum(found.values()), found
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sigma", [None, SIGMA])
+def test_honest_touches_are_seldom_called_anything_but_good(sigma: float | None) -> None:
+    random = np.random.default_rng(42)
+    found = Counter[str]()
+    for seed in range(240):
+        marks = layout(5 + seed % 8, random)
+        found[outcome(marks, SCENE.touched(marks, seed), sigma)] += 1
+    assert found["good"] >= 0.96 * sum(found.values()), found
+    assert found["beyond"] == 0, found
+
+
+def test_seven_marks_with_three_in_the_wrong_order_are_put_right() -> None:
+    random = np.random.default_rng(3)
+    marks = layout(7, random)
+    order = np.array([0, 4, 2, 1, 3, 5, 6])
+    found = better_order(marks, SCENE.touched(marks, 1)[order], 3 * SIGMA)
+    assert found is not None
+    assert found.sure
+    assert order[found.order].tolist() == [*range(7)]
+    assert found.moved == (1, 3, 4)
+
+
+def test_order_of_a_grid_that_fits_from_several_sides_is_not_sure() -> None:
+    marks = np.array([(0.15 * i, 0.12 * j) for i in range(3) for j in range(3)])
+    touches = SCENE.touched(marks, 1)
+    pair = better_order(marks, touches[[0, 5, 2, 3, 4, 1, 6, 7, 8]], 3 * SIGMA)
+    assert pair is not None
+    assert (pair.sure, pair.moved) == (True, (1, 5))
+    shifted = better_order(marks, np.roll(touches, 1, axis=0), 3 * SIGMA)
+    assert shifted is not None
+    assert not shifted.sure
+    assert better_order(marks, touches, 3 * SIGMA) is None
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), "0.001", True, [1.0]])
+@pytest.mark.parametrize("name", ["allowed_error", "touch_sigma", "nominal_scale"])
+def test_option_that_is_no_positive_number_is_refused(name: str, value: Any) -> None:
+    marks = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2], [0.1, 0.05]])
+    options: dict[str, Any] = {name: value}
+    with refused("NOT_FINITE", f"{name}: expected a positive number of"):
+        fit_plane(marks, np.pad(marks, ((0, 0), (0, 1))), **options)
