@@ -16,9 +16,14 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.fleet._camera import FleetCamera
-    from smartcam.fleet._file import FleetFile, fleet_schema, load_fleet
-    from smartcam.fleet._fleet import (
+    from smartcam.fleet._agent.reload import FleetChanges
+    from smartcam.fleet._agent.server import FleetServer
+    from smartcam.fleet._agent.summary import CameraSummary
+    from smartcam.fleet._file.fleet_file import FleetFile, fleet_schema, load_fleet
+    from smartcam.fleet._frames.wire import FleetFrame
+    from smartcam.fleet._opening import open, serve
+    from smartcam.fleet._program.camera import FleetCamera, ReservationLost
+    from smartcam.fleet._program.fleet import (
         AgentJoined,
         AgentLeft,
         CameraJoined,
@@ -27,11 +32,6 @@ if TYPE_CHECKING:
         FleetEvent,
         FleetResults,
     )
-    from smartcam.fleet._frame_wire import FleetFrame
-    from smartcam.fleet._opening import open, serve
-    from smartcam.fleet._reload import FleetChanges
-    from smartcam.fleet._server import FleetServer
-    from smartcam.fleet._summary import CameraSummary
 
 __all__ = [
     "AgentJoined",
@@ -47,6 +47,7 @@ __all__ = [
     "FleetFrame",
     "FleetResults",
     "FleetServer",
+    "ReservationLost",
     "fleet_schema",
     "load_fleet",
     "open",
@@ -57,13 +58,14 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_camera": "FleetCamera",
-            "_file": "FleetFile fleet_schema load_fleet",
-            "_fleet": "AgentJoined AgentLeft CameraJoined CameraLeft Fleet FleetEvent FleetResults",
-            "_frame_wire": "FleetFrame",
+            "_agent.reload": "FleetChanges",
+            "_agent.server": "FleetServer",
+            "_agent.summary": "CameraSummary",
+            "_file.fleet_file": "FleetFile fleet_schema load_fleet",
+            "_frames.wire": "FleetFrame",
             "_opening": "open serve",
-            "_reload": "FleetChanges",
-            "_server": "FleetServer",
-            "_summary": "CameraSummary",
+            "_program.camera": "FleetCamera ReservationLost",
+            "_program.fleet": "AgentJoined AgentLeft CameraJoined "
+            "CameraLeft Fleet FleetEvent FleetResults",
         },
     )

@@ -5,15 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
+from smartcam._arguments import check_seconds, check_text
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, UnsupportedError
-from smartcam.fleet._address import FleetAddress, missing_certificates
-from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._fleet import Fleet
-from smartcam.fleet._program import Program
-from smartcam.fleet._server import FleetServer
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._agent.server import FleetServer
+from smartcam.fleet._bus.address import FleetAddress, missing_certificates
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._bus.zenoh import ZenohEnd
+from smartcam.fleet._file.fleet_file import FleetFile
+from smartcam.fleet._program.camera import FleetCamera
+from smartcam.fleet._program.fleet import Fleet
+from smartcam.fleet._program.program import Program
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -21,8 +23,7 @@ if TYPE_CHECKING:
     from typing import Unpack
 
     from smartcam.backoff import Backoff
-    from smartcam.fleet._file import FleetFile
-    from smartcam.interpreters._base import Spec
+    from smartcam.interpreters import Spec
     from smartcam.models import Calibration
     from smartcam.observers import Observer
 
@@ -83,6 +84,9 @@ def open(
                 f"open: a fleet has no option {name!r}; it has {', '.join(known)}"
                 f"{did_you_mean(name, known)}"
             )
+    connect_timeout = check_seconds(connect_timeout, "connect_timeout", "open")
+    if not isinstance(place, (Path, FleetFile)):
+        place = check_text(place, "fleet", least=1)
     if isinstance(place, str) and "://" in place:
         address = FleetAddress.parse(place)
         if address.camera:
@@ -124,7 +128,7 @@ def fleet_camera(
             f"{url}: {', '.join(theirs)}: the session with the camera is its agent's: fleet.yaml "
             "says how that is"
         )
-    program = Program(_end(address), address.fleet, address.camera)
+    program = Program(_end(address), address.fleet, address.camera, called=address.program)
     return FleetCamera(settings, address.camera, program, observers=observers)
 
 

@@ -7,22 +7,26 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
+from smartcam._finishing import close_all
+from smartcam._ros_names import as_name
 from smartcam._server import Server
 from smartcam.exceptions import SmartCamError
-from smartcam.fleet._fleet import CameraJoined, Fleet
-from smartcam.fleet._ros_file import RosCamera, RosSection, node_names
-from smartcam.fleet._zenoh import ZenohEnd
-from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
-from smartcam.ros2._context import SETTINGS, RosContext
-from smartcam.ros2._names import as_name
-from smartcam.ros2._node import Node
+from smartcam.fleet._bus.zenoh import ZenohEnd
+from smartcam.fleet._file.ros import RosCamera, RosSection, node_names
+from smartcam.fleet._program.camera import FleetCamera
+from smartcam.fleet._program.fleet import CameraJoined, Fleet
+from smartcam.ros2 import CameraNode, CameraNodeOptions, Node, RosContext
+from smartcam.ros2._inside import SETTINGS, NativeContext, NativeNode
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 
-    from smartcam.fleet._address import FleetAddress
-    from smartcam.fleet._camera import FleetCamera
+    from smartcam._client._inside import Interpretation
+    from smartcam.calibration import HandEyeCalibration
+    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.fleet._bus.address import FleetAddress
+    from smartcam.frames import FrameSource
     from smartcam.models import Calibration
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
@@ -35,21 +39,34 @@ MEET = 2.0
 """Seconds that a camera's agent is waited for before its node comes."""
 
 
+class _SeenCamera(FleetCamera[Any]):
+    """A camera that expects no application: results of all of them are to be seen in ROS.
+
+    Its calibration is for those applications whose results are localizations.
+    """
+
+    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+        return super()._interpretation(spec)
+
+    async def switch_application(
+        self, application: int | str, *, timeout: float | None = None
+    ) -> None:
+        await super().switch_application(application, timeout=timeout)
+        self._expected = None
+
+
 class _Cameras(Fleet):
-    """A fleet whose cameras have calibrations of their own."""
+    """A fleet whose cameras have calibrations of their own, and are seen in ROS."""
 
     def __init__(self, *given: Any, calibrations: Mapping[str, Calibration]) -> None:
         self._calibrations = calibrations
         super().__init__(*given, guest=True)
 
     def _make(self, name: str) -> FleetCamera[Any]:
-        camera = super()._make(name)
         calibration = self._calibrations.get(name)
-        if calibration is None:
-            return camera
         options = {"name": name, "connect_timeout": TIMEOUT, "calibration": calibration}
         settings = CameraSettings.of(self._address_of(name), options)
-        return type(camera)(settings, name, self._program, shared=True)
+        return _SeenCamera(settings, name, self._program, shared=True)
 
 
 class RosFleet(Server):
@@ -58,16 +75,20 @@ class RosFleet(Server):
     Args:
         bus: an end of the fleet's bus, open; its session carries ROS, too.
         fleet: the fleet's name; None for the only one that is there.
-        address: where it is.
-        section: how the cameras are seen.
-        cameras: what is said of single cameras, by name.
-        settings: what the agent tells their sessions, by name, where that is known.
-        frames: where their frames come from, by name, as parameters of v4l2_camera.
-        calibrations: of cameras whose results are to be the robot's.
+        address: address of the fleet.
+        section: settings of how all cameras are seen in ROS.
+        cameras: settings of single cameras, by name.
+        settings: settings that the agent gives the cameras' sessions, by name, where known.
+        frames: sources of the cameras' frames, by name, as parameters of v4l2_camera.
+        calibrations: calibrations of cameras whose results are to be the robot's, by name.
+        controls: functions that return the open source of a camera's frames, whose device has
+            controls, by name.
+        places: hand-eye calibrations, which say where cameras are, by name.
         wanted: whether a camera, of an agent, is to be seen.
+        desks: calibrations that the agent's bus has, too; None where there is no folder for them.
 
     Raises:
-        ConfigurationError: there is no such domain.
+        ConfigurationError: there is no such domain; or no rclpy, where it is wanted.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -81,14 +102,17 @@ class RosFleet(Server):
         cameras: Mapping[str, RosCamera] | None = None,
         settings: Mapping[str, CameraSettings] | None = None,
         frames: Mapping[str, Mapping[str, Any]] | None = None,
+        controls: Mapping[str, Callable[[], Awaitable[FrameSource]]] | None = None,
         calibrations: Mapping[str, Calibration] | None = None,
+        places: Mapping[str, HandEyeCalibration] | None = None,
         wanted: Callable[[str, str], bool] = lambda _agent, _camera: True,
+        desks: CalibrationDesks | None = None,
     ) -> None:
+        self._desks = desks
         self._section, self._said, self._wanted = section, dict(cameras or {}), wanted
         self._settings, self._frames = settings or {}, frames or {}  # others come into them
-        self.context: RosContext = RosContext(
-            bus, domain=section.domain, distribution=section.distribution
-        )
+        self._places, self._controls = places or {}, controls or {}
+        self.context: RosContext | NativeContext = _context(bus, section)
         self._fleet = _Cameras(
             bus, address, fleet, None, TIMEOUT, {}, calibrations=dict(calibrations or {})
         )
@@ -145,24 +169,31 @@ class RosFleet(Server):
                 while not camera.met:  # noqa: ASYNC110 - nothing tells of it
                     await asyncio.sleep(0.01)
 
-    def _node(self, name: str) -> Node:
+    def _node(self, name: str) -> Node | NativeNode:
         try:
             full = node_names([*self._of.keys() - {name}, name])[name]
         except ValueError as exc:
             raise SmartCamError(str(exc)) from exc
         namespace, _, own = full.rpartition("/")
         above = self._section.namespace.rstrip("/")
-        return Node(own, namespace=f"{above}/{namespace}", context=self.context)
+        if isinstance(self.context, RosContext):
+            return Node(own, namespace=f"{above}/{namespace}", context=self.context)
+        return NativeNode(own, namespace=f"{above}/{namespace}", context=self.context)
 
     def _options(self, name: str, camera: FleetCamera[Any]) -> CameraNodeOptions:
         said = self._said.get(name, RosCamera.model_validate({}))
         return CameraNodeOptions(
             frame_id=said.frame_id or as_name(name).replace("/", "_"),
             parent_frame=said.parent_frame or "",
+            flange_frame=said.flange_frame or "",
+            place=self._places.get(name),
+            calibrated_at=said.robot_pose(),
             autostart=self._section.autostart,
             settings=self._settings.get(name),
             heard=lambda: camera.met,
             frames=self._frames.get(name, {}),
+            controls=self._controls.get(name),
+            calibrations=None if self._desks is None else self._desks.of(name),
         )
 
     @property
@@ -175,12 +206,19 @@ class RosFleet(Server):
         task, self._task = self._task, None
         if task is not None:
             task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
+            await asyncio.wait({task})
         nodes, self.nodes = self.nodes, {}
-        await asyncio.gather(*(node.stop() for node in nodes.values()))
+        await close_all(node.stop for node in nodes.values())
         self._of.clear()
         await self._fleet.close()
+
+
+def _context(bus: ZenohEnd, section: RosSection) -> RosContext | NativeContext:
+    """Return the context of the nodes: the bus' own session, or a context of rclpy."""
+    if section.through == "zenoh":
+        return RosContext(bus, domain=section.domain, distribution=section.distribution)
+    said = section.distribution if "distribution" in section.model_fields_set else ""
+    return NativeContext(domain=section.domain, distribution=said, args=section.args)
 
 
 @contextlib.asynccontextmanager

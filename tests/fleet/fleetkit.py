@@ -10,13 +10,12 @@ from typing import Any, Self
 from smartcam import Backoff
 from smartcam._zenoh import BusLink
 from smartcam.emulator import Application, EmulatedCamera, Run
-from smartcam.fleet._agent import Agent
-from smartcam.fleet._bus import Bus, MemoryBus, MemoryEnd
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._frames import FramesOf
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._program import Program
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet import FleetCamera
+from smartcam.fleet._agent.agent import Agent
+from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
+from smartcam.fleet._frames.camera_frames import FramesOf
+from smartcam.fleet._inside import Bus, Keys, ZenohEnd
+from smartcam.fleet._program.program import Program
 from smartcam.frames import FrameSource
 from smartcam.settings import Address, CameraSettings
 from tests.processes import free_place

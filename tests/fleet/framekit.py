@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 from typing import Any
 
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._frames import SharedFrames
+from smartcam.fleet._frames.camera_frames import SharedFrames
 from smartcam.frames import FrameSource
 from tests.fleet.fleetkit import NAME, Plant, until
 from tests.frames.drivers import ScriptedDriver, frame

@@ -7,12 +7,11 @@ from typing import Any
 
 from smartcam import Camera, SmartCamera
 from smartcam._zenoh import BusLink
-from smartcam.fleet._agent import Agent
-from smartcam.fleet._bus import Bus, MemoryBus
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._program import Program
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet import FleetCamera
+from smartcam.fleet._agent.agent import Agent
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._inside import Bus, Keys, ZenohEnd
+from smartcam.fleet._program.program import Program
 from smartcam.observers import Observer
 from smartcam.settings import Address, CameraSettings
 from tests.processes import free_place

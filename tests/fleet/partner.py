@@ -18,11 +18,10 @@ from typing import Any
 
 import smartcam
 from smartcam._zenoh import BusLink
-from smartcam.fleet._agent import Agent
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._standby_file import Standby
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet import FleetCamera
+from smartcam.fleet._agent.agent import Agent
+from smartcam.fleet._file.standby import Standby
+from smartcam.fleet._inside import Keys, ZenohEnd
 from smartcam.settings import CameraSettings
 from tests.fleet.fleetkit import FAST, FLEET, NAME, PATIENCE
 

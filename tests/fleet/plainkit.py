@@ -12,7 +12,7 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._bus import MemoryBus
+from smartcam.fleet._bus.bus import MemoryBus
 from smartcam.protocols import messages as m
 from tests.fleet.fleetkit import until
 from tests.processes import free_place
@@ -21,7 +21,8 @@ from tests.timed_loop import TimedLoop
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from smartcam.fleet._bus import Bus, Publisher
+    from smartcam.fleet._bus.bus import Publisher
+    from smartcam.fleet._inside import Bus
 
 PREFIX = "smartcam/plant"
 NAME = "line1/cam3"

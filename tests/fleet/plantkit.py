@@ -11,9 +11,8 @@ from typing import Any
 
 from smartcam._zenoh import BusLink
 from smartcam.fleet import FleetFile
-from smartcam.fleet._access import access_control
-from smartcam.fleet._authority import make_certificates
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import ZenohEnd, make_certificates
+from smartcam.fleet._security.access import access_control
 from tests.fleet.fleetkit import PATIENCE
 from tests.processes import free_port
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import importlib
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from smartcam.fleet._access import RIGHTS, ros_rights
-from smartcam.fleet._calls import ACTIONS
-from smartcam.fleet._certificates import ROLES, may_command
-from smartcam.fleet._keys import COMMANDS, Keys, meets
-from smartcam.fleet._services import SERVICES
-from smartcam.fleet._thesis import THESIS
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._agent.calls import ACTIONS
+from smartcam.fleet._bus.keys import COMMANDS
+from smartcam.fleet._inside import Keys, ZenohEnd, may_command, meets
+from smartcam.fleet._json.services import SERVICES
+from smartcam.fleet._json.thesis import THESIS
+from smartcam.fleet._security.access import RIGHTS, ros_rights
+from smartcam.fleet._security.certificates import ROLES
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.plantkit import WHO, certified, guarded, joined
 
@@ -34,7 +36,7 @@ STRANGER = "stranger"
 def concrete(pattern: str) -> str:
     """Return a key that a pattern means."""
     said = pattern.replace("smartcam/*/", "smartcam/plant/", 1)
-    return said.replace("**", "line1/cam3").replace("*", "x")
+    return said.replace("**", "line1/cam3").replace("$*", "x").replace("*", "x")
 
 
 def keys_of(does: str) -> list[str]:
@@ -98,8 +100,8 @@ async def known(end: ZenohEnd, guard: ZenohEnd, role: str) -> None:
     """Wait until all that an end has declared is known: in order, its presence at last."""
     seen = Seen()
     watch = guard.watch(KEYS.program("*"), seen)
-    end.be_present(KEYS.program(MARK))
-    await seen.mark(KEYS.program(MARK))
+    end.be_present(KEYS.program(f"{role}-{MARK}"))
+    await seen.mark(KEYS.program(f"{role}-{MARK}"))
     watch.close()
 
 
@@ -108,7 +110,7 @@ async def test_say(ends: Ends) -> None:
     seen = Seen()
     for pattern in ("**", "**/@adv/**", "@ros2_lv/**"):
         guard.subscribe(pattern, seen)
-    mark = KEYS.call(MARK, MARK, command=False)
+    mark = KEYS.ask(role, MARK, MARK)
     for key in keys_of("say"):
         end.put(key, b"")
     end.put("smartcam/plant/*/x/line1/cam3", b"")  # a pattern means commands, too
@@ -183,8 +185,8 @@ async def test_appear(ends: Ends) -> None:
         guard.watch(pattern, seen)
     for key in keys_of("appear"):
         end.be_present(key)
-    end.be_present(KEYS.program(MARK))
-    assert await seen.mark(KEYS.program(MARK)) == expected(role, "appear")
+    end.be_present(KEYS.program(f"{role}-{MARK}"))
+    assert await seen.mark(KEYS.program(f"{role}-{MARK}")) == expected(role, "appear")
 
 
 async def test_watch(ends: Ends) -> None:
@@ -217,22 +219,34 @@ async def test_look_who_is_there(ends: Ends) -> None:
 # ---------------------------------------------------------------------- calls and services
 
 QUESTIONS = {
-    *("hello", "find", "results", "states", "refresh", "about_frames", "frame", "next_frame"),
+    *(
+        "hello",
+        "find",
+        "reserved",
+        "results",
+        "states",
+        "refresh",
+        "about_frames",
+        "frame",
+        "next_frame",
+    ),
     *("leave_frames", "lens", "query_application", "query_status", "wait_connected", "wait_ready"),
-    *("read_image", "get_clock"),
+    *("read_image", "get_clock", "features"),
 }
 """Calls that were looked at, and change nothing: a new one has to be, too."""
 
 LOOKING = {
     *("status", "results", "frame", "query_application", "query_status", "wait_ready"),
-    *("get_clock", "read_image"),
+    *("get_clock", "read_image", "features"),
 }
 
 
 @pytest.mark.parametrize("role", ROLES[:3])
 @pytest.mark.parametrize("do", ACTIONS)
 def test_each_call(role: str, do: str) -> None:
-    key = KEYS.call("line1", "line1/cam3", command=do in COMMANDS)
+    key = KEYS.command("line1", "line1/cam3")
+    if do not in COMMANDS:
+        key = KEYS.ask(role, "line1", "line1/cam3")
     assert allowed(role, "say", key) == (do in QUESTIONS or role == "operator")
     assert may_command(role) == (role == "operator")
 
@@ -250,7 +264,7 @@ def test_each_service(role: str) -> None:
 
 async def test_certificate_without_a_role_may_nothing(plant: Path, tmp_path: Path) -> None:
     """Its common name is none of the roles: it comes in, and sees nobody."""
-    from smartcam.fleet import _authority
+    from smartcam.fleet._security import authority as _authority
 
     folder = tmp_path / "plant"
     folder.mkdir()
@@ -270,8 +284,109 @@ async def test_certificate_without_a_role_may_nothing(plant: Path, tmp_path: Pat
             end.put(key, b"")
         asked = asyncio.ensure_future(end.present(KEYS.agent("*"), PATIENCE))
         assert await viewer.present(KEYS.agent("*"), PATIENCE) == [KEYS.agent("line1")]
-        viewer.put(KEYS.call("a", MARK, command=False), b"")
-        assert await heard.mark(KEYS.call("a", MARK, command=False)) == set()
+        mark = KEYS.ask("viewer", "a", MARK)
+        viewer.put(mark, b"")
+        assert await heard.mark(mark) == set()
         assert seen.keys == []
         asked.cancel()
         await asyncio.gather(asked, return_exceptions=True)
+
+
+# ---------------------------------------------------------------------- patterns
+
+WIDE = (
+    "**",
+    "smartcam/**",
+    "smartcam/*/**",
+    "smartcam/plant/**",
+    "smartcam/plant/command/**",
+    "smartcam/plant/*/*/line1/cam3",
+    "smartcam/plant/ask/**",
+    "smartcam/plant/ask/*/*/line1/cam3",
+    "smartcam/plant/reply/**",
+    "smartcam/plant/service/**",
+    "smartcam/plant/*/line1/cam3/trigger",
+    "smartcam/plant/service/line1/*/trigger",
+    "smartcam/plant/thesis/**",
+    "smartcam/plant/presence/**",
+    "smartcam/plant/presence/program/**",
+    "smartcam/plant/presence/*/operator-robot.secret",
+    "smartcam/plant/administer/**",
+    "smartcam/plant/states/**",
+    "smartcam/plant/topic/**",
+    "smartcam/plant/summary/**",
+)
+"""Patterns that mean more than any role may do."""
+
+MINE = "operator-robot.secret"
+
+
+def covered(role: str, does: str, pattern: str) -> bool:
+    """Whether the table allows all that a pattern means."""
+    expression: Any = importlib.import_module("zenoh").KeyExpr
+    return any(
+        expression(one).includes(expression(pattern))
+        for right in TABLE
+        if role in right.roles and right.does == does
+        for one in right.keys
+    )
+
+
+@pytest.mark.parametrize("ends", ROLES[:3], indirect=True)  # a router passes everything on
+async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends: Ends) -> None:
+    """Who says, answers, or is present under a pattern would be heard by all who mean a part."""
+    role, end, guard = ends
+    said, asked, present = Seen(), Seen(), Seen()
+
+    def answer(question: Any) -> None:
+        asked(question.key)
+        question.close()
+
+    mark = KEYS.ask(role, MARK, MARK)
+    guard.subscribe("**", said)
+    guard.answer("**", answer)
+    guard.watch("**", present)
+    for pattern in WIDE:
+        end.put(pattern, b"forged")
+        end.session.delete(pattern)
+        end.answer(pattern, lambda question: question.reply(question.key, b"forged"))
+        with contextlib.suppress(Exception):  # some are no keys to be present under
+            end.be_present(pattern)
+    asking = [asyncio.ensure_future(end.ask(one, b"", PATIENCE)) for one in WIDE]
+    await asyncio.sleep(0)
+    await known(end, guard, role)
+    end.put(mark, b"")
+    assert await said.mark(mark) <= {one for one in WIDE if covered(role, "say", one)}
+    assert await end.ask(KEYS.listing(MARK), b"", PATIENCE) == []  # which came behind
+    allowed_to_ask = {one for one in WIDE if covered(role, "ask", one)} | {KEYS.listing(MARK)}
+    assert {*asked.keys} <= allowed_to_ask
+    own = {KEYS.program(f"{role}-{MARK}")}
+    assert {*present.keys} - own <= {one for one in WIDE if covered(role, "appear", one)}
+    for key in (KEYS.service("line1/cam3", "trigger"), KEYS.summary("line1"), KEYS.reload("x")):
+        forged = [(key, b"forged")] if allowed(role, "answer", key) else []
+        assert await guard.ask(key, b"", 1.0) in ([], forged)
+    for one in asking:
+        one.cancel()
+    await asyncio.gather(*asking, return_exceptions=True)
+
+
+@pytest.mark.parametrize("ends", ["viewer", "operator"], indirect=True)  # others see all
+@pytest.mark.parametrize("pattern", WIDE)
+async def test_wide_pattern_brings_no_operator_what_is_for_agents(ends: Ends, pattern: str) -> None:
+    """Secrets of other programs are in their presence and their calls, which agents alone see."""
+    role, end, guard = ends
+    heard, seen = Seen(), Seen()
+    end.subscribe(pattern, heard)
+    end.watch(pattern, seen)
+    end.subscribe(KEYS.states(MARK), heard)
+    end.watch(KEYS.agent(MARK), seen)
+    await known(end, guard, role)
+    for key in (KEYS.command("line1", "cam3"), KEYS.ask("operator", "line1", "cam3")):
+        guard.put(key, b"")
+    guard.be_present(KEYS.program(MINE))
+    guard.be_present(KEYS.agent(MARK))
+    guard.put(KEYS.states(MARK), b"")
+    assert not any(
+        "/command/" in one or "/ask/" in one for one in await heard.mark(KEYS.states(MARK))
+    )
+    assert KEYS.program(MINE) not in await seen.mark(KEYS.agent(MARK))

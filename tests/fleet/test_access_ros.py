@@ -9,16 +9,15 @@ import pytest
 
 import smartcam.fleet
 from smartcam._zenoh import BusLink
-from smartcam.fleet import _renewal
-from smartcam.fleet._certificates import read_identity
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import ZenohEnd, read_identity
+from smartcam.fleet._security import renewal as _renewal
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.plantkit import certified, plant_file
 
 pytest.importorskip("rosbags", reason="needs the extra ros2")
 
-from smartcam.ros2 import Node
-from smartcam.ros2._context import SETTINGS, RosContext
+from smartcam.ros2 import Node, RosContext
+from smartcam.ros2._inside import SETTINGS
 
 pytestmark = [pytest.mark.real_time, pytest.mark.long]
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import pytest
 
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._fleet import Fleet
-from smartcam.fleet._host import GATHER
+from smartcam.fleet import Fleet, FleetCamera
+from smartcam.fleet._agent.host import GATHER
 from smartcam.models import Result, SubscriberStatistics
 from smartcam.streams import Subscription
 from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, end_of, until

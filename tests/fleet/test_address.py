@@ -11,7 +11,8 @@ import smartcam
 import smartcam.fleet
 from smartcam._zenoh import engine
 from smartcam.exceptions import ConfigurationError, MissingExtraError, UnsupportedError
-from smartcam.fleet._address import FleetAddress, check_name, check_pattern
+from smartcam.fleet._bus.address import check_name, check_pattern
+from smartcam.fleet._inside import FleetAddress
 from smartcam.settings import parse_address
 from tests.test_exports import newly_imported
 
@@ -160,7 +161,7 @@ def test_without_zenoh_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_engine_is_imported_for_fleet_urls_only() -> None:
-    watched = ["zenoh", "smartcam.fleet._zenoh"]
+    watched = ["zenoh", "smartcam.fleet._bus.zenoh"]
     wire = "smartcam.connect('bvs://127.0.0.1', interpret_as='localizations')"
     assert newly_imported(f"import smartcam; {wire}", watched) == []
     url = "smartcam.connect('fleet://127.0.0.1/line1/cam3')"
@@ -171,3 +172,11 @@ def test_fleet_in_this_process_needs_no_engine() -> None:
     file = "smartcam.fleet.FleetFile(cameras={'a': {'emulated': {}}})"
     code = f"import smartcam.fleet; smartcam.fleet.open({file})"
     assert newly_imported(code, ["zenoh"]) == []
+
+
+def test_address_says_what_the_program_is_called() -> None:
+    address = FleetAddress.parse("fleet://h/a?program=robot1")
+    assert address.program == "robot1"
+    assert address.of("a").url == "fleet://h:7447/a?program=robot1"
+    with pytest.raises(ConfigurationError, match="program"):
+        FleetAddress.parse("fleet://h/a?program=Robot 1")

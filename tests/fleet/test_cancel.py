@@ -17,14 +17,14 @@ import pytest
 from smartcam import fleet
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet import FleetCamera, FleetFile, FleetServer
-from smartcam.fleet._bus import MemoryBus
+from smartcam.fleet._bus.bus import MemoryBus
 from tests.fleet.fleetkit import NAME, Plant, end_of, until
 from tests.timed_loop import TimedLoop
 
 STEP = 0.001
 """Seconds that a step of the loop takes."""
 
-MOST_STEPS = 3000
+MAX_STEPS = 3000
 STRIDE = 11
 """Of the short form: a prime, so that the sweeps do not all skip the same steps."""
 
@@ -102,7 +102,7 @@ CALLS: dict[str, Work] = {
 
 def sweep(make: Callable[[int], Coroutine[Any, Any, bool]], every: int) -> int:
     """Cancel after 0, ``every``, 2 * ``every`` ... steps until it is over before; return these."""
-    for steps in range(0, MOST_STEPS, every):
+    for steps in range(0, MAX_STEPS, every):
         try:
             with asyncio.Runner(loop_factory=lambda: TimedLoop(turn=STEP)) as runner:
                 if runner.run(make(steps)):
@@ -110,7 +110,7 @@ def sweep(make: Callable[[int], Coroutine[Any, Any, bool]], every: int) -> int:
         except BaseException as exc:
             exc.add_note(f"cancelled after {steps} steps")
             raise
-    raise AssertionError(f"it is not over after {MOST_STEPS} steps")
+    raise AssertionError(f"it is not over after {MAX_STEPS} steps")
 
 
 async def cancelled_after(steps: int, work: Coroutine[Any, Any, object]) -> bool:

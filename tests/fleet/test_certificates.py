@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives import serialization
 
+from smartcam._accepting import is_loopback
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetFile, FleetServer, load_fleet
-from smartcam.fleet._access_file import is_loopback
-from smartcam.fleet._authority import MadeCertificate, make_certificates
-from smartcam.fleet._certificates import context, read_identity
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import MadeCertificate, ZenohEnd, make_certificates, read_identity
+from smartcam.fleet._security.certificates import context
 
 YEAR = timedelta(days=365)
 

@@ -11,10 +11,10 @@ import pytest
 
 from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetCamera, FleetFile, FleetServer
-from smartcam.fleet._address import FleetAddress
-from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._host import CATCH_UP, HOLD
-from smartcam.fleet._program import Program
+from smartcam.fleet._agent.host import CATCH_UP, HOLD
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._inside import FleetAddress
+from smartcam.fleet._program.program import Program
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:

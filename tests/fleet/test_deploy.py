@@ -14,10 +14,10 @@ import yaml
 from click.testing import CliRunner
 
 from smartcam._cli.smartcam import command
-from smartcam.fleet import _metric_families as families
-from smartcam.fleet import _metrics as metrics
 from smartcam.fleet import load_fleet
-from smartcam.fleet._trigger_counts import OUTCOMES
+from smartcam.fleet._operations import metric_families as families
+from smartcam.fleet._operations import metrics
+from smartcam.fleet._operations.trigger_counts import OUTCOMES
 from tests import ROOT
 
 DEPLOY = ROOT / "deploy"

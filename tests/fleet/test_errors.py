@@ -15,7 +15,7 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.fleet._errors import MAX_CHAIN, from_fields, to_fields
+from smartcam.fleet._bus.errors import MAX_CHAIN, from_fields, to_fields
 
 KINDS = [
     getattr(smartcam.exceptions, name)

@@ -138,7 +138,10 @@ URL = "url: bvs://192.168.0.10\n    "
         ("", ": expected fields such as 'cameras:'"),
         ("# nothing\n", ": expected fields such as 'cameras:'"),
         ("- 1\n", ": expected fields such as"),
-        ("cameras: {}\n", ", line 1: cameras: .*at least 1 item"),
+        (
+            "connect: tcp/h:1\ncameras: {}\n",
+            ", line 2: cameras: an agent without cameras is a router",
+        ),
         ("fleet: plant\n", ", line 1: cameras: Field required"),
         (f"flet: plant\n{CAMERAS}", ", line 1: flet: Extra inputs .*; did you mean 'fleet'"),
         (camera(f"{URL}aplication: 7"), ", line 4: cameras.line1/cam3.aplication: .*'application'"),
@@ -171,8 +174,14 @@ URL = "url: bvs://192.168.0.10\n    "
             "cameras:\n  a: {url: 'bvs://h'}\n  b: {url: 'bvs+udp://h:36701'}\n",
             ", line 3: cameras.b.url: this is the camera a, and a camera takes one client",
         ),
-        (camera("application: 7"), ", line 3: cameras.line1/cam3: .*url or emulated, got neither"),
-        (camera(f"{URL}emulated: {{}}"), ", line 3: .*cam3: .*url or emulated, got both"),
+        (
+            camera("application: 7"),
+            ", line 3: cameras.line1/cam3: .*url, emulated, software; got none of them",
+        ),
+        (
+            camera(f"{URL}emulated: {{}}"),
+            ", line 3: .*cam3: .*url, emulated, software; got url and emulated",
+        ),
         (camera("url: bvz://h"), ", line 3: .*cam3.url: .*unknown scheme 'bvz'.*did you mean"),
         (camera("url: fleet://h/a"), ", line 3: .*cam3.url: .*of a fleet"),
         (camera("url: h\n    model: XYZ"), ", line 3: .*cam3.url: unknown camera model 'XYZ'"),
@@ -183,14 +192,14 @@ URL = "url: bvs://192.168.0.10\n    "
             ", line 6: cameras.line1/cam3.interpret_as.3: layout: ",
         ),
         (camera(f"{URL}interpret_as: localisations"), ", line 4: .*interpret_as: .*localizations"),
-        (camera(f"{URL}application: -1"), ", line 4: .*application: .*greater than or equal to 0"),
-        (camera(f"{URL}application: x"), ", line 4: .*application: .*valid integer"),
+        (camera(f"{URL}application: -1"), ", line 4: .*application.*greater than or equal to 0"),
+        (camera(f"{URL}application: x"), ", line 4: .*application: a name is given"),
         (camera(f"{URL}switch_timeout: 0"), ", line 4: .*switch_timeout: .*greater than 0"),
         (camera(f"{URL}connect_timeout: .inf"), ", line 4: .*connect_timeout: "),
         (camera(f"{URL}reconnect: true"), ", line 4: .*reconnect: Input should be a valid dict"),
         (
             camera(f"{URL}reconnect: {{initial: 9, maximum: 1}}"),
-            ", line 4: .*reconnect: Backoff: expected maximum",
+            ", line 4: .*reconnect: Backoff: maximum: expected",
         ),
         (
             camera("emulated: {count: 0}"),
@@ -336,7 +345,7 @@ def test_schema_takes_what_is_right_and_refuses_what_is_wrong() -> None:
         "$": [{}, {"flet": "plant", **entry(emulated={})}],
         "$.fleet": [{"fleet": "Plant A", **entry(emulated={})}],
         "$.listen": [{"listen": one, **entry(emulated={})} for one in ("udp/h:1", 7447, ["tcp/h"])],
-        "$.cameras": [{"cameras": {}}, {"cameras": {"Line 1": {"emulated": {}}}}],
+        "$.cameras": [{"cameras": {"Line 1": {"emulated": {}}}}],
         "$.cameras.a": [
             entry(),
             entry(url="bvs://h", emulated={}),
@@ -355,3 +364,28 @@ def test_schema_takes_what_is_right_and_refuses_what_is_wrong() -> None:
 def test_schema_in_the_documents_is_that_of_the_code() -> None:
     text = (ROOT / "docs" / "fleet.schema.json").read_text(encoding="utf-8")
     assert plain(json.loads(text)) == plain(fleet_schema())
+
+
+def test_applications_may_be_named_in_a_file(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    text = """
+cameras:
+  line1/cam3:
+    url: "pcic://192.168.0.69"
+    application: bolts
+    application_names: {bolts: 7, nuts: 12}
+    interpret_as: {bolts: "x: real32 mm", 12: raw}
+"""
+    file.write_text(text)
+    entry = load_fleet(file).cameras["line1/cam3"]
+    settings = entry.settings("line1/cam3", str(entry.url))
+    assert settings.application == 7
+    assert set(settings.interpret_as) == {7, 12}
+    for wrong in (
+        text.replace("application: bolts", "application: bolt"),
+        text.replace('{bolts: "x', '{bolt: "x'),
+        text.replace("    application_names: {bolts: 7, nuts: 12}\n", ""),
+    ):
+        file.write_text(wrong)
+        with pytest.raises(ConfigurationError, match="application"):
+            load_fleet(file)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import gc
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from smartcam.exceptions import (
     InterpretationError,
     LocalProtocolError,
     NotRunningError,
+    ReservationLostError,
     ResponseTimeoutError,
     SubscriberOverflowError,
     TriggerTimeoutError,
@@ -32,11 +34,14 @@ from smartcam.fleet import (
     CameraJoined,
     CameraLeft,
     Fleet,
+    FleetEvent,
     FleetFile,
     FleetServer,
 )
-from smartcam.fleet._bus import MemoryBus
-from tests.client.clientkit import cancelled, until
+from smartcam.fleet._bus.bus import Handle, MemoryBus, MemoryEnd
+from smartcam.fleet._program.program_name import in_words
+from tests.client.clientkit import cancelled
+from tests.handmade import until
 
 LOOK = {"application": 21, "interpret_as": "text: string[20]"}
 HELLO = {**LOOK, "emulated": {}}
@@ -228,8 +233,8 @@ async def test_trigger_takes_what_a_camera_takes() -> None:
     [
         ("line3/*", {}, r"no camera of the fleet is 'line3/\*'; there are line1/cam1, line1/cam2"),
         ("Line", {}, "expected a camera's name, with"),
-        ("**", {"timeout": -1}, "timeout -1 is no number of seconds"),
-        ("**", {"when_busy": "go"}, "when_busy is 'wait' or 'refuse'"),
+        ("**", {"timeout": -1}, "timeout: expected seconds"),
+        ("**", {"when_busy": "go"}, "when_busy: expected 'wait' or 'refuse'"),
         ("**", {"interpret_as": "n: int3"}, "int3"),
     ],
 )
@@ -537,6 +542,38 @@ async def test_agent_that_is_cut_off_has_left_and_comes_back() -> None:
     assert kinds == [AgentJoined, CameraJoined, CameraLeft, AgentLeft, AgentJoined, CameraJoined]
 
 
+class _LatePresenceOfOne(MemoryEnd):
+    """An end at which who watches one camera is told later than who watches all."""
+
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        if "/presence/camera/" not in pattern or pattern.endswith("**"):
+            return super().watch(pattern, see)
+        loop = asyncio.get_running_loop()
+
+        def late(key: str, present: bool) -> None:
+            loop.call_later(0.05, see, key, present)
+
+        return super().watch(pattern, late)
+
+
+@pytest.mark.parametrize("kind", [CameraLeft, AgentLeft])
+async def test_camera_is_away_once_the_fleet_says_that_it_or_its_agent_left(
+    kind: type[FleetEvent],
+) -> None:
+    bus = MemoryBus()
+    async with Fleet(_LatePresenceOfOne(bus), None, "plant", None, 2.0, {}) as fleet:
+        events = fleet.events()
+        async with agent(bus, "one", "a"):
+            await until(lambda: "a" in fleet)
+            await fleet["a"].wait_connected()
+        async for event in events:
+            if isinstance(event, kind):
+                break
+        assert not fleet["a"].connected
+        with pytest.raises(ConnectionLostError, match=r"shares the camera no more|is gone"):
+            await fleet["a"].trigger()
+
+
 async def test_second_agent_with_a_camera_refuses_and_names_the_first() -> None:
     bus = MemoryBus()
     async with agent(bus, "one", "a", "b"), fleet_on(bus) as fleet:
@@ -559,7 +596,7 @@ async def test_reserved_camera_keeps_the_fleets_others_out() -> None:
             assert isinstance(outcomes["b"], Result)
             refused = outcomes["a"]
             assert isinstance(refused, TriggerTimeoutError)
-            assert mine["a"]._program.name in str(refused)
+            assert in_words(mine["a"]._program.name) in str(refused)
             with pytest.raises(ResponseTimeoutError, match="reserved by"):
                 async with yours["a"].reserve(timeout=0.5):
                     raise AssertionError
@@ -572,6 +609,9 @@ async def test_reservation_ends_with_its_program() -> None:
     async with agent(bus, "one", "a"), fleet_on(bus) as yours:
         mine = fleet_on(bus)
         await mine.open()
-        async with mine["a"].reserve():
-            await mine.close()
-            assert isinstance((await yours.trigger(timeout=2.0))["a"], Result)
+        reservation = mine["a"].reserve()
+        await reservation.__aenter__()
+        await mine.close()
+        assert isinstance((await yours.trigger(timeout=2.0))["a"], Result)
+        with pytest.raises(ReservationLostError, match="closed"):  # its block had it no more
+            await reservation.__aexit__(None, None, None)

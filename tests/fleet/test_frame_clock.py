@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._caller import DRIFT, Caller
+from smartcam.fleet._program.caller import DRIFT, Caller
 from smartcam.frames import FrameSource
 from smartcam.frames import open as open_frames
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import read_stamp
 from tests.fleet.fleetkit import PATIENCE
 from tests.processes import free_place
 

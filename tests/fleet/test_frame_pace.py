@@ -9,7 +9,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.fleet._frame_pace import LEAST, PATIENCE, SHARE, FramePace
+from smartcam.fleet._frames.pace import LEAST, PATIENCE, SHARE, FramePace
 from smartcam.frames import FrameSource
 from tests.frames.drivers import ScriptedDriver, frame
 

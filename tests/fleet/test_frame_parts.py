@@ -13,12 +13,14 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet import _frame_collector
-from smartcam.fleet._bus import Data, MemoryEnd
-from smartcam.fleet._frame_collector import FrameCollector, Incoming
-from smartcam.fleet._frame_sender import MOST_WAITING, PART, SMALL, STALE, WINDOW, FrameSender
-from smartcam.fleet._frame_wire import MOST_FRAME, FramePart, decode_part, encode_part
-from smartcam.fleet._keys import Keys
+from smartcam.fleet._bus.bus import Data, MemoryEnd
+from smartcam.fleet._frames import collector as _frame_collector
+from smartcam.fleet._frames.collector import FrameCollector, Incoming
+from smartcam.fleet._frames.features import feature_fields, read_feature
+from smartcam.fleet._frames.sender import MAX_WAITING_BYTES, PART, SMALL, STALE, WINDOW, FrameSender
+from smartcam.fleet._frames.wire import MAX_FRAME_BYTES, FramePart, decode_part, encode_part
+from smartcam.fleet._inside import Keys
+from smartcam.frames import Feature
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FLEET, PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
@@ -81,7 +83,7 @@ async def test_program_that_takes_nothing_holds_up_no_other() -> None:
     for call in range(200):
         sender.send("dead", call, data)
     assert wire.bytes_of("dead") <= WINDOW
-    assert sender._windows["dead"].waiting <= MOST_WAITING + 2 * WINDOW
+    assert sender._windows["dead"].waiting <= MAX_WAITING_BYTES + 2 * WINDOW
     sender.send("other", 1, bytes(WINDOW))
     assert wire.bytes_of("other") == WINDOW
     sender.forget("dead")
@@ -187,7 +189,7 @@ async def test_rest_that_does_not_come_is_given_up_and_told() -> None:
 
 
 @pytest.mark.parametrize(
-    "head", [b"", b"scf1", b"x" * 28, encode_part(FramePart(1, 0, MOST_FRAME + 1))]
+    "head", [b"", b"scf1", b"x" * 28, encode_part(FramePart(1, 0, MAX_FRAME_BYTES + 1))]
 )
 def test_broken_part_is_none(head: bytes) -> None:
     with pytest.raises(RemoteProtocolError):
@@ -304,3 +306,24 @@ async def test_program_that_ends_without_a_word_stops_its_stream_and_no_other(nu
             assert triggered > 1 or number != signal.SIGSTOP  # none had to wait for its end
         await plant.driver.rests()
         viewer.signal(signal.SIGCONT)
+
+
+FEATURE = Feature("Gain", "float", "rw", 1.0, 0, 24.5, None, "dB", (), ("GainSelector",), "x", "y")
+
+
+def test_a_feature_crosses_whole() -> None:
+    assert read_feature(feature_fields(FEATURE), "cam") == FEATURE
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"kind": "register"}, {"access": "x"}, {"value": [1]}, {"minimum": "0"}, {"maximum": True},
+        {"entries": 3}, {"selectors": None},
+    ],
+)  # fmt: skip
+def test_what_is_no_feature_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(RemoteProtocolError):
+        read_feature({**feature_fields(FEATURE), **wrong}, "cam")
+    with pytest.raises(RemoteProtocolError):
+        read_feature(None, "cam")

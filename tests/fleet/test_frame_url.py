@@ -21,7 +21,7 @@ from smartcam import (
 )
 from smartcam.camera import FrameEncoding
 from smartcam.fleet import FleetFile, FleetFrame, FleetServer
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import read_stamp
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import PATIENCE
 from tests.fleet.framekit import looking

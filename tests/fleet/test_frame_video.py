@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from smartcam import ConfigurationError, FrameFormatError, FrameSourceError
-from smartcam.fleet import FleetFrame, _frame_collector
-from smartcam.fleet._frame_video import KEY_EVERY, LATE, SharedVideo, VideoUnit
+from smartcam.fleet import FleetFrame
+from smartcam.fleet._frames import collector as _frame_collector
+from smartcam.fleet._frames.video import KEY_EVERY, LATE, SharedVideo, VideoUnit
 from smartcam.frames import Codecs, Frame, FrameSource, find_format
-from smartcam.frames._h264 import entry_point
-from smartcam.frames._synthetic import read_stamp, stripes, write_stamp
+from smartcam.frames._inside import entry_point, read_stamp
+from smartcam.frames._synthetic import stripes, write_stamp
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
@@ -185,7 +186,12 @@ async def test_one_frame_is_no_video() -> None:
 )
 async def test_what_cannot_be_held_is_refused(asked: dict[str, Any]) -> None:
     async with looking() as (_, camera):
-        assert isinstance(await gone(camera.frames(**asked).__aenter__()), ConfigurationError)
+
+        async def look() -> None:
+            async with camera.frames(**asked):
+                raise AssertionError("frames were promised")
+
+        assert isinstance(await gone(look()), ConfigurationError)
 
 
 # ---------------------------------------------------------------------- who gets what

@@ -22,9 +22,12 @@ from smartcam import (
     UnsupportedError,
 )
 from smartcam.calibration import CameraModel
-from smartcam.fleet import FleetFrame, _frame_caller, _frame_stream, _frames
-from smartcam.fleet._frame_wire import to_fields
-from smartcam.fleet._frames import SharedFrames
+from smartcam.fleet import FleetFrame
+from smartcam.fleet._frames import caller as _frame_caller
+from smartcam.fleet._frames import camera_frames as _frames
+from smartcam.fleet._frames import stream as _frame_stream
+from smartcam.fleet._frames.camera_frames import SharedFrames
+from smartcam.fleet._frames.wire import to_fields
 from smartcam.frames import Moment
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import NAME, PATIENCE, Plant, end_of, until
@@ -308,7 +311,7 @@ async def test_silent_agent_ends_a_stream() -> None:
 
 
 async def test_frame_that_no_bus_takes_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_frames, "MOST_FRAME", 7)
+    monkeypatch.setattr(_frames, "MAX_FRAME_BYTES", 7)
     async with looking() as (plant, camera), plant.streaming():
         assert "of 8 bytes, expected 7" in str(await gone(camera.newest_frame()))
         async with camera.frames() as frames:
@@ -335,8 +338,8 @@ async def test_one_program_s_stream_does_not_end_another_s() -> None:
 
 
 async def test_streams_and_calls_of_a_program_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_frames, "MOST_OF_PROGRAM", 2)
-    monkeypatch.setattr(_frames, "MOST_ASKED", 3)
+    monkeypatch.setattr(_frames, "MAX_STREAMS_PER_PROGRAM", 2)
+    monkeypatch.setattr(_frames, "MAX_FRAME_CALLS_PER_PROGRAM", 3)
     async with (
         looking() as (plant, camera),
         camera.frames() as first,

@@ -9,8 +9,9 @@ from random import Random
 
 import pytest
 
-from smartcam.fleet._gate import Gate
-from tests.client.clientkit import steps, until
+from smartcam.fleet._agent.gate import Gate
+from tests.client.clientkit import steps
+from tests.handmade import until
 
 
 @contextlib.asynccontextmanager

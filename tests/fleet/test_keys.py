@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from smartcam.fleet._keys import Keys, meets
+from smartcam.fleet._inside import Keys, meets
 
 CHUNKS = ("a", "b", "*", "**")
 SHORT = [
@@ -66,8 +66,9 @@ def test_keys_are_keys_of_the_engine() -> None:
     every = [
         keys.agent("desk-1"),
         keys.camera("desk-1", "line1/cam3"),
-        keys.program("robot-1"),
-        *(keys.call("desk-1", "line1/cam3", command=command) for command in (True, False)),
+        keys.program("operator-robot-1.secret"),
+        keys.command("desk-1", "line1/cam3"),
+        *(keys.ask(role, "desk-1", "line1/cam3") for role in ("viewer", "operator")),
         keys.reply("robot-1"),
         keys.states("line1/cam3"),
         keys.results("line1/cam3"),

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.long
 AGENT, PROGRAM = "10.77.0.1", "10.77.0.2"
 PORT = 7447  # of a namespace of its own
 TUN = (0x400454CA, 0x1001)  # TUNSETIFF; IFF_TUN and IFF_NO_PI
-MOST_PACKETS = 10_000
+MAX_PACKETS = 10_000
 
 FLEET = f"""\
 listen: tcp/{AGENT}:{PORT}
@@ -147,7 +147,7 @@ class Network:
                         return
                     with contextlib.suppress(OSError):  # this end is down
                         packet = os.read(key.fd, 1 << 16)
-                        if chance.random() >= self.loss and len(waiting) < MOST_PACKETS:
+                        if chance.random() >= self.loss and len(waiting) < MAX_PACKETS:
                             at = time.monotonic() + self.delay
                             heapq.heappush(waiting, (at, next(count), key.data, packet))
                 while waiting and waiting[0][0] <= time.monotonic():

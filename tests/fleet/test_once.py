@@ -17,8 +17,8 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet import FleetFile
-from smartcam.fleet._log import AgentLog
-from smartcam.fleet._wire import decode, decode_order, decode_outcome
+from smartcam.fleet._bus.log import AgentLog
+from smartcam.fleet._bus.wire import decode, decode_order, decode_outcome
 from smartcam.models import Disconnected, Reconnected
 from smartcam.streams import Subscription
 from tests.client.clientkit import gone
@@ -280,7 +280,7 @@ async def test_start_of_an_agent_that_nobody_saw_is_seen_by_who_only_listens() -
 
 async def test_as_many_calls_at_once_as_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a program may have under way grows with the cameras: a whole fleet is triggered."""
-    monkeypatch.setattr("smartcam.fleet._agent.MOST_CALLS", 2)
+    monkeypatch.setattr("smartcam.fleet._agent.agent.MAX_CALLS_PER_PROGRAM", 2)
     file = FleetFile.model_validate({"cameras": {"line1/**": {"emulated": {"count": 5}}}})
     async with fleet.open(file) as plant:
         cameras = plant.cameras()

@@ -14,7 +14,8 @@ import pytest
 
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
-from smartcam.fleet._bus import MemoryBus
+from smartcam.exceptions import ReservationLostError
+from smartcam.fleet._bus.bus import MemoryBus
 from tests import ROOT
 from tests.fleet.plainkit import (
     COUNTER,
@@ -220,8 +221,12 @@ async def test_status_topic_says_each_status_and_the_loss_of_the_camera() -> Non
         assert came[-1]["failure"] == ""
         numbers = [said["number"] for said in came]
         assert numbers == [*range(numbers[0], numbers[0] + len(numbers))]
-        listed = set((await place.client.call("status")).keys()) - {"error"}
-        assert set(came[-1]) == listed | {"number", "at"}
+        asked = await place.client.call("status")
+        assert {**came[-1], "error": ""}.keys() == asked.keys()
+        if asked["number"] > came[-1]["number"]:
+            came += await statuses.until(lambda said: said["number"] == asked["number"])
+        assert asked["number"] == came[-1]["number"]
+        assert datetime.fromisoformat(asked["at"]) >= datetime.fromisoformat(came[-1]["at"])
 
 
 @pytest.mark.both_buses
@@ -235,6 +240,32 @@ async def test_events_topic_has_the_camera_s_events() -> None:
         came += await events.until(lambda said: said["event"] == "Disconnected")
         assert came[-1]["reason"]
         assert {said["event"] for said in came} >= {"StatusChanged", "ApplicationChanged"}
+        numbers = [said["number"] for said in came]
+        assert numbers == [*range(numbers[0], numbers[0] + len(numbers))]
+
+
+@pytest.mark.both_buses
+async def test_topics_tell_a_reservation_and_its_loss() -> None:
+    async with plant() as place, place.fleet() as fleet:
+        camera = fleet[NAME]
+        await camera.wait_connected()
+        events = await place.client.topic("topic/events/**")
+        statuses = await place.client.topic(f"topic/status/{NAME}")
+        async with camera.reserve(timeout=PATIENCE):
+            holder = (await place.client.call("status"))["reserved_by"]
+            assert holder
+            await statuses.until(lambda said: said["reserved_by"] == holder)
+        await statuses.until(lambda said: said["reserved_by"] is None)
+        with pytest.raises(ReservationLostError):
+            async with camera.reserve(timeout=PATIENCE):
+                place.server.hosts[NAME].lose_reservation()
+        came = await events.until(lambda said: said["event"] == "ReservationLost")
+        told = [said for said in came if said["event"].startswith(("Re", "Lost"))]
+        kinds = ["Reserved", "Released", "Reserved", "ReservationLost"]
+        assert [said["event"] for said in told] == kinds
+        assert {(said["by"], said["camera"], said["agent"]) for said in told} == {
+            (holder, NAME, "one")
+        }
         numbers = [said["number"] for said in came]
         assert numbers == [*range(numbers[0], numbers[0] + len(numbers))]
 

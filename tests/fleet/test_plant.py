@@ -12,13 +12,13 @@ import pytest
 from smartcam import Result
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, RemoteProtocolError
-from smartcam.fleet import _fleet
-from smartcam.fleet._bundle import AgentBundle, decode_bundle
-from smartcam.fleet._bus import MemoryBus, MemoryEnd
-from smartcam.fleet._exchange import Exchange
-from smartcam.fleet._fleet import Fleet
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._server import FleetServer
+from smartcam.fleet import Fleet, FleetServer
+from smartcam.fleet._agent.bundle import AgentBundle, decode_bundle
+from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
+from smartcam.fleet._inside import Keys
+from smartcam.fleet._program import fleet as _fleet
+from smartcam.fleet._program.exchange import Exchange
+from smartcam.fleet._program.program_name import in_words
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.test_fleet import HELLO, file
 from tests.processes import free_place
@@ -29,8 +29,8 @@ CAMERAS = ("a", "b", "c", "d", "e")
 @contextlib.asynccontextmanager
 async def plant(monkeypatch: pytest.MonkeyPatch, *, met: int = 3) -> AsyncIterator[Fleet]:
     """Give a program with a fleet that is large to it: two agents, five cameras."""
-    monkeypatch.setattr(_fleet, "MOST_MET", met)
-    monkeypatch.setattr(_fleet, "MOST_SINGLE", 2)
+    monkeypatch.setattr(_fleet, "MAX_CAMERAS_MET", met)
+    monkeypatch.setattr(_fleet, "MAX_CAMERAS_SUBSCRIBED", 2)
     bus = MemoryBus()
     async with contextlib.AsyncExitStack() as stack:
         for name, cameras in (("north", CAMERAS[:3]), ("south", CAMERAS[3:])):
@@ -75,10 +75,10 @@ async def test_status_says_why_there_is_no_session_and_who_has_it_reserved() -> 
         await server.wait_tried()
         async with fleet["here"].reserve():
             known = await fleet.status()
-        assert known["here"].reserved_by == fleet._program.name
+        assert known["here"].reserved_by == in_words(fleet._program.name)
         assert not known["gone"].connected
         assert known["gone"].reason is not None
-        with pytest.raises(ConfigurationError, match="no number of seconds"):
+        with pytest.raises(ConfigurationError, match="timeout: expected seconds"):
             await fleet.status(timeout=-1.0)
     with pytest.raises(ConnectionClosedError):
         await fleet.status()
@@ -196,7 +196,7 @@ def test_broken_bundle_is_told(payload: bytes) -> None:
 async def test_thousands_of_presences_come_through_a_router() -> None:
     """With less room for declarations the router waited for itself, and ended the connection."""
     pytest.importorskip("zenoh")
-    from smartcam.fleet._zenoh import ZenohEnd
+    from smartcam.fleet._inside import ZenohEnd
 
     places = (free_place(),)
     keys, count = Keys("plant"), 6000

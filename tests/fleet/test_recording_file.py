@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import load_fleet
-from smartcam.fleet._recording_file import RecordSection
+from smartcam.fleet._inside import RecordSection
 
 
 def load(folder: Path, record: str) -> RecordSection:

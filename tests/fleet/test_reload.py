@@ -12,10 +12,16 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 
-from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectionClosedError,
+    ConnectionLostError,
+    SmartCamError,
+)
 from smartcam.fleet import Fleet, FleetChanges, FleetFile, FleetServer
-from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._reload import LoadedFleet, changes_of, loaded
+from smartcam.fleet._agent.reload import LoadedFleet, changes_of, loaded
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.models import Disconnected
 from smartcam.protocols import messages as m
 from smartcam.settings import CameraSettings, parse_address
 from tests.fleet.fleetkit import PATIENCE, NumberedCamera
@@ -244,7 +250,7 @@ async def test_what_nobody_foresaw_is_a_typed_error_and_the_next_one_works(
             (KeyError("x"), "a fault of ours"),
         ):
             with monkeypatch.context() as patched:
-                patched.setattr("smartcam.fleet._reload.load_fleet", failing(fault))
+                patched.setattr("smartcam.fleet._agent.reload.load_fleet", failing(fault))
                 with pytest.raises(SmartCamError, match=expected):
                     await one.server.reload()
                 outcome = (await one.fleet.reload())["a1"]
@@ -374,3 +380,30 @@ def test_how_a_camera_is_seen_in_ros_wants_a_restart() -> None:
     assert changes_of(file("base", False), file("table", False), "a1").changed == ("one",)
     with pytest.raises(ConfigurationError, match="ros2: it was changed"):
         changes_of(file(None, False), file(None, True), "a1")
+
+
+@pytest.mark.parametrize(
+    ("names", "more", "why"),
+    [
+        (("two",), {}, "it was removed from the fleet file"),
+        (("one", "two"), {"one": {"lenient": True}}, "its entry in the fleet file has changed"),
+    ],
+    ids=["removed", "changed"],
+)
+async def test_program_is_told_why_its_camera_is_shared_no_more(
+    tmp_path: Path, names: tuple[str, ...], more: dict[str, Any], why: str
+) -> None:
+    async with line(tmp_path) as one:
+        camera = one.fleet["one"]
+        events = camera.events()
+        await camera.trigger()
+        one.write(*names, more=more)
+        await one.server.reload()
+        lost = await anext(events)
+        while not isinstance(lost, Disconnected):
+            lost = await anext(events)
+        said = f"the agent a1 shares the camera no more: {why}"
+        assert said in lost.reason
+        if "one" not in names:
+            with pytest.raises(ConnectionLostError, match=said):
+                await camera.query_status()

@@ -9,7 +9,7 @@ import pytest
 
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import ConfigurationError, ConnectFailedError
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import ZenohEnd
 from tests.fleet.fleetkit import PATIENCE, until
 from tests.fleet.test_zenoh import two_ends
 from tests.processes import free_place

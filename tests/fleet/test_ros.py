@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import smartcam
 import smartcam.fleet
+from smartcam.calibration import fit_plane
+from smartcam.emulator import Application, EmulatedCamera
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet import FleetFile
-from smartcam.fleet._address import FleetAddress
-from smartcam.fleet._file import load_fleet
-from smartcam.fleet._ros import ros_of
-from smartcam.fleet._ros_file import RosSection
+from smartcam.fleet import FleetFile, load_fleet
+from smartcam.fleet._inside import FleetAddress, RosSection, ros_of
 from smartcam.ros2 import Node, QoS
-from smartcam.ros2._qos import LATCHED
+from smartcam.ros2._inside import LATCHED
 from tests.processes import free_place
-from tests.ros2.roskit import PATIENCE, TRIGGER, soon, until
+from tests.ros2.roskit import PATIENCE, TRIGGER, called, peer, router, soon, until
+from tests.ros2.tfkit import TransformTree
 
 pytestmark = pytest.mark.real_time
 
@@ -27,6 +30,7 @@ ROOT = Path(__file__).parents[2]
 
 EMULATED = {"emulated": {}, "application": 7, "interpret_as": "localizations"}
 STATUS = "smartcam_msgs/msg/CameraStatus"
+LOCALIZE = "smartcam_msgs/srv/TriggerLocalization"
 POSES = "geometry_msgs/msg/PoseArray"
 
 
@@ -79,6 +83,115 @@ async def test_a_plant_is_seen_and_used_from_ros() -> None:
         assert reply.success, reply.message
         assert len((await soon(anext(others))).poses) >= 1
     assert server.ros_nodes == []
+
+
+async def test_the_frames_that_a_file_names_are_those_that_tf_knows(tmp_path: Path) -> None:
+    seen = np.array([[0, 0], [0.1, 0], [0, 0.1], [0.1, 0.1]])
+    touched = np.column_stack([seen, np.zeros(4)]) + np.array([0.4, 0.1, 0])
+    fit_plane(seen, touched, model="similarity").save(tmp_path / "plane.json")
+    place, path = free_place(), tmp_path / "plant.yaml"
+    path.write_text(
+        f"listen: {place}\nros2: {{domain: 9}}\ncameras:\n  line-1/cam:\n    emulated: {{}}\n"
+        "    application: 7\n    interpret_as: localizations\n    frames: synthetic://\n"
+        "    ros2: {frame_id: cam_plane, parent_frame: base_link, calibration: plane.json}\n"
+    )
+    tree = TransformTree()
+    async with (
+        smartcam.fleet.serve(path),
+        Node("viewer", connect=place, domain=9) as viewer,
+    ):
+        frames = viewer.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", qos=LATCHED)
+        tree.hear(await soon(anext(frames)))
+        trigger = viewer.client("/line_1/cam/TriggerLocalization", LOCALIZE)
+        reply = await soon(trigger.call(timeout=PATIENCE))
+        assert reply.error == ""
+        assert reply.localizations
+        for one in reply.localizations:
+            assert one.pose.header.frame_id == "base_link"
+            tree.lookup("cam_plane", one.pose.header.frame_id)
+        picture = viewer.subscribe("/line_1/cam/image_raw", "sensor_msgs/msg/Image")
+        assert (await soon(anext(picture))).header.frame_id == "cam_plane_optical"
+
+
+async def test_nodes_go_on_without_the_router_that_they_connect_to() -> None:
+    place = free_place()
+    file = FleetFile.model_validate(
+        {"connect": place, "cameras": {"cam": EMULATED}, "ros2": {"domain": 9}}
+    )
+    async with contextlib.AsyncExitStack() as stack:
+        with router(place):
+            await stack.enter_async_context(smartcam.fleet.serve(file))
+            viewer = stack.enter_context(peer(place))
+            assert (await called(viewer, 9, "/cam/trigger")).success
+        # the router is gone
+        assert (await called(viewer, 9, "/cam/trigger")).success
+        with router(place), peer(place) as later:
+            assert (await called(later, 9, "/cam/trigger")).success
+
+
+async def test_nodes_begin_without_the_router_that_they_connect_to(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    place = free_place()
+    file = FleetFile.model_validate(
+        {"connect": place, "cameras": {"cam": EMULATED}, "ros2": {"domain": 9}}
+    )
+    async with smartcam.fleet.serve(file) as server:
+        assert server.ros_nodes == ["/cam"]
+        assert "no router at" in caplog.text
+        with router(place), peer(place) as viewer:
+            assert (await called(viewer, 9, "/cam/trigger")).success
+
+
+@pytest.mark.parametrize(
+    ("section", "entry", "runs"),
+    [({}, {}, True), ({}, {"restore": False}, False), ({"autostart": False}, {}, False)],
+)
+async def test_an_application_runs_again_after_its_camera_restarts(
+    section: dict[str, Any], entry: dict[str, Any], runs: bool
+) -> None:
+    place = free_place()
+    application = Application(id=7, layout="n: int32", cycle=[{"n": 1}], load_time=0.01)
+    async with EmulatedCamera([application], builtins=False, quirks={"reboot_time": 0.3}) as box:
+        camera = {"url": box.url, "application": 7, "interpret_as": "n: int32", **entry}
+        async with (
+            smartcam.fleet.serve(plant(place, {"cam": camera}, ros2=section)) as server,
+            Node("viewer", connect=place) as viewer,
+        ):
+            await server.wait_tried()
+            heard = viewer.subscribe("/cam/status", STATUS, qos=LATCHED)
+            await wait_for(heard, lambda one: one.running)
+            assert (await soon(viewer.client("/cam/reboot", TRIGGER).call())).success
+            await wait_for(heard, lambda one: not one.connected)
+            await wait_for(heard, lambda one: one.connected)
+            if runs:
+                await until(lambda: box.device.running)
+            else:
+                await wait_for(heard, lambda one: one.connected and not one.running)
+                await asyncio.sleep(0.3)
+                assert not box.device.running
+            restores = await viewer.parameters_of("/cam").get("restore")
+            assert restores == {"restore": runs}
+
+
+async def wait_for(heard: Any, fits: Callable[[Any], bool]) -> Any:
+    """Return the next message that fits."""
+    while not fits(said := await soon(anext(heard))):
+        pass
+    return said
+
+
+def test_a_calibration_of_ours_is_no_camera_info_that_ros_may_write(tmp_path: Path) -> None:
+    (tmp_path / "ours.json").write_text('{"kind": "lens"}')
+    (tmp_path / "ros.yaml").write_text("image_width: 640")
+    urls = []
+    for name in ("ours.json", "ros.yaml", "later.yaml"):
+        frames = {"url": "synthetic://", "camera_info": name}
+        file = FleetFile.model_validate({"cameras": {"cam": {"emulated": {}, "frames": frames}}})
+        entry = file.cameras["cam"].frames
+        assert entry is not None
+        urls.append(entry.camera_info_url(tmp_path))
+    assert urls == ["", *((tmp_path / one).as_uri() for one in ("ros.yaml", "later.yaml"))]
 
 
 async def test_a_node_goes_with_its_agent_and_comes_with_it() -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import base64
 import socket
+import time
 from functools import partial
 from typing import Any
 
 import pytest
 
 from smartcam.emulator import EmulatedCamera
-from smartcam.fleet import _plain
+from smartcam.fleet._json import plain as _plain
 from smartcam.protocols import messages as m
 from tests.fleet.plainkit import (
     COUNTER,
@@ -222,7 +223,7 @@ async def test_call_for_an_earlier_start_of_the_agent_is_not_done() -> None:
 
 
 async def test_memory_of_answers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MOST_KNOWN", 3)
+    monkeypatch.setattr(_plain, "MAX_ANSWERS_REMEMBERED", 3)
     async with plant() as place:
         for number in range(5):
             await place.client.call("trigger", id=number)
@@ -233,7 +234,7 @@ async def test_memory_of_answers_is_bounded(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 async def test_bytes_of_answers_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MOST_KNOWN_BYTES", 100)
+    monkeypatch.setattr(_plain, "MAX_ANSWER_BYTES_REMEMBERED", 100)
     async with plant() as place:
         await place.client.call("trigger", id=1)
         await place.client.call("trigger", id=1)
@@ -259,7 +260,7 @@ async def test_call_waits_for_a_reservation_within_its_time() -> None:
 
 
 async def test_number_of_calls_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_plain, "MOST_CALLS", 2)
+    monkeypatch.setattr(_plain, "MAX_CONCURRENT_CALLS", 2)
     async with plant() as place:
         await place.client.call("switch_application", application=SILENT)
         calls = [place.client.call("trigger", timeout=1) for _ in range(4)]
@@ -271,7 +272,7 @@ async def test_number_of_calls_is_bounded(monkeypatch: pytest.MonkeyPatch) -> No
 async def test_repeats_that_wait_are_bounded() -> None:
     async with plant() as place:
         await place.client.call("switch_application", application=SILENT)
-        most = _plain.MOST_REPEATS
+        most = _plain.MAX_WAITING_REPEATS
         calls = [place.client.call("trigger", timeout=1, id=1) for _ in range(most + 1)]
         kinds = [answer["kind"] for answer in await asyncio.gather(*calls)]
         assert kinds == ["TriggerTimeoutError"] * most + ["LocalProtocolError"]
@@ -290,7 +291,63 @@ async def test_agent_that_ends_answers_calls_under_way() -> None:
         assert "unknown" in answer["error"]
 
 
+@pytest.mark.both_buses
+@pytest.mark.parametrize("service", ["trigger", "start"])
+async def test_command_that_comes_after_its_deadline_is_not_done(service: str) -> None:
+    """As behind an agent that was stopped for a while, whose queries wait for it."""
+    async with plant() as place:
+        listed = (await place.client.ask("cameras/**"))[0][1]["next_result"]
+        answer = await place.client.call(service, timeout=5, deadline=time.time() - 0.1)
+        assert "after its deadline" in answer["error"]
+        assert "was not done" in answer["error"]
+        assert answer["kind"].endswith("TimeoutError")
+        assert (await place.client.ask("cameras/**"))[0][1]["next_result"] == listed
+        answer = await place.client.call(service, timeout=5, deadline=time.time() + 60)
+        assert answer["error"] == ""
+        for wrong in ("soon", -1, True, float("1e999")):
+            assert (await place.client.call(service, deadline=wrong))["kind"]
+
+
 # ---------------------------------------------------------------------- the thesis' interface
+
+
+@pytest.mark.both_buses
+@pytest.mark.parametrize("host", ["as listed", "localhost"])
+async def test_setup_takes_no_camera_that_the_fleet_has_under_another_name(host: str) -> None:
+    async with plant() as place:
+        where = place.camera.host if host == "as listed" else host
+        fields: dict[str, Any] = {"con_address": where, "port": place.camera.port}
+        answer = await place.client.thesis("Setup", "thief", **fields)
+        assert answer["kind"] == "ConfigurationError"
+        assert f"is the camera {NAME} of the agent one" in answer["error"]
+        assert [key for key, _ in await place.client.ask("cameras/**")] == [f"cameras/{NAME}"]
+        assert (await place.client.call("trigger"))["error"] == ""  # its session goes on
+
+
+async def test_of_two_setups_of_one_address_one_adds_it() -> None:
+    async with plant() as place, EmulatedCamera(active=LOCALIZATIONS, running=True) as other:
+        fields = {"con_address": other.host, "port": other.port}
+        answers = await asyncio.gather(
+            *(place.client.thesis("Setup", name, **fields) for name in ("left", "right"))
+        )
+        assert sorted(bool(one["error"]) for one in answers) == [False, True]
+        listed = [key for key, _ in await place.client.ask("cameras/**")]
+        assert len(listed) == 2
+
+
+async def test_setup_that_fails_behind_the_session_leaves_nothing_behind() -> None:
+    async with plant() as place, EmulatedCamera(active=LOCALIZATIONS, running=True) as other:
+        fields = {"con_address": other.host, "port": other.port}
+        answer = await place.client.thesis("Setup", "new", application_id=99, **fields)
+        assert answer["kind"]
+        assert [key for key, _ in await place.client.ask("cameras/**")] == [f"cameras/{NAME}"]
+        assert not other.has_session
+        answer = await place.client.thesis("Setup", "new", interpret_as="nonsense(", **fields)
+        assert answer["kind"]
+        assert (await place.client.thesis("Setup", "other", **fields))["error"] == ""
+        # a later one that fails takes away nothing
+        assert (await place.client.thesis("Setup", "other", application_id=99))["kind"]
+        assert len(await place.client.ask("cameras/**")) == 2
 
 
 @pytest.mark.both_buses
@@ -446,7 +503,9 @@ async def test_thesis_fields_that_are_empty_or_0_count_as_not_said() -> None:
                     "ChangeApplication", id=empty, epoch="", timeout=0, application_id=TEXTS
                 )
                 assert answer == {"error": ""}
-                answer = await place.client.thesis("Trigger50ByteString", id=empty, epoch="")
+                answer = await place.client.thesis(
+                    "Trigger50ByteString", id=empty, epoch="", deadline=0
+                )
                 assert answer["error"] == ""
         assert heard(place.camera, m.Trigger) == 4
 

@@ -12,6 +12,7 @@ import pytest
 
 import smartcam
 from smartcam import Backoff
+from smartcam._client.supervisor import FIRST_RETRY_DELAY_OF_TAKEN
 from smartcam.emulator import faults
 from smartcam.exceptions import (
     ConfigurationError,
@@ -20,15 +21,13 @@ from smartcam.exceptions import (
     SmartCamError,
     TriggerTimeoutError,
 )
-from smartcam.fleet._agent import Agent
-from smartcam.fleet._bus import MemoryBus, MemoryEnd
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._claims import ASK, HOLD_OFF, RETURN
-from smartcam.fleet._file import FleetFile
-from smartcam.fleet._fleet import Fleet
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._program import Program
-from smartcam.fleet._standby_file import Standby
+from smartcam.fleet import Fleet, FleetCamera, FleetFile
+from smartcam.fleet._agent.agent import Agent
+from smartcam.fleet._agent.claims import ASK, HOLD_OFF, RETURN
+from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
+from smartcam.fleet._file.standby import Standby
+from smartcam.fleet._inside import Keys
+from smartcam.fleet._program.program import Program
 from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.settings import Address, CameraSettings
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
@@ -181,6 +180,48 @@ class Work:
         return kinds
 
 
+@pytest.mark.parametrize("how", ["start", "reload"])
+async def test_agent_takes_no_camera_that_another_has_under_another_name(how: str) -> None:
+    async with Pair() as pair:
+        north = await pair.start("north")
+        settings = CameraSettings.make(pair.box.url, None, {"name": "thief", "reconnect": QUICK})
+        first = {} if how == "reload" else {"thief": settings}
+        south = Agent("south", Keys(FLEET), pair.bus.end(), first, standby=STANDS_BY)
+        try:
+            if how == "reload":
+                await south.open(PATIENCE)
+            with pytest.raises(ConfigurationError, match=f"is the camera {NAME} of the agent"):
+                await (south.open(PATIENCE) if first else south.want("thief", settings))
+            assert not south.hosts
+            assert pair.having() == ["north"]
+            if how == "reload":
+                await north.close()
+                await south.want("thief", settings)  # it is free now
+                assert [*south.hosts] == ["thief"]
+        finally:
+            await south.close()
+
+
+async def test_camera_is_not_taken_over_while_another_name_has_it() -> None:
+    async with Pair() as pair:
+        north = await pair.start("north")
+        await pair.start("south")
+        settings = CameraSettings.make(pair.box.url, None, {"name": "thief", "reconnect": QUICK})
+        third = Agent("third", Keys(FLEET), pair.bus.end(), {})
+        await third.open(PATIENCE)
+        try:
+            await north.close()
+            third.share("thief", settings)  # as a Setup that was faster
+            await third.wait_tried()
+            await asyncio.sleep(SOON)
+            assert third.hosts["thief"].connected
+            assert pair.sharing() == ["north"]  # which is closed
+            await third.drop("thief", "a test")
+            await until(lambda: "south" in pair.having())
+        finally:
+            await third.close()
+
+
 @contextlib.asynccontextmanager
 async def pair_at_work() -> AsyncIterator[tuple[Pair, Work]]:
     """Give a pair of which north has the camera and south stands by, and a program at work."""
@@ -297,7 +338,7 @@ async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
     async with pair_at_work() as (pair, _):
         winner = await split(pair)
         sessions = [one.camera.statistics().sessions for one in hosts(pair)]
-        await asyncio.sleep(30.0)
+        await asyncio.sleep(FIRST_RETRY_DELAY_OF_TAKEN / 2)
         assert pair.having() == [winner]
         assert [one.camera.statistics().sessions for one in hosts(pair)] == sessions
         pair.ends["north"].attach()
@@ -323,7 +364,7 @@ async def test_session_that_begins_while_another_agent_is_asked_is_seen(
     async with Pair() as pair:
         await pair.start("north")
         await pair.start("south")
-        await pair.agents["north"].unshare(NAME)
+        await pair.agents["north"].unshare(NAME, "it is told to")
         await until(lambda: pair.having() == ["south"])
         async with pair.program() as camera:
             pair.box.inject(faults.Delay(on="ConnectAnswer", seconds=1.0))
@@ -335,7 +376,7 @@ async def test_session_that_begins_while_another_agent_is_asked_is_seen(
                 return heard
 
             monkeypatch.setattr(camera._caller, "_say_hello", slowly)
-            await pair.agents["south"].drop(NAME)
+            await pair.agents["south"].drop(NAME, "it is told to")
             await until(lambda: pair.having() == ["north"])
             await camera.wait_connected(timeout=PATIENCE)
             assert (await camera.trigger(2)).value.run == 1
@@ -423,7 +464,7 @@ async def test_camera_that_was_taken_is_taken_back_from_an_agent_only(contested:
                 other.be_present(Keys(FLEET).camera("south", NAME)).close()
             await taken_twice(pair)
         (host,) = hosts(pair)
-        await asyncio.sleep(60.0)
+        await asyncio.sleep(FIRST_RETRY_DELAY_OF_TAKEN / 2)
         assert isinstance(host.camera.trouble, ConnectionTakenError)
         assert (hosts(pair), pair.having()) == ([host], [])
 

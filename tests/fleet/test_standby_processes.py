@@ -16,9 +16,7 @@ pytest.importorskip("zenoh")
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import SmartCamError
 from smartcam.fleet import Fleet
-from smartcam.fleet._address import FleetAddress
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import FleetAddress, Keys, ZenohEnd
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
 from tests.fleet.partner import Partner, partner
 from tests.fleet.test_standby import QUICK, Work

@@ -9,8 +9,7 @@ import pytest
 pytest.importorskip("zenoh")
 
 from smartcam._zenoh import BusLink
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import Keys, ZenohEnd
 from tests.fleet.fleetkit import FLEET, PATIENCE, until
 from tests.processes import free_place
 

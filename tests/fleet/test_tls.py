@@ -22,9 +22,11 @@ from smartcam.exceptions import (
     ResponseTimeoutError,
     TriggerTimeoutError,
 )
-from smartcam.fleet import FleetCamera, FleetFile, FleetServer, _renewal, _zenoh
-from smartcam.fleet._certificates import read_identity
-from smartcam.fleet._wire import encode
+from smartcam.fleet import FleetCamera, FleetFile, FleetServer
+from smartcam.fleet._bus import zenoh as _zenoh
+from smartcam.fleet._bus.wire import encode
+from smartcam.fleet._inside import read_identity
+from smartcam.fleet._security import renewal as _renewal
 from smartcam.models import Disconnected, Reconnected
 from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, until
 from tests.fleet.plantkit import CAMERA, certified, plant_file, short_lived, url_of
@@ -137,11 +139,11 @@ async def test_cancelling_under_the_name_of_another() -> None:
     ):
         own = robot._program
         number = own._calls + 1
-        key = own.keys.call("agent", NAME, command=False)
+        key = own.keys.ask(own.role, "agent", NAME)
 
         def cancel() -> None:
             for one in range(1, number + 3):
-                fields = {"program": own.name, "call": 1, "cancel": one}
+                fields = {"program": own.token, "call": 1, "cancel": one}
                 spy._program.bus.put(key, encode(fields, []))
 
         cancel()  # before it comes
@@ -310,6 +312,7 @@ async def soon_expired(
         await camera.close()
 
 
+@pytest.mark.long
 async def test_certificates_that_end_while_all_runs(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -360,3 +363,8 @@ def test_warnings(tmp_path: Path) -> None:
     )
     soon = identity._replace(authority_ends=now + timedelta(days=3))
     assert "its authority" in soon.warning
+
+
+async def test_name_that_does_not_resolve_is_told_as_such() -> None:
+    said = await refused(f"fleet://nohost.invalid:7447/{CAMERA}")
+    assert "the name 'nohost.invalid' does not resolve" in said

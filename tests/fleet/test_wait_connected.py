@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import pytest
 
 from smartcam.exceptions import ResponseTimeoutError
-from smartcam.fleet._camera import ASK_AGAIN
+from smartcam.fleet._program.camera import ASK_AGAIN
 from tests.fleet.fleetkit import Plant
 from tests.fleet.lossy_bus import LossyBus, only
 

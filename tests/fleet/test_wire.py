@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet._wire import (
+from smartcam.fleet._bus.wire import (
     ResultRun,
     TriggerOrder,
     decode,
@@ -107,6 +107,7 @@ ORDERS = st.builds(
     by_application=st.booleans(),
     data=st.none() | st.binary(max_size=9),
     layouts=st.none(),
+    reservation=st.none() | st.integers(0, 2**64 - 1),
 )
 
 

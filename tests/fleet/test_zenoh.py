@@ -21,9 +21,10 @@ import pytest
 import smartcam
 from smartcam import _zenoh
 from smartcam._zenoh import BusLink, with_ports
-from smartcam.exceptions import ConnectFailedError, ConnectionLostError
+from smartcam.exceptions import ConnectFailedError, ConnectionLostError, ReservationLostError
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._zenoh import LONG, ZenohEnd
+from smartcam.fleet._bus.zenoh import LONG
+from smartcam.fleet._inside import ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, PATIENCE, NumberedCamera, Plant, until
@@ -228,7 +229,7 @@ async def test_killed_agent_is_seen_at_once_and_everything_goes_on_when_it_is_ba
         other = await stack.enter_async_context(smartcam.connect(url, reconnect=FAST))
         assert isinstance(other, FleetCamera)
         reservation = other.reserve(timeout=PATIENCE)
-        await stack.enter_async_context(reservation)
+        await reservation.__aenter__()
         waiting = [
             asyncio.create_task(camera.trigger(timeout=3600.0)),  # at the agent
             asyncio.create_task(camera.wait_status(_never, 3600.0)),  # here
@@ -250,6 +251,8 @@ async def test_killed_agent_is_seen_at_once_and_everything_goes_on_when_it_is_ba
             kinds = [type(await anext(events)) for _ in range(events.statistics().queued)]
         wanted = {Connected, Disconnected, Reconnected}
         assert [kind for kind in kinds if kind in wanted] == [Disconnected, Reconnected]
+        with pytest.raises(ReservationLostError):
+            await reservation.__aexit__(None, None, None)
 
 
 def _never(_: object) -> bool:
@@ -392,7 +395,7 @@ async def test_what_waits_for_a_loop_that_is_busy_is_bounded(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     bound, size, count = 100_000, 1000, 1000
-    monkeypatch.setattr(_zenoh, "MOST_WAITING", bound)
+    monkeypatch.setattr(_zenoh, "MAX_WAITING_BYTES", bound)
     async with two_ends() as (says, hears):
         heard = await heard_by(says, hears)
         session, done = says._session, threading.Event()
@@ -439,3 +442,93 @@ async def test_end_that_is_closed_says_and_hears_nothing_and_can_be_closed_again
         assert await hears.ask("test/**", b"", 1.0) == []
         await asyncio.sleep(0.1)
         assert heard.payloads == []
+
+
+async def test_program_hears_why_a_camera_is_shared_no_more_before_its_presence_ends() -> None:
+    async with Plant(zenoh=True) as plant, plant.camera() as camera:
+        await camera.trigger()
+        await plant.agent.unshare(NAME, "it is told to")
+        await until(lambda: not camera.connected)
+        assert "the agent agent shares the camera no more: it is told to" in str(camera.trouble)
+
+
+CANCELLED_WHILE_IT_OPENS = """
+import asyncio
+from smartcam._zenoh import BusLink
+from smartcam.fleet._bus.zenoh import ZenohEnd
+
+async def main():
+    opening = asyncio.create_task(ZenohEnd(BusLink(connect=({place!r},))).open(10.0))
+    await asyncio.sleep({wait})
+    opening.cancel()
+    await asyncio.wait({{opening}})
+
+asyncio.run(main())
+print("ended")
+"""
+
+
+async def test_program_that_ends_while_its_bus_opens_is_not_aborted() -> None:
+    """The engine's session comes when nobody wants it; its close once ran into Python's end."""
+    place = free_place()
+    listens = await ZenohEnd(BusLink(listen=(place,))).open(PATIENCE)
+    try:
+        for step in range(10):
+            text = CANCELLED_WHILE_IT_OPENS.format(place=place, wait=0.003 * step)
+            assert await asyncio.to_thread(printed_by, text) == "ended\n"
+    finally:
+        await listens.close()
+
+
+# ---------------------------------------------------------------------- what is patient
+
+
+async def test_flood_of_what_is_patient_neither_delays_nor_fills_up_all_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A viewer's questions are: a command that comes behind thousands of them is next."""
+    async with two_ends() as (listens, connects):
+        came: list[str] = []
+        ended = asyncio.Event()
+
+        def hear(key: str, _: bytes) -> None:
+            came.append(key)
+            if key == "last":
+                ended.set()
+
+        for pattern, patient in (("ask/*", True), ("command", False), ("last", False)):
+            listens.subscribe(pattern, hear, patient=patient)
+        for number in range(2000):
+            listens.in_loop_patiently(hear, 10, f"ask/{number}", b"")
+        listens.in_loop(hear, 10, "command", b"")
+        await until(lambda: len(came) == 2001)
+        assert came[0] == "command"
+        assert came[1:] == [f"ask/{number}" for number in range(2000)]  # in their order
+
+        monkeypatch.setattr(_zenoh, "MAX_WAITING_BYTES", 1000)
+        listens.in_loop_patiently(hear, 990, "ask/x", b"")
+        assert listens.full(20, patient=True)
+        assert not listens.full(20)
+        connects.put("last", b"")
+        async with asyncio.timeout(PATIENCE):
+            await ended.wait()
+
+
+async def test_each_question_waits_as_its_key_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_zenoh, "MAX_WAITING_BYTES", 10_000)
+    async with two_ends() as (listens, connects):
+
+        def answer(question: Any) -> None:
+            question.reply(question.key, b"yes")
+            question.close()
+
+        listens.answer("q/*", answer, patient=lambda key: key.endswith("look"))
+        assert await connects.ask("q/look", b"", PATIENCE) == [("q/look", b"yes")]
+        with listens._lock:
+            listens._patient_bytes += 10_000  # as if so much waited
+        assert await connects.ask("q/look", b"", PATIENCE) == []
+        assert await connects.ask("q/do", b"", PATIENCE) == [("q/do", b"yes")]
+        assert await connects.ask("q/do", bytes(20_000), PATIENCE) == []
+        with listens._lock:
+            listens._patient_bytes -= 10_000
+        assert await connects.ask("q/look", b"", PATIENCE) == [("q/look", b"yes")]

@@ -1,0 +1,757 @@
+"""An agent: it has the sessions with its cameras, and does what programs call for.
+
+Each call has a number of its program's, and is done once however often it arrives; one that comes
+after its deadline is not done at all. Every call is a task of the agent's, which ends with its
+deadline, with the program's cancellation, and with the program itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import functools
+import logging
+import time
+from dataclasses import dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from smartcam._arguments import check_moment, check_seconds
+from smartcam._finishing import close_all
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectionLostError,
+    LocalProtocolError,
+    ProtocolError,
+    ReservationLostError,
+    SmartCamError,
+    UnsupportedError,
+)
+from smartcam.fleet._agent.bundle import AgentBundle
+from smartcam.fleet._agent.calls import ACTIONS, PASSES_GATE, ProgramCall, now
+from smartcam.fleet._agent.claims import Claims
+from smartcam.fleet._agent.host import Host
+from smartcam.fleet._agent.shared import Owner
+from smartcam.fleet._agent.summary import Summaries
+from smartcam.fleet._bus.errors import late, to_fields
+from smartcam.fleet._bus.keys import COMMANDS
+from smartcam.fleet._bus.wire import (
+    BusMessage,
+    TriggerOrder,
+    decode,
+    decode_order,
+    encode,
+    encode_outcome,
+    grace,
+)
+from smartcam.fleet._frames.camera_frames import NO_FRAMES, SharedFrames
+from smartcam.fleet._frames.encoding import FrameEncoder
+from smartcam.fleet._frames.sender import FrameSender
+from smartcam.fleet._json.plain import Plain
+from smartcam.fleet._operations.trigger_counts import RESULT, Totals, outcome_of
+from smartcam.fleet._program.program_name import ROLES_OF_NAMES, ProgramName
+from smartcam.fleet._security.certificates import VIEWER
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+    from typing import Self
+
+    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.fleet._bus.bus import Bus, Handle
+    from smartcam.fleet._bus.keys import Keys
+    from smartcam.fleet._file.standby import Standby
+    from smartcam.fleet._frames.camera_frames import FramesOf
+    from smartcam.models import CameraEvent
+    from smartcam.observers import Observer
+    from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+MAX_PROGRAMS_PER_ROLE = 4096
+"""Programs of each role that may be here at a time; a crowd of one role keeps no other out."""
+
+PRESENCE_WITHIN = 10.0
+"""Seconds behind its first call within which a program's presence must be seen: the call may have
+come before it. One without presence is forgotten then, as nobody would see that it is gone."""
+
+MAX_CALLS_PER_PROGRAM = 256
+"""Calls of one program that may be under way at a time, for each camera of the agent; questions
+and commands each."""
+
+MAX_QUESTIONS_PER_ROLE = 16 * MAX_CALLS_PER_PROGRAM
+"""Questions of all programs of one role that may be under way at a time, for each camera."""
+
+KNOWN_CALLS = 4096
+"""Numbers of calls that are remembered for each program; older ones are not done any more."""
+
+KNOWN_CAMERAS = 1000
+"""Cameras shared no more whose numbers go on where they ended, should they come back."""
+
+FIRST_TRY = 30.0
+"""Seconds that the first try to reach a camera is waited for at the start."""
+
+
+WORD_AHEAD = 0.02
+"""Seconds from what is said last of a camera to the end of its presence, which the engine would
+let overtake it."""
+
+
+class CallNumbers:
+    """Numbers of the calls that were seen.
+
+    Args:
+        floor: number up to which all calls count as seen.
+    """
+
+    def __init__(self, floor: int = 0) -> None:
+        self.floor = floor
+        self._known: set[int] = set()
+
+    @property
+    def last(self) -> int:
+        """The highest number that was seen."""
+        return max(self._known, default=self.floor)
+
+    def is_new(self, call: int) -> bool:
+        """Return True if a call was not seen before; the call is known from now on."""
+        if call <= self.floor or call in self._known:
+            return False
+        self._known.add(call)
+        if len(self._known) > KNOWN_CALLS:
+            kept = sorted(self._known)[KNOWN_CALLS // 2 :]
+            self.floor = kept[0] - 1
+            self._known = set(kept)
+        return True
+
+
+@dataclass(eq=False)
+class Guest:
+    """A program that calls.
+
+    Questions and commands are kept apart: neither keeps the other from being done.
+
+    Attributes:
+        who: name and secret of the program.
+        number: number of the program in the results of its triggers.
+        present: whether the program's presence was seen.
+        questions, commands: numbers of its calls of each kind.
+        tasks: calls under way, by kind (True: a command) and number.
+        under_way: numbers of questions and of commands among ``tasks``.
+        entered: applications to go back to after the program's temporary switches.
+        told: number up to which the program's replies have told it of states, by camera.
+    """
+
+    who: ProgramName
+    number: int
+    present: bool
+    questions: CallNumbers = field(default_factory=CallNumbers)
+    commands: CallNumbers = field(default_factory=CallNumbers)
+    tasks: dict[tuple[bool, int], asyncio.Task[None]] = field(
+        default_factory=dict[tuple[bool, int], "asyncio.Task[None]"]
+    )
+    under_way: list[int] = field(default_factory=lambda: [0, 0])
+    entered: dict[tuple[str, int], Any] = field(default_factory=dict[tuple[str, int], Any])
+    told: dict[str, int] = field(default_factory=dict[str, int])
+
+    @property
+    def last(self) -> int:
+        """The highest number of a call that was seen."""
+        return max(self.questions.last, self.commands.last)
+
+    def is_new(self, call: int, command: bool) -> bool:
+        """Return True if a call was not seen before; the call is known from now on."""
+        return (self.commands if command else self.questions).is_new(call)
+
+    def begin(self, command: bool, call: int, task: asyncio.Task[None]) -> None:
+        """Count a call as under way."""
+        self.tasks[command, call] = task
+        self.under_way[command] += 1
+
+    def end(self, command: bool, call: int) -> asyncio.Task[None] | None:
+        """Count a call as under way no more; return its task, None where it was counted before."""
+        task = self.tasks.pop((command, call), None)
+        if task is not None:
+            self.under_way[command] -= 1
+        return task
+
+
+class Agent:
+    """Shares cameras over a bus.
+
+    Args:
+        name: name of the agent.
+        keys: keys of the fleet.
+        bus: the agent's own end of the bus.
+        cameras: options of the client of each camera, by the camera's name.
+        history: numbers of results and of bytes that are kept for each camera at most.
+        on_event: callback for what happens to the cameras.
+        frames: sources of frames, by camera's name, for the cameras that have any.
+        observers: observers of all sessions.
+        standby: settings of standing by for cameras that others have; None: the agent does not.
+        on_retired: callback for the end of all cameras, since another agent has the name.
+        calibrations: calibrations of the cameras; None where there is no folder for them.
+
+    Attributes:
+        retired_by: why the agent has no cameras any more.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        keys: Keys,
+        bus: Bus,
+        cameras: dict[str, CameraSettings],
+        *,
+        history: tuple[int, int] = (10_000, 1 << 24),
+        on_event: Callable[[CameraEvent], None] = lambda _: None,
+        frames: Mapping[str, FramesOf] | None = None,
+        observers: Iterable[Observer] = (),
+        standby: Standby | None = None,
+        on_retired: Callable[[ConfigurationError], None] = lambda _: None,
+        calibrations: CalibrationDesks | None = None,
+    ) -> None:
+        self.name = name
+        self.retired_by: ConfigurationError | None = None
+        self._on_retired = on_retired
+        self._frames = dict(frames or {})
+        self._observers = tuple(observers)
+        self._sender, self._encoder = FrameSender(bus, keys), FrameEncoder()
+        self.epoch: int = time.time_ns()
+        self._keys, self._bus = keys, bus
+        self._cameras, self._history, self._on_event = cameras, history, on_event
+        self.hosts: dict[str, Host] = {}
+        self._programs: dict[str, Guest] = {}
+        # of each role: programs that are present, by their tokens; and those that left, oldest
+        # first, with their last call
+        self._present = collections.defaultdict[str, set[str]](set)
+        self._gone = collections.defaultdict[str, dict[str, int]](dict)
+        self._of_role: collections.Counter[str] = collections.Counter()  # programs that are here
+        self._questions: collections.Counter[str] = collections.Counter()  # of theirs, under way
+        self._numbers = 0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._declared: list[Handle] = []
+        self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
+        self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
+        self._plain = Plain(self, keys, bus, calibrations)
+        self.leaving: set[Host] = set()  # are being closed
+        self.past: Totals = Totals()  # of cameras shared no more
+        self._summaries = Summaries(self, keys, bus)
+        self._bundle = AgentBundle(name, self.epoch, keys, bus)
+        self.stands_by: bool = standby is not None
+        self._claims = Claims(self, keys, bus, standby)
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus, and begin to have sessions with the cameras.
+
+        Raises:
+            ConnectFailedError: there is no bus within ``timeout`` seconds.
+            ConfigurationError: an option of a camera cannot work, or another agent has it and
+                neither stands by; or another agent has this one's name.
+        """
+        await self._bus.open(timeout)
+        keys, bus, declared = self._keys, self._bus, self._declared
+        try:
+            await self._claims.refuse_namesake(timeout)
+            declared.append(bus.watch(keys.program("*"), self._on_program))
+            for role in (None, *ROLES_OF_NAMES):
+                pattern, hear = self._calls_of(role, "**"), self._hears(role)
+                declared.append(bus.subscribe(pattern, hear, patient=role == VIEWER))
+            self._plain.open()
+            self._summaries.open()
+            self._bundle.open()
+            await self._claims.claim_name(timeout)
+            declared.append(bus.be_present(keys.agent(self.name)))
+            await self._claims.open(self._cameras, timeout)
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def close(self) -> None:
+        """Leave the bus, end calls and sessions; bounded. Idempotent.
+
+        Cancellation: the sessions' links are dropped at once; the bus is left nevertheless.
+        """
+        declared, self._declared = self._declared, []
+        self._claims.close()
+        self._plain.close()
+        self._summaries.close()
+        for handle in (*declared, *(token for token, _ in self._shared.values())):
+            handle.close()
+        for program in [*self._programs]:
+            self._forget(program, going_back=False)
+        for task in tuple(self._tasks):
+            task.cancel()
+        try:
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            try:
+                await close_all(host.close for host in self.hosts.values())
+            except Exception:
+                logger.exception("%s ! a camera did not close", self.name)
+            await self._encoder.close()
+        finally:
+            self._bundle.close()
+            self._sender.close()
+            await self._bus.close()
+
+    def retire(self, why: ConfigurationError) -> None:
+        """End the sessions, and be no agent any more: another one has this name."""
+        if self.retired_by is not None:
+            return
+        logger.error("%s ! %s", self.name, why)
+        self.retired_by = why
+        self.begin(self._retire(why), "smartcam.fleet.retire")
+
+    async def _retire(self, why: ConfigurationError) -> None:
+        declared, self._declared = self._declared, []
+        self._claims.close()
+        self._plain.close()
+        self._summaries.close()
+        for handle in declared:
+            handle.close()
+        said = "another agent has its name"
+        try:
+            await close_all(functools.partial(self.unshare, name, said) for name in [*self.hosts])
+        except Exception:
+            logger.exception("%s ! a camera did not close", self.name)
+        finally:
+            self._on_retired(why)
+
+    def share(self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None) -> Host:
+        """Begin to have a session with a camera, and to share it.
+
+        Args:
+            name: name of the camera.
+            settings: settings of the client that has the session.
+            frames_of: source of the camera's frames; None for none.
+
+        Raises:
+            ConfigurationError: an option of the camera cannot work.
+        """
+        bus, keys, topics = self._bus, self._keys, self._plain.topics
+        if frames_of is not None:
+            self._frames[name] = frames_of
+        found = self._frames.get(name, NO_FRAMES)
+        frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
+        events = self._on_camera_event
+        host = Host(
+            name,
+            settings,
+            bus,
+            keys,
+            self.epoch,
+            self._history,
+            events,
+            topics,
+            frames,
+            self._bundle,
+            self._observers,
+        )
+        host.numbers = self._numbers_at.pop(name, host.numbers)
+        host.began, host.final = host.results.following, not self.stands_by
+        self.hosts[name] = host
+        running = self.begin(host.run(), f"smartcam.fleet.{name}")
+        self._shared[name] = bus.be_present(keys.camera(self.name, name)), running
+        return host
+
+    async def want(
+        self, name: str, settings: CameraSettings, frames_of: FramesOf | None = None
+    ) -> None:
+        """Share one more camera, or stand by for it.
+
+        Raises:
+            ConfigurationError: an option of it cannot work; or another agent has it.
+        """
+        if self.retired_by is not None:
+            raise self.retired_by.with_traceback(None)
+        if frames_of is not None:
+            self._frames[name] = frames_of
+        await self._claims.want(name, settings)
+
+    async def refuse_taken(self, name: str, settings: CameraSettings) -> None:
+        """Raise where the fleet has a camera under another name already.
+
+        Raises:
+            ConfigurationError: it has; says which and whose that is.
+        """
+        await self._claims.refuse_taken({name: settings})
+
+    async def drop(self, name: str, why: str) -> None:
+        """Share a camera no more, nor stand by for it; bounded. Its programs are told ``why``."""
+        self._claims.drop(name)
+        if name in self.hosts:
+            await self.unshare(name, why)
+
+    async def unshare(self, name: str, why: str) -> None:
+        """End the session with a camera, and share it no more; bounded.
+
+        Args:
+            name: name of the camera.
+            why: reason that the camera's programs are told, in words.
+
+        Cancellation: takes effect when it is done.
+        """
+        host = self.hosts.pop(name)
+        host.say_removed(why)  # before its presence ends, which alone would say that we are gone
+        self.leaving.add(host)
+        token, running = self._shared.pop(name)
+        try:
+            try:
+                if not self._bus.local:
+                    await asyncio.sleep(WORD_AHEAD)
+            finally:
+                token.close()
+                running.cancel()
+            await asyncio.wait({running})
+        finally:
+            try:
+                await host.close()
+            finally:
+                self._numbers_at[name] = host.numbers
+                self.leaving.discard(host)
+                self.past.add([host.camera.statistics()])
+        if len(self._numbers_at) > KNOWN_CAMERAS:
+            del self._numbers_at[next(iter(self._numbers_at))]
+
+    @property
+    def programs(self) -> int:
+        """Number of programs that are here."""
+        return len(self._programs)
+
+    @property
+    def calls(self) -> int:
+        """Number of calls of programs that are under way."""
+        return sum(len(guest.tasks) for guest in self._programs.values())
+
+    def _on_camera_event(self, event: CameraEvent) -> None:
+        self._claims.on_event(event)
+        self._on_event(event)
+
+    async def wait_tried(self) -> None:
+        """Wait until each camera was tried once, well or not; bounded."""
+        end = asyncio.get_running_loop().time() + FIRST_TRY
+        for host in tuple(self.hosts.values()):
+            await host.tried(max(0.0, end - asyncio.get_running_loop().time()))
+
+    def begin(self, work: Any, name: str) -> asyncio.Task[None]:
+        """Have something done in a task, which ends with the agent."""
+        task = asyncio.get_running_loop().create_task(work, name=name)
+        self._own(task)
+        return task
+
+    def _own(self, task: asyncio.Task[None]) -> None:
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _end(self, call: asyncio.Task[None]) -> None:
+        """Cancel a call, which nobody else looks after from now on."""
+        self._own(call)
+        call.cancel()
+
+    @property
+    def busy(self) -> bool:
+        """True while a program has a camera reserved, or a command under way."""
+        return (
+            self._plain.busy
+            or any(command for guest in self._programs.values() for command, _ in guest.tasks)
+            or any(host.gate.holder is not None for host in self.hosts.values())
+        )
+
+    # ------------------------------------------------------------------ programs
+
+    def _on_program(self, key: str, present: bool) -> None:
+        token = self._keys.tail(key, "presence/program")[-1]
+        who = ProgramName.of(token)
+        if not who.genuine:
+            return
+        there, guest = self._present[who.role], self._programs.get(who.name)
+        if not present:
+            there.discard(token)
+        elif len(there) < MAX_PROGRAMS_PER_ROLE:
+            there.add(token)
+        if guest is None or guest.who != who:
+            return
+        guest.present = present
+        if not present:
+            self._forget(who.name)
+
+    def _forget(self, program: str, *, going_back: bool = True) -> None:
+        """End all that a program has here: it is gone."""
+        guest = self._programs.pop(program, None)
+        if guest is None:
+            return
+        role = guest.who.role
+        self._of_role[role] -= 1
+        gone = self._gone[role]
+        gone[program] = guest.last
+        if len(gone) > MAX_PROGRAMS_PER_ROLE:
+            del gone[next(iter(gone))]
+        for task in guest.tasks.values():
+            self._end(task)
+        self._sender.forget(program)
+        for host in self.hosts.values():
+            host.gate.forget(program)
+            host.frames.forget(program)
+        if going_back:
+            for camera, before in guest.entered.values():
+                camera.leave(before)
+
+    def _known(self, who: ProgramName) -> Guest | None:
+        """Return a program that is here; None also where another one says its name."""
+        guest = self._programs.get(who.name)
+        return guest if guest is not None and guest.who == who else None
+
+    def _guest(self, who: ProgramName, call: int) -> Guest | None:
+        """Return the program that says hello; None if the program has left since it said so."""
+        known, role = self._known(who), who.role
+        left = self._gone[role].get(who.name, 0)
+        if known is None and call > left:
+            if self._of_role[role] >= MAX_PROGRAMS_PER_ROLE:
+                raise LocalProtocolError(
+                    f"{self.name}: {MAX_PROGRAMS_PER_ROLE} programs of role {role} are here already"
+                )
+            present = who.token in self._present[role]
+            numbers = CallNumbers(left), CallNumbers(left)
+            known = self._programs[who.name] = Guest(who, self.next_program(), present, *numbers)
+            self._of_role[role] += 1
+            if not present:
+                loop = asyncio.get_running_loop()
+                loop.call_later(PRESENCE_WITHIN, self._expect_present, known)
+        return known
+
+    def _expect_present(self, guest: Guest) -> None:
+        """Forget a program whose presence was not seen in time."""
+        if not guest.present and self._programs.get(guest.who.name) is guest:
+            logger.warning("%s ! %s is not present: forgotten", self.name, guest.who.name)
+            self._forget(guest.who.name)
+
+    def next_program(self) -> int:
+        """Return the number of another program, by which results say whose they are."""
+        self._numbers += 1
+        return self._numbers
+
+    # ------------------------------------------------------------------ calls
+
+    def _calls_of(self, role: str | None, camera: str) -> str:
+        """Return the key of the questions of a role; with None that of commands."""
+        keys = self._keys
+        return (
+            keys.command(self.name, camera) if role is None else keys.ask(role, self.name, camera)
+        )
+
+    def _hears(self, role: str | None) -> Callable[[str, bytes], None]:
+        """Return the callback for calls of one kind: a role's questions, or with None commands."""
+        root, command = self._calls_of(role, ""), role is None
+
+        def hear(key: str, payload: bytes) -> None:
+            name = key.removeprefix(root)
+            try:
+                host, order = self.hosts[name], decode_order(payload, "a call")
+                if order is None:
+                    self._on_call(host, decode(payload, "a call"), role)
+                elif command:
+                    self._on_order(host, *order)
+                else:
+                    raise ProtocolError(f"{name}: a trigger is no question")
+            except (ProtocolError, LocalProtocolError, KeyError, TypeError, ValueError) as exc:
+                logger.warning("%s ! a call that cannot be read: %s", name, exc)
+
+        return hear
+
+    def _who(self, token: str, role: str | None) -> ProgramName:
+        """Return the name of the calling program.
+
+        Raises:
+            ProtocolError: the program uses another's name, or a key for another role than its own.
+        """
+        who = ProgramName.of(token)
+        if not who.genuine or role not in {None, who.role}:
+            raise ProtocolError(f"{self.name}: a call as {who.name:.80}, by another program")
+        return who
+
+    def _on_call(self, host: Host, message: BusMessage, role: str | None) -> None:
+        fields, command = message.fields, role is None
+        who, number = self._who(str(fields["program"]), role), int(fields["call"])
+        if "come" in fields:
+            self._sender.come(who.name, number, fields["come"])
+            return
+        if "cancel" in fields:
+            self._cancel(host, who.name, int(fields["cancel"]), command)
+            self._reply(who.name, number, {"answer": {}})
+            return
+        said, timeout = str(fields["do"]), fields.get("timeout", 1.0)
+        deadline = fields.get("deadline")
+        epoch, arguments = fields.get("epoch", self.epoch), fields.get("arguments", {})
+        guest = self._guest(who, number) if said == "hello" else self._known(who)
+        reservation = fields.get("reservation")
+        if reservation is not None:
+            reservation = int(reservation)
+        left = self._admit(
+            host, guest, who.name, number, epoch, said, deadline, timeout, command, reservation
+        )
+        if guest is not None and left is not None:
+            owner = Owner(guest.number, number)
+            blobs, entered = message.blobs, guest.entered
+            call = ProgramCall(
+                host, who.name, owner, arguments, blobs, left, entered, None, reservation
+            )
+            self._start(said, call, guest, command)
+
+    def _on_order(self, host: Host, token: str, order: TriggerOrder) -> None:
+        number, said = order.call, "trigger"
+        program, _, secret = token.partition(".")
+        guest = self._programs.get(program)
+        if guest is None or guest.who.secret != secret:
+            guest, program = None, self._who(token, None).name
+        epoch, deadline, timeout = order.epoch, order.deadline, order.timeout
+        reservation = order.reservation
+        left = self._admit(
+            host, guest, program, number, epoch, said, deadline, timeout, True, reservation
+        )
+        if guest is not None and left is not None:
+            owner, entered = Owner(guest.number, number), guest.entered
+            call = ProgramCall(host, program, owner, {}, [], left, entered, order, reservation)
+            self._start(said, call, guest, True)
+
+    def _admit(
+        self,
+        host: Host,
+        guest: Guest | None,
+        program: str,
+        number: int,
+        epoch: int,
+        said: str,
+        deadline: float | None,
+        timeout: float,
+        command: bool,
+        reservation: int | None,
+    ) -> float | None:
+        """Return the seconds that a call may take; None where it is not done, or not again."""
+        if guest is None or epoch != self.epoch:
+            kind = ConnectionLostError if reservation is None else ReservationLostError
+            stranger = kind(
+                f"{host.name}: the agent {self.name} was restarted, or took this program for "
+                f"gone{'' if reservation is None else ', and lost its reservation'}; {said} was "
+                "not done"
+            )
+            self._reply(program, number, {"error": to_fields(stranger), "stranger": True})
+            return None
+        if not guest.is_new(number, command):
+            return None  # it is done, or under way: a double
+        error: SmartCamError | None = None
+        left = 1.0
+        try:
+            timeout = check_seconds(timeout, "timeout", host.name)
+            if deadline is not None:
+                left = check_moment(deadline, "deadline", host.name) + grace(timeout) / 2 - now()
+        except ConfigurationError as exc:
+            error = exc
+        error = error or self._refusal(host, guest, said, left, command)
+        if error is not None:
+            if said == "trigger":
+                host.triggers[outcome_of(error)] += 1
+            self._reply(program, number, {"error": to_fields(error)})
+            return None
+        return min(timeout, left)
+
+    def _refusal(
+        self, host: Host, guest: Guest, said: str, left: float, command: bool
+    ) -> SmartCamError | None:
+        """Return why a call is not done, None where it is."""
+        if said not in ACTIONS or (said in COMMANDS) != command:
+            return UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
+        if left < 0:
+            return late(said, f"{host.name}: {said} came after its deadline; it was not done")
+        cameras = len(self.hosts)
+        if not command and self._questions[guest.who.role] >= MAX_QUESTIONS_PER_ROLE * cameras:
+            return LocalProtocolError(
+                f"{host.name}: too many questions of role {guest.who.role} are under way"
+            )
+        if guest.under_way[command] >= MAX_CALLS_PER_PROGRAM * cameras:
+            kind = "commands" if command else "questions"
+            return LocalProtocolError(
+                f"{host.name}: {guest.under_way[command]} {kind} of this program are under way"
+            )
+        return None
+
+    def _start(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
+        task = asyncio.get_running_loop().create_task(
+            self._do(said, call, guest, command), name=f"smartcam.fleet.{call.host.name}.{said}"
+        )
+        guest.begin(command, call.owner.call, task)
+        if not command:
+            self._questions[guest.who.role] += 1
+            task.add_done_callback(partial(self._answered, guest.who.role))
+
+    def _answered(self, role: str, _: object) -> None:
+        self._questions[role] -= 1
+
+    def _cancel(self, host: Host, program: str, number: int, command: bool) -> None:
+        guest = self._programs.get(program)
+        if guest is None:
+            return
+        guest.is_new(number, command)  # if it comes yet, it comes too late
+        task = guest.end(command, number)
+        if task is not None:
+            self._end(task)
+        if not command:
+            self._sender.come(program, number, None)
+            return
+        host.gate.release((program, number))
+        entered = guest.entered.pop((host.name, number), None)
+        if entered is not None:  # it was done, and its program does not know
+            camera, before = entered
+            camera.leave(before)
+
+    async def _do(self, said: str, call: ProgramCall, guest: Guest, command: bool) -> None:
+        """Do a call, and reply; a program that has cancelled gets none."""
+        host = call.host
+        inside, outcome = False, "cancelled"
+        try:
+            if call.reservation is not None:
+                host.check_reserved((call.program, call.reservation), said)
+            if said in PASSES_GATE:
+                if not host.gate.goes_in(call.program):
+                    begun = now()
+                    await host.enter(call.program, said, call.timeout)
+                    call = call._replace(timeout=max(0.0, call.timeout - (now() - begun)))
+                inside = True
+            fields, blobs = await ACTIONS[said](call)
+        except Exception as exc:
+            if not isinstance(exc, SmartCamError):
+                logger.exception("%s ! %s failed", host.name, said)
+            reply: dict[str, Any] = {"error": to_fields(exc)}
+            blobs, outcome = [], outcome_of(exc)
+        else:
+            reply, outcome = {"answer": fields}, RESULT
+        finally:
+            if said == "trigger":
+                host.triggers[outcome] += 1
+            if inside:
+                host.gate.leave(call.program)
+            guest.end(command, call.owner.call)
+        if said == "trigger" and blobs:
+            self._reply_to_trigger(call, guest, blobs[0])
+            return
+        host.flush()
+        reply |= {"states": host.states.following, "results": host.results.following}
+        self._reply(call.program, call.owner.call, reply, blobs)
+
+    def _reply_to_trigger(self, call: ProgramCall, guest: Guest, runs: bytes) -> None:
+        """Reply, with the states that nobody was told of; others hear of them a little later."""
+        host, following = call.host, call.host.states.following
+        told = host.untold(guest.told.get(host.name, 0))
+        guest.told[host.name] = following
+        host.flush(states=not told)
+        if told and len(self._programs) == 1:
+            host.forget_fresh()
+        reply = encode_outcome(call.owner.call, self.epoch, now(), following, told, runs)
+        self._bus.put(self._keys.reply(call.program), reply)
+
+    def _reply(
+        self, program: str, number: int, fields: dict[str, Any], blobs: list[bytes] | None = None
+    ) -> None:
+        said = {"call": number, "epoch": self.epoch, "clock": now(), **fields}
+        self._bus.put(self._keys.reply(program), encode(said, blobs or ()))

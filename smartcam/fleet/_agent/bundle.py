@@ -1,0 +1,165 @@
+"""Results of all cameras of an agent in one message, for programs that hear them all.
+
+With a message for each camera a result costs what its message costs. So an agent has one more key,
+under which the results of all its cameras go together, if anybody hears it. Bundles are numbered:
+who finds that one is missing asks where each camera's numbers stand.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from smartcam.fleet._bus.bus import Bus, Publisher
+    from smartcam.fleet._bus.keys import Keys
+
+GATHER = 0.005
+"""Seconds between two bundles, at least."""
+
+FULL = 1 << 15
+"""Bytes of results with which a bundle goes at once."""
+
+REMINDERS = (0.05, 0.2, 1.0, 5.0)
+"""Seconds behind the last bundle after which the next number is told again."""
+
+_HEAD = struct.Struct("<4sQQQI")
+_PART = struct.Struct("<HI")
+_MAGIC = b"scb1"
+
+
+class Bundled(NamedTuple):
+    """A bundle.
+
+    Attributes:
+        epoch: number of the agent's start.
+        number: number of the bundle; an empty bundle has the number of the next one.
+        following: number of the next bundle.
+        parts: cameras, and their results as :func:`encode_runs` gives them.
+    """
+
+    epoch: int
+    number: int
+    following: int
+    parts: list[tuple[str, bytes]]
+
+
+def decode_bundle(payload: bytes, what: str) -> Bundled:
+    """Return the bundle in ``payload``.
+
+    Raises:
+        RemoteProtocolError: it is none; ``what`` is said to be broken.
+    """
+    try:
+        magic, epoch, number, following, count = _HEAD.unpack_from(payload)
+        if magic != _MAGIC:
+            raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
+        place, parts = _HEAD.size, list[tuple[str, bytes]]()
+        for _ in range(count):
+            name, size = _PART.unpack_from(payload, place)
+            begin = place + _PART.size + name
+            place = begin + size
+            if place > len(payload):
+                raise ValueError(f"{place} bytes were announced, {len(payload)} came")
+            parts.append((str(payload[begin - name : begin], "utf-8"), payload[begin:place]))
+        if place != len(payload):
+            raise ValueError(f"{len(payload) - place} bytes are left over")
+    except (ValueError, struct.error) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return Bundled(epoch, number, following, parts)
+
+
+class AgentBundle:
+    """Says the results of an agent's cameras together.
+
+    Args:
+        agent: the agent's name.
+        epoch: number of the agent's start.
+        keys: keys of the fleet.
+        bus: the agent's end of the bus.
+    """
+
+    def __init__(self, agent: str, epoch: int, keys: Keys, bus: Bus) -> None:
+        self._key, self._epoch, self._bus = keys.bundle(agent), epoch, bus
+        self._out: Publisher | None = None
+        self._fresh: list[bytes] = []
+        self._count, self._bytes, self._number = 0, 0, 1
+        self._said_at = -math.inf
+        self._due: asyncio.Handle | None = None
+        self._reminder: asyncio.TimerHandle | None = None
+
+    def open(self) -> None:
+        """Begin to look whether anybody hears."""
+        self._out = self._bus.publisher(self._key, self._on_heard)
+
+    def close(self) -> None:
+        """Send the results that are left, and stop sending. Idempotent."""
+        self.flush()
+        out, self._out = self._out, None
+        self._end_reminding()
+        if out is not None:
+            out.close()
+
+    @property
+    def heard(self) -> bool:
+        """True if anybody hears the bundles."""
+        return self._out is not None and self._out.heard
+
+    def add(self, camera: str, runs: bytes) -> None:
+        """Have a camera's results said soon, with those of others."""
+        name = camera.encode()
+        self._fresh += (_PART.pack(len(name), len(runs)), name, runs)
+        self._count += 1
+        self._bytes += len(runs)
+        if self._bytes >= FULL:
+            self.flush()
+        elif self._due is None:
+            loop = asyncio.get_running_loop()
+            at = self._said_at + GATHER
+            self._due = (
+                loop.call_at(at, self.flush) if at > loop.time() else loop.call_soon(self.flush)
+            )
+
+    def flush(self) -> None:
+        """Send the results that were added and not sent yet."""
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
+        if self._fresh and self._out is not None:
+            self._said_at = asyncio.get_running_loop().time()
+            fresh, count = self._fresh, self._count
+            self._fresh, self._count, self._bytes = [], 0, 0
+            number, self._number = self._number, self._number + 1
+            self._put(number, count, fresh)
+            self._remind(0)
+
+    def _put(self, number: int, count: int, parts: list[bytes]) -> None:
+        if self._out is not None:
+            head = _HEAD.pack(_MAGIC, self._epoch, number, self._number, count)
+            self._out.put(b"".join((head, *parts)))
+
+    def _on_heard(self, heard: bool) -> None:
+        if heard:
+            self._remind(0)
+
+    def _end_reminding(self) -> None:
+        if self._reminder is not None:
+            self._reminder.cancel()
+            self._reminder = None
+
+    def _remind(self, step: int) -> None:
+        """Tell the next number again in a while; after the last reminder, no more."""
+        self._end_reminding()
+        if step < len(REMINDERS):
+            loop = asyncio.get_running_loop()
+            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+
+    def _say_number(self, step: int) -> None:
+        self._reminder = None
+        if self.heard:
+            self._put(self._number, 0, [])
+            self._remind(step)

@@ -1,0 +1,437 @@
+"""The calls that an agent takes from programs: the name, the effect, and which are commands."""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+
+from smartcam._arguments import (
+    MAX_APPLICATION_ID,
+    check_age,
+    check_application,
+    check_application_or_name,
+    check_flag,
+    check_integer,
+    check_message_id,
+    check_moment,
+    check_text,
+    wrong_argument,
+)
+from smartcam._client._inside import TriggerRequest
+from smartcam.camera import MAX_RESULTS_PER_TRIGGER, MAX_SEQUENCE_NUMBER
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._agent.shared import Carrier, Owner
+from smartcam.fleet._bus.keys import COMMANDS
+from smartcam.fleet._bus.wire import TriggerOrder, encode_runs
+from smartcam.fleet._frames.stream import FrameOrder
+from smartcam.fleet._frames.wire import MAX_BITRATE, MIN_BITRATE, FrameForm
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.fleet._agent.host import Host
+
+T = TypeVar("T")
+
+Answer = tuple[dict[str, Any], list[bytes]]
+NOTHING: Answer = ({}, [])
+MAX_REPLY_BYTES = 1 << 20
+"""Bytes of results, or of states, that one reply brings at most."""
+
+
+class ProgramCall(NamedTuple):
+    """A call under way.
+
+    Attributes:
+        host: the camera that it is for.
+        program: name of the calling program.
+        owner: numbers of the program and of its call.
+        arguments: arguments of the call, by name.
+        blobs: byte strings that came with the call.
+        timeout: seconds that the call may take.
+        entered: applications to go back to of this program's temporary switches, by their call.
+        order: a trigger that came in numbers; in place of arguments.
+        reservation: the call that made the reservation in whose block it is; None outside of one.
+    """
+
+    host: Host
+    program: str
+    owner: Owner
+    arguments: dict[str, Any]
+    blobs: list[bytes]
+    timeout: float
+    entered: dict[tuple[str, int], Any]
+    order: TriggerOrder | None = None
+    reservation: int | None = None
+
+    def argument(self, name: str, check: Callable[..., T], *bounds: Any) -> T | None:
+        """Return an argument; None where it is not said.
+
+        Args:
+            name: name of the argument.
+            check: function of :mod:`smartcam._arguments` that checks the value.
+            bounds: further arguments of ``check``.
+
+        Raises:
+            ConfigurationError: the value cannot work.
+        """
+        value = self.arguments.get(name)
+        return None if value is None else check(value, name, *bounds, who=self.host.name)
+
+    def wanted(self, name: str, check: Callable[..., T], *bounds: Any) -> T:
+        """Return an argument that has to be there."""
+        value = self.argument(name, check, *bounds)
+        if value is None:
+            raise ConfigurationError(f"{self.host.name}: {name} is missing")
+        return value
+
+
+def _check_layouts(value: object, what: str, who: str) -> Any:
+    """Return the layouts with a number in them: one, or one for each application."""
+    if not isinstance(value, dict):
+        return check_text(value, what, who)
+    try:
+        return {
+            int(key): check_text(text, what, who)
+            for key, text in cast("dict[str, object]", value).items()
+        }
+    except ValueError as exc:
+        raise wrong_argument(what, "layouts by application id", value, who) from exc
+
+
+_PLAIN = Carrier()
+
+
+async def _trigger(call: ProgramCall) -> Answer:
+    order = call.order
+    layouts = None
+    if order is not None:
+        data, wait, each = order.data, order.wait, order.by_application
+        results: object = order.results
+        application, expected = order.application, order.expected
+    else:
+        layouts = call.argument("layouts", _check_layouts)
+        data = call.blobs[0] if call.blobs else None
+        results, wait = call.arguments.get("results"), call.wanted("wait", check_flag)
+        each = bool(call.argument("by_application", check_flag))
+        application, expected = call.arguments.get("application"), call.arguments.get("expected")
+    wanted = check_integer(results, "results", 1, MAX_RESULTS_PER_TRIGGER, call.host.name)
+    if application is not None:
+        application = check_application(application, "application", call.host.name)
+    if expected is not None:  # below 0 where the camera does not say its program's id
+        expected = check_integer(expected, "expected", -1, MAX_APPLICATION_ID, call.host.name)
+    if layouts is None and not each:
+        carrier = _PLAIN.of(call.owner)
+    else:
+        carrier = Carrier(call.owner, layouts, by_application=each)
+    request = TriggerRequest(carrier, data, wanted, wait, expected)
+    runs = await outcomes(call.host, call.owner, request, application, call.timeout)
+    return {}, [encode_runs(0, call.host.results.following, runs)]
+
+
+async def outcomes(
+    host: Host,
+    owner: Owner,
+    request: TriggerRequest,
+    application: int | None,
+    timeout: float,
+) -> list[bytes]:
+    """Trigger for somebody, and return the runs that came of it.
+
+    The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is whose trigger it is.
+    """
+    runs: list[bytes] = []
+    host.outcomes[owner] = runs
+    try:
+        await host.require().trigger_for(request, application, timeout)
+    finally:
+        del host.outcomes[owner]
+    return runs
+
+
+async def _switch_application(call: ProgramCall) -> Answer:
+    camera = call.host.require()
+    await camera.switch_application(
+        call.wanted("application", check_application_or_name), timeout=call.timeout
+    )
+    return {"application": camera.active_application}, []
+
+
+async def _ensure(call: ProgramCall) -> Answer:
+    await call.host.require().ensure(call.wanted("application", check_application), call.timeout)
+    return NOTHING
+
+
+async def _enter(call: ProgramCall) -> Answer:
+    before = await call.host.require().enter(
+        call.wanted("application", check_application), call.timeout
+    )
+    call.entered[call.host.name, call.owner.call] = (call.host.camera, before)
+    return {"before": before.application, "wanted": before.wanted.application}, []
+
+
+async def _leave(call: ProgramCall) -> Answer:
+    found = call.entered.pop((call.host.name, call.wanted("entered", check_integer, 0)), None)
+    if found is not None:
+        camera, before = found
+        if call.argument("wait", check_flag) is False:
+            camera.leave(before)  # a failure is told by the next command
+        else:
+            await camera.leave_and_wait(before)
+    return NOTHING
+
+
+async def _start(call: ProgramCall) -> Answer:
+    await call.host.require().start(timeout=call.timeout)
+    return NOTHING
+
+
+async def _stop(call: ProgramCall) -> Answer:
+    await call.host.require().stop(timeout=call.timeout)
+    return NOTHING
+
+
+async def _query_application(call: ProgramCall) -> Answer:
+    return {"application": await call.host.require().query_application(timeout=call.timeout)}, []
+
+
+async def _query_status(call: ProgramCall) -> Answer:
+    return {"status": int(await call.host.require().query_status(timeout=call.timeout))}, []
+
+
+async def _wait_ready(call: ProgramCall) -> Answer:
+    return {"status": int(await call.host.require().wait_ready(timeout=call.timeout))}, []
+
+
+async def _reset_errors(call: ProgramCall) -> Answer:
+    return {"status": int(await call.host.require().reset_errors(timeout=call.timeout))}, []
+
+
+async def _read_image(call: ProgramCall) -> Answer:
+    return {}, [await call.host.require().read_image(timeout=call.timeout)]
+
+
+async def _get_clock(call: ProgramCall) -> Answer:
+    return {"clock": (await call.host.require().get_clock(timeout=call.timeout)).isoformat()}, []
+
+
+async def _set_clock(call: ProgramCall) -> Answer:
+    text = call.wanted("when", check_text)
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError as exc:
+        raise ConfigurationError(f"{call.host.name}: {text!r:.80} is no time") from exc
+    await call.host.require().set_clock(when)
+    return NOTHING
+
+
+async def _set_input(call: ProgramCall) -> Answer:
+    await call.host.require().set_input(call.blobs[0] if call.blobs else b"")
+    return NOTHING
+
+
+async def _set_sequence_number(call: ProgramCall) -> Answer:
+    await call.host.require().set_sequence_number(
+        call.wanted("number", check_integer, 0, MAX_SEQUENCE_NUMBER)
+    )
+    return NOTHING
+
+
+async def _reboot(call: ProgramCall) -> Answer:
+    await call.host.require().reboot()
+    return NOTHING
+
+
+async def _take_back(call: ProgramCall) -> Answer:
+    """Have a camera that another client took tried again now, and wait for its session."""
+    camera = call.host.require()
+    camera.take_again()
+    await camera.wait_connected(call.timeout)
+    return NOTHING
+
+
+async def _request(call: ProgramCall) -> Answer:
+    answer = await call.host.require().request(
+        call.wanted("message_id", check_message_id),
+        call.blobs[0] if call.blobs else b"",
+        answered=call.argument("answered", check_flag),
+        timeout=call.timeout,
+    )
+    return {}, [] if answer is None else [answer]
+
+
+MAX_FRAME_INTERVAL = 3600.0
+"""Seconds from one frame of a stream to the next that a program may ask for at most."""
+
+
+def _frame_order(call: ProgramCall, *, stream: bool = False) -> FrameOrder:
+    encoding = FrameForm.checked(
+        call.argument("encoding", check_text) or "raw",
+        call.argument("quality", check_integer, 1, 100),
+        call.host.name,
+        bitrate=call.argument("bitrate", check_integer, MIN_BITRATE, MAX_BITRATE),
+        stream=stream,
+    )
+    rest = min(MAX_FRAME_INTERVAL, call.argument("rest", check_age) or 0.0)
+    have = call.argument("have", check_integer, 0) or 0
+    return FrameOrder(call.program, call.owner.call, encoding, call.timeout, rest, have)
+
+
+async def _frame(call: ProgramCall) -> Answer:
+    return await call.host.frames.one(
+        _frame_order(call),
+        max_age=call.argument("max_age", check_age),
+        after=call.argument("after", check_moment),
+        fresh=bool(call.argument("fresh", check_flag)),
+    ), []
+
+
+async def _next_frame(call: ProgramCall) -> Answer:
+    return await call.host.frames.next(
+        _frame_order(call, stream=True), call.wanted("stream", check_integer, 0)
+    ), []
+
+
+async def _leave_frames(call: ProgramCall) -> Answer:
+    call.host.frames.leave(call.program, call.wanted("stream", check_integer, 0))
+    return NOTHING
+
+
+async def _about_frames(call: ProgramCall) -> Answer:
+    return await call.host.frames.about(call.timeout), []
+
+
+async def _trigger_frame(call: ProgramCall) -> Answer:
+    wait = call.argument("wait", check_flag)
+    return await call.host.frames.trigger(_frame_order(call), wait=wait is not False), []
+
+
+async def _features(call: ProgramCall) -> Answer:
+    return await call.host.frames.features(
+        call.argument("name", check_text),
+        call.timeout,
+        names_only=bool(call.argument("names_only", check_flag)),
+        value_only=bool(call.argument("value_only", check_flag)),
+    ), []
+
+
+async def _set_feature(call: ProgramCall) -> Answer:
+    name, value = call.wanted("name", check_text), call.arguments.get("value")
+    return await call.host.frames.set_feature(name, value, call.timeout), []
+
+
+async def _execute_feature(call: ProgramCall) -> Answer:
+    await call.host.frames.execute_feature(call.wanted("name", check_text), call.timeout)
+    return NOTHING
+
+
+async def _lens(call: ProgramCall) -> Answer:
+    return call.host.frames.lens(call.wanted("lens", check_integer, 0)), []
+
+
+async def _refresh(call: ProgramCall) -> Answer:
+    return {"asked": await call.host.require().refresh(call.timeout)}, []
+
+
+async def _wait_connected(call: ProgramCall) -> Answer:
+    await call.host.require().wait_connected(call.timeout)
+    return NOTHING
+
+
+async def _reserve(call: ProgramCall) -> Answer:
+    reservation = (call.program, call.owner.call)
+    await call.host.reserve(call.program, reservation, call.timeout)
+    return NOTHING
+
+
+async def _release(call: ProgramCall) -> Answer:
+    call.host.gate.release((call.program, call.wanted("reservation", check_integer, 0)))
+    return NOTHING
+
+
+async def _reserved(call: ProgramCall) -> Answer:
+    reservation = (call.program, call.wanted("reservation", check_integer, 0))
+    return {"reserved": await call.host.keeps(reservation, call.timeout)}, []
+
+
+async def _hello(call: ProgramCall) -> Answer:
+    host = call.host
+    return {
+        **host.about(),
+        **host.state(),
+        "program": call.owner.program,
+        "frames": host.frames.make is not None,
+        "results": host.results.following,
+        "began": host.began,
+        "states": host.states.following,
+    }, []
+
+
+async def _find(call: ProgramCall) -> Answer:
+    """Find the first result that came since a time of the agent's clock."""
+    results = call.host.results
+    since = call.wanted("since", check_moment)
+    return {"first": results.first_since(since), "following": results.following}, []
+
+
+async def _results(call: ProgramCall) -> Answer:
+    part = call.host.results.part(call.wanted("first", check_integer, 0), MAX_REPLY_BYTES)
+    return {"first": part.first, "following": part.following}, [
+        encode_runs(0, part.following, part.data)
+    ]
+
+
+async def _states(call: ProgramCall) -> Answer:
+    part = call.host.states.part(call.wanted("first", check_integer, 0), MAX_REPLY_BYTES)
+    return {"first": part.first, "following": part.following}, part.data
+
+
+ACTIONS: dict[str, Callable[[ProgramCall], Awaitable[Answer]]] = {
+    "hello": _hello,
+    "find": _find,
+    "results": _results,
+    "states": _states,
+    "refresh": _refresh,
+    "reserve": _reserve,
+    "reserved": _reserved,
+    "release": _release,
+    "query_application": _query_application,
+    "query_status": _query_status,
+    "wait_connected": _wait_connected,
+    "wait_ready": _wait_ready,
+    "read_image": _read_image,
+    "get_clock": _get_clock,
+    "about_frames": _about_frames,
+    "frame": _frame,
+    "next_frame": _next_frame,
+    "leave_frames": _leave_frames,
+    "lens": _lens,
+    "trigger_frame": _trigger_frame,
+    "features": _features,
+    "set_feature": _set_feature,
+    "execute_feature": _execute_feature,
+    "leave": _leave,
+    "trigger": _trigger,
+    "switch_application": _switch_application,
+    "ensure": _ensure,
+    "enter": _enter,
+    "start": _start,
+    "stop": _stop,
+    "reset_errors": _reset_errors,
+    "set_clock": _set_clock,
+    "set_input": _set_input,
+    "set_sequence_number": _set_sequence_number,
+    "reboot": _reboot,
+    "take_back": _take_back,
+    "request": _request,
+}
+"""The function of each call, by the call's name."""
+
+PASSES_GATE = COMMANDS - {"reserve", "release", "leave"}
+"""Commands that wait while another program has the camera reserved."""
+
+
+def now() -> float:
+    """Return the agent's clock, its loop's, seconds; only differences mean anything."""
+    return asyncio.get_running_loop().time()

@@ -1,0 +1,465 @@
+"""Decide which agent of a fleet has a name and a camera, and let one that stands by take over.
+
+Two agents of one name see each other's starts. The earlier start keeps the name; the later one
+gives up its cameras, and says so.
+
+An agent says by its presence that it has a camera. Another one with the same camera either refuses
+to start, or stands by: without a session, until that presence ends. Two that have a camera both,
+behind a split of the network, leave it to the camera, which serves the newcomer: whoever has lost
+its session and sees another's presence asks that agent, and lets it have the camera. Both may let
+go of it at the same time; so who has stopped because the camera was taken, and sees that the other
+one has it no more, stands by again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import logging
+import secrets
+import socket
+from typing import TYPE_CHECKING
+
+from smartcam._zenoh import LEASE_TIME
+from smartcam.exceptions import ConfigurationError, ConnectionTakenError, SmartCamError
+from smartcam.fleet._agent.summary import ask_cameras
+from smartcam.models import Disconnected
+from smartcam.settings import parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.fleet._agent.agent import Agent
+    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._bus.bus import Bus, Handle
+    from smartcam.fleet._bus.keys import Keys
+    from smartcam.fleet._file.standby import Standby
+    from smartcam.models import CameraEvent
+    from smartcam.settings import Address, CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+HOLD_OFF = 0.2
+"""Seconds per step of preference until an agent that stands by takes a camera without agent."""
+
+ASK = 0.5
+"""Seconds for another agent's answer, and between two looks at what it has."""
+
+RESOLVE = 2.0
+"""Seconds for finding the addresses of a host's name."""
+
+RETURN = 4.0
+"""Seconds for others to be back on a bus that was away, before what they had is taken over."""
+
+CONTEST = 30.0
+"""Seconds behind the last word of another agent that has a camera, too, in which it may be that one
+who takes it from us."""
+
+CALM = 600.0
+"""Seconds in which a camera that was taken is not taken again a second time: it may be no agent who
+takes it, and that one would again, too."""
+
+
+class Claims:
+    """The cameras that an agent has, or stands by for.
+
+    Args:
+        agent: the agent.
+        keys: keys of the fleet.
+        bus: the agent's end of the bus.
+        standby: settings of standing by; None: the agent does not stand by.
+
+    Attributes:
+        given_up: why a camera is another agent's now, by its name.
+    """
+
+    def __init__(self, agent: Agent, keys: Keys, bus: Bus, standby: Standby | None) -> None:
+        self._agent, self._keys, self._bus, self._standby = agent, keys, bus, standby
+        self._wanted: dict[str, CameraSettings] = {}
+        self._others: dict[str, set[str]] = {}  # agents that have a camera of ours
+        self._contested: dict[str, float] = {}  # until when it may be one of them who takes it
+        self._calm: dict[str, float] = {}  # until when that is not so, whoever comes and goes
+        self._settling: set[str] = set()
+        self._again: set[str] = set()
+        self._back: dict[str, asyncio.Event] = {}  # another one's presence that is waited for
+        self._watch: Handle | None = None
+        self.given_up: dict[str, ConnectionTakenError] = {}
+        self._start = f"{agent.epoch}-{secrets.token_hex(4)}"
+        self._name: list[Handle] = []
+
+    async def refuse_namesake(self, timeout: float) -> None:
+        """Raise where an agent of this name is there; before anything is said under it.
+
+        Raises:
+            ConfigurationError: one is there, and stays for longer than one that has died would.
+        """
+        loop, name = asyncio.get_running_loop(), self._agent.name
+        patience = loop.time() + LEASE_TIME + 1.0
+        while await self._bus.present(self._keys.agent(name), timeout):
+            if loop.time() > patience:
+                raise ConfigurationError(
+                    f"an agent named {name} is in fleet {self._keys.fleet} already; each has a "
+                    "name of its own: `agent:` in its fleet file"
+                )
+            await asyncio.sleep(ASK)
+
+    async def claim_name(self, timeout: float) -> None:
+        """Have the agent's name from now on, as long as no agent that was started before has it.
+
+        Raises:
+            ConfigurationError: one has it.
+        """
+        keys, bus, name = self._keys, self._bus, self._agent.name
+        self._name.append(bus.be_present(keys.start(name, self._start)))
+        for key in await bus.present(keys.start(name, "*"), timeout):
+            if self._is_earlier(key):
+                raise self._namesake()
+        self._name.append(bus.watch(keys.start(name, "*"), self._on_namesake))
+
+    def _is_earlier(self, key: str) -> bool:
+        """Return True if another start of this name is earlier; of two at once one is."""
+        return _order(self._keys.tail(key, "presence/start")[-1]) < _order(self._start)
+
+    def _namesake(self) -> ConfigurationError:
+        name, fleet = self._agent.name, self._keys.fleet
+        return ConfigurationError(
+            f"an agent named {name} is in fleet {fleet}, which was started before this one: this "
+            "one ends its cameras; each has a name of its own: `agent:` in its fleet file"
+        )
+
+    def _on_namesake(self, key: str, present: bool) -> None:
+        if present and self._is_earlier(key):
+            self._agent.retire(self._namesake())
+        elif present and not key.endswith(f"/{self._start}"):
+            logger.warning(
+                "%s ! another agent of this name was started later: that one ends", self._agent.name
+            )
+        elif not present:
+            for host in self._agent.hosts.values():
+                host.camera.take_again()  # what it took
+
+    async def open(self, cameras: Mapping[str, CameraSettings], timeout: float) -> None:
+        """Have the cameras that no other agent has.
+
+        Raises:
+            ConfigurationError: another one has a camera, and neither stands by; nothing is shared.
+                Or an option of a camera cannot work.
+        """
+        self._wanted = dict(cameras)
+        keys, bus = self._keys, self._bus
+        for key in await bus.present(keys.camera("*", "**"), timeout):
+            self._note(key, True)
+        self._watch = bus.watch(keys.camera("*", "**"), self._on_presence)
+        if self._standby is None:
+            await self._refuse()
+        await self.refuse_taken({n: one for n, one in cameras.items() if not self._others.get(n)})
+        for name, settings in cameras.items():
+            if self._others.get(name):
+                self._consider(name)
+            else:
+                self._agent.share(name, settings)
+
+    async def want(self, name: str, settings: CameraSettings) -> None:
+        """Have one more camera, at once or when no other agent has it.
+
+        Raises:
+            ConfigurationError: another one has it, and this one does not stand by.
+        """
+        self._wanted[name] = settings
+        for key in await self._bus.present(self._keys.camera("*", name), ASK):
+            self._note(key, True)
+        others = self._others.get(name)
+        if not others:
+            try:
+                await self.refuse_taken({name: settings})
+            except ConfigurationError:
+                self.drop(name)
+                raise
+            self._agent.share(name, settings)
+        elif self._standby is not None:
+            self._consider(name)
+        else:
+            self.drop(name)
+            raise ConfigurationError(
+                f"{name}: the agent {min(others)} has this camera, which serves one"
+            )
+
+    async def refuse_taken(self, cameras: Mapping[str, CameraSettings]) -> None:
+        """Raise where the fleet has a camera of these under another name: it serves one client.
+
+        Nothing happens between the last look at this agent's own cameras and the return. Two agents
+        that look at the same time do not see each other.
+
+        Raises:
+            ConfigurationError: one is taken; says which and by whom.
+        """
+        listing = self._keys.listing("**")
+        answers = await self._bus.ask(listing, b"", ASK) if cameras else ()
+        ports = {one.address.port for one in cameras.values()}
+        there: list[tuple[str, str, Address]] = []
+        for _, payload in answers:
+            try:
+                said = json.loads(payload)
+                address = parse_address(str(said["url"]))
+                if address.port in ports:
+                    there.append((str(said["camera"]), str(said["agent"]), address))
+            except (ValueError, TypeError, KeyError, SmartCamError) as exc:
+                logger.warning("! what an agent says of a camera cannot be read: %s", exc)
+        hosts = {one.address.host for one in cameras.values()}
+        hosts |= {address.host for _, _, address in there}
+        hosts |= {one.settings.address.host for one in self._agent.hosts.values()}
+        found = await _places_of(hosts)
+        there += [
+            (name, self._agent.name, one.settings.address)
+            for name, one in self._agent.hosts.items()
+        ]
+        taken: dict[tuple[str, int], list[tuple[str, str]]] = {}
+        for camera, agent, address in there:
+            for place in found.get(address.host, {address.host}):
+                taken.setdefault((place, address.port), []).append((camera, agent))
+        for name, settings in cameras.items():
+            address = settings.address
+            for place in found[address.host]:
+                for camera, agent in taken.get((place, address.port), ()):
+                    if camera != name:
+                        raise ConfigurationError(
+                            f"{name}: {address.url} is the camera {camera} of the agent {agent}, "
+                            "and a camera takes one client; use it under that name"
+                        )
+
+    def drop(self, name: str) -> None:
+        """Want a camera no more."""
+        self._wanted.pop(name, None)
+        self._others.pop(name, None)
+        self._contested.pop(name, None)
+        self._calm.pop(name, None)
+        self.given_up.pop(name, None)
+
+    def close(self) -> None:
+        """Claim nothing more. Idempotent."""
+        self._wanted.clear()
+        for handle in self._name:
+            handle.close()
+        self._name.clear()
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+
+    async def _refuse(self) -> None:
+        """Raise where another agent has a camera of ours, and neither is one that stands by.
+
+        One that neither answers nor goes may have died a moment ago: its presence ends with the
+        engine's lease.
+        """
+        loop = asyncio.get_running_loop()
+        patience = loop.time() + LEASE_TIME + 1.0
+        while True:
+            there = {(name, other) for name, others in self._others.items() for other in others}
+            if not there:
+                return
+            told = {
+                (one.summary.camera, one.summary.agent): one.standby
+                for agent in sorted({agent for _, agent in there})
+                for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK)
+            }
+            if all(told.get(one) for one in there):
+                return
+            silent = not there & told.keys()
+            if not silent or loop.time() > patience:
+                name, agent = min(one for one in there if not told.get(one))
+                more = f", and {len(there) - 1} more cameras" if len(there) > 1 else ""
+                says = ", which does not answer" if silent else ""
+                raise ConfigurationError(
+                    f"{name}: the agent {agent} of fleet {self._keys.fleet}{says} has this camera "
+                    f"already{more}; a camera has one agent. `standby: true` in both fleet files "
+                    "makes this one stand by"
+                )
+            await asyncio.sleep(ASK)
+
+    # ------------------------------------------------------------------ who has what
+
+    def _note(self, key: str, present: bool) -> str:
+        """Return the camera that somebody else comes or goes for; nothing if it is none of ours."""
+        agent, *chunks = self._keys.tail(key, "presence/camera")
+        name = "/".join(chunks)
+        if agent == self._agent.name or name not in self._wanted:
+            return ""
+        others = self._others.setdefault(name, set())
+        (others.add if present else others.discard)(agent)
+        now = asyncio.get_running_loop().time()
+        if now >= self._calm.get(name, now):
+            self._contested[name] = now + CONTEST
+        return name
+
+    def _on_presence(self, key: str, present: bool) -> None:
+        if name := self._note(key, present):
+            if present and name in self._back:
+                self._back[name].set()
+            self._consider(name)
+
+    def on_event(self, event: CameraEvent) -> None:
+        """Take in an event of a camera that this agent has."""
+        if isinstance(event, Disconnected):
+            name = event.camera
+            if not self._bus.reached or self._is_contested(name):
+                self._consider(name)
+
+    def _is_contested(self, name: str) -> bool:
+        """Return True if another agent has a camera of ours, or had it a moment ago."""
+        now = asyncio.get_running_loop().time()
+        return bool(self._others.get(name)) or now < self._contested.get(name, now)
+
+    def _consider(self, name: str) -> None:
+        """Look whose a camera is, in a task; once at a time for each."""
+        self._again.add(name)
+        if name not in self._settling:
+            self._settling.add(name)
+            self._agent.begin(self._settle(name), f"smartcam.fleet.{name}.claim")
+
+    async def _settle(self, name: str) -> None:
+        try:
+            while name in self._again and name in self._wanted:
+                self._again.discard(name)
+                if name in self._agent.hosts:
+                    await self._defend(name)
+                else:
+                    await self._stand_by(name)
+        finally:
+            self._settling.discard(name)
+
+    async def _stand_by(self, name: str) -> None:
+        """Take a camera over if nobody has it."""
+        if self._standby is None or self._others.get(name):
+            return
+        away = not self._bus.reached  # we are gone, and not the others
+        await asyncio.sleep(HOLD_OFF * self._standby.preference)
+        while away or not self._bus.reached:
+            if self._bus.reached:
+                if await self._appears(name, RETURN):
+                    return  # should it go again, that is another matter
+                away = False
+            else:
+                away = True
+                await asyncio.sleep(ASK)
+        settings = self._wanted.get(name)
+        if settings is None or self._others.get(name) or name in self._agent.hosts:
+            return
+        try:
+            await self.refuse_taken({name: settings})
+        except ConfigurationError as exc:
+            logger.warning("! %s", exc)
+            await asyncio.sleep(RETURN)
+            self._again.add(name)
+            return
+        if name not in self._wanted or self._others.get(name) or name in self._agent.hosts:
+            return
+        logger.warning("%s = the agent %s takes it over", name, self._agent.name)
+        self.given_up.pop(name, None)
+        self._agent.share(name, settings)
+
+    async def _appears(self, name: str, timeout: float) -> bool:
+        """Wait until another agent says that it has a camera; return whether one did."""
+        if self._others.get(name):
+            return True
+        back = self._back[name] = asyncio.Event()
+        try:
+            async with asyncio.timeout(timeout):
+                await back.wait()
+        except TimeoutError:
+            return False
+        else:
+            return True
+        finally:
+            del self._back[name]
+
+    async def _defend(self, name: str) -> None:
+        """Settle whose a camera is that this agent has, without a session.
+
+        Another one that says it has it, too, keeps it if the camera serves that one. Where nobody
+        else has it, and the camera was taken, this one stands by.
+        """
+        agent, away = self._agent, False
+        while (host := agent.hosts.get(name)) and not host.connected:  # its loss is an event
+            if others := self._others.get(name):
+                away = False
+                other = min(others)
+                if await self._yields(host, other):
+                    await self._give_up(name, other)
+                    return
+                await asyncio.sleep(ASK)
+            elif away or not self._bus.reached:
+                away = not self._bus.reached
+                await self._appears(name, ASK if away else RETURN)
+            elif self._standby is not None and _is_taken(host):
+                logger.warning("! %s: no agent has it: %s stands by", name, agent.name)
+                self._contested.pop(name, None)
+                self._calm[name] = asyncio.get_running_loop().time() + CALM
+                await agent.unshare(name, "another client has taken it")
+                self._again.add(name)
+                return
+            elif self._is_contested(name):
+                await self._appears(name, ASK)
+            else:
+                return
+
+    async def _yields(self, host: Host, other: str) -> bool:
+        """Return True if this agent, without a session, leaves a camera to another that has it.
+
+        Of two that have no session the first one by name goes on trying.
+        """
+        agent, name = self._agent, host.name
+        told = await ask_cameras(self._bus, self._keys, other, name, ASK)
+        if host.connected or agent.hosts.get(name) is not host:
+            return False
+        yields = bool(told) and (told[0].summary.connected or other < agent.name)
+        return yields and other in self._others.get(name, ())
+
+    async def _give_up(self, name: str, other: str) -> None:
+        stays = "stands by" if self._standby is not None else "shares it no more"
+        error = self.given_up[name] = ConnectionTakenError(
+            f"{name}: the agent {other} has the camera now, which serves one; the agent "
+            f"{self._agent.name} {stays}"
+        )
+        logger.warning("! %s", error)
+        await self._agent.unshare(name, f"the agent {other} has it")
+
+
+def _order(start: str) -> tuple[int, str]:
+    """Return the key by which agents' starts are ordered: their time, then a random word."""
+    epoch, _, chance = start.partition("-")
+    return int(epoch) if epoch.isdecimal() else 0, chance
+
+
+async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
+    """Return the addresses of each host, and its name where there are none; bounded."""
+    found: dict[str, set[str]] = {}
+    names: list[str] = []
+    for host in hosts:
+        try:
+            found[host] = {ipaddress.ip_address(host).compressed}
+        except ValueError:
+            names.append(host)
+            found[host] = {host.lower()}
+
+    async def resolve(host: str) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            told = await loop.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+        except (OSError, UnicodeError):
+            return  # whoever connects there says so
+        found[host] |= {str(one[4][0]) for one in told}
+
+    if names:
+        tasks = [asyncio.create_task(resolve(one)) for one in names]
+        try:
+            await asyncio.wait(tasks, timeout=RESOLVE)
+        finally:
+            for task in tasks:
+                task.cancel()
+    return found
+
+
+def _is_taken(host: Host) -> bool:
+    """Return True if no session will come any more, as another client has the camera."""
+    return isinstance(host.camera.trouble, ConnectionTakenError)

@@ -1,0 +1,533 @@
+"""A camera at its agent: the session with it, what it said last, and who may command it."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import math
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client._inside import DeadlineTimer, Interpretation
+from smartcam.exceptions import (
+    ConnectionLostError,
+    ReservationLostError,
+    SmartCamError,
+    UnsupportedError,
+)
+from smartcam.fleet._agent.gate import Gate
+from smartcam.fleet._agent.shared import SharedCamera, Tap
+from smartcam.fleet._bus.errors import late, to_fields
+from smartcam.fleet._bus.log import AgentLog
+from smartcam.fleet._bus.wire import (
+    CURRENT,
+    LATE,
+    ResultRun,
+    encode,
+    encode_runs,
+    encode_state,
+    encode_status,
+    timestamp,
+)
+from smartcam.fleet._json.topics import CameraTopics
+from smartcam.fleet._operations.trigger_counts import RESULT, outcome_of
+from smartcam.fleet._program.program_name import in_words
+from smartcam.models import Connected, Disconnected, Reconnected, StatusChanged, jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterator, Sequence
+
+    from smartcam.fleet._agent.bundle import AgentBundle
+    from smartcam.fleet._agent.gate import Change
+    from smartcam.fleet._agent.shared import Carried, Owner
+    from smartcam.fleet._bus.bus import Bus, Publisher
+    from smartcam.fleet._bus.keys import Keys
+    from smartcam.fleet._frames.camera_frames import SharedFrames
+    from smartcam.fleet._json.topics import Topics
+    from smartcam.models import CameraEvent, Result, Status
+    from smartcam.observers import Observer
+    from smartcam.settings import CameraSettings
+
+MAX_STATES_PER_BUNDLE = 1000
+MAX_STATE_BYTES = 1 << 19
+HOLD = 0.005
+"""Seconds that a status may wait for others, so that one message tells them. The program whose
+trigger it belongs to hears of it with the reply."""
+
+CATCH_UP = 0.2
+"""Seconds behind such a reply after which the number of the next state is told where no state was:
+the reply may have been lost, and nothing else would tell."""
+
+GATHER = 0.002
+"""Seconds between two messages with results, at least: those that come faster go together."""
+
+FULL = 1 << 16
+"""Bytes of results that go at once, however soon after the last."""
+
+REMINDERS = (0.05, 0.2, 1.0, 5.0)
+"""Seconds behind the last results after which their numbers are told again: the last of them may
+have been lost on the way, and nothing else would tell."""
+
+
+class Host:
+    """One camera of an agent.
+
+    Args:
+        name: name of the camera in the fleet.
+        settings: settings of the client that has the session.
+        bus: bus on which results and states are sent.
+        keys: keys of the fleet.
+        epoch: number of the agent's start.
+        history: numbers of results and of bytes that are kept at most.
+        on_event: callback for what happens to the camera.
+        topics: topics of the agent's cameras in JSON.
+        frames: frames of the camera.
+        bundle: sender of the results of all the agent's cameras together.
+        observers: observers of the camera's sessions.
+
+    Attributes:
+        epoch: number of the agent's start, or of this time that it has the camera.
+        began: the number of the first result since then.
+        final: no other agent takes the camera over when there will be no session any more.
+        gate: gate that decides which program's commands may pass.
+        results: the last results.
+        states: the last things that happened.
+        outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
+        topics: topics of the camera in JSON, for other programs.
+        frames: frames of the camera.
+        failure: why there is no session yet, None where there is or was one.
+        triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
+    """
+
+    def __init__(
+        self,
+        name: str,
+        settings: CameraSettings,
+        bus: Bus,
+        keys: Keys,
+        epoch: int,
+        history: tuple[int, int],
+        on_event: Callable[[CameraEvent], None],
+        topics: Topics,
+        frames: SharedFrames,
+        bundle: AgentBundle,
+        observers: Sequence[Observer] = (),
+    ) -> None:
+        self.name = name
+        self.frames = frames
+        self.settings = settings
+        self.gate: Gate = Gate(self._on_reservation)
+        self.results: AgentLog = AgentLog(*history)
+        self.states: AgentLog = AgentLog(MAX_STATES_PER_BUNDLE, MAX_STATE_BYTES)
+        self.outcomes: dict[Owner, list[bytes]] = {}
+        self.failure: SmartCamError | None = None
+        self.triggers: collections.Counter[str] = collections.Counter()
+        self.epoch: int = epoch
+        self.began: int = 1
+        self.final: bool = True
+        self._tell, self._bundle, self._observers = on_event, bundle, observers
+        Interpretation(settings.interpret_as, lenient=True, y_down=False)  # it is the programs'
+        self.topics: CameraTopics = CameraTopics(self, topics)
+        self._camera = self._make()
+        self._fresh: list[bytes] = []  # runs that are not said yet
+        self._fresh_states: list[bytes] = []
+        self._fresh_bytes = 0
+        self._due: asyncio.Handle | None = None  # says the results
+        self._said_at = -math.inf
+        self._held = DeadlineTimer(self._flush_states)
+        self._catch_up = DeadlineTimer(self._put_states)
+        self._reminder: asyncio.TimerHandle | None = None
+        self._opened = asyncio.Event()
+        self._over = False  # there will be no session any more
+        self._states_out: Publisher = bus.publisher(keys.states(name), urgent=True)
+        self._results_out: Publisher = bus.publisher(keys.results(name), self._on_heard)
+
+    @property
+    def camera(self) -> SharedCamera:
+        """The client that has the session."""
+        return self._camera
+
+    @property
+    def was_tried(self) -> bool:
+        """True once the first attempt has ended, well or not."""
+        return self._opened.is_set()
+
+    @property
+    def connected(self) -> bool:
+        """True while there is a session."""
+        return self._camera.connected
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """The numbers that what is said next has."""
+        topics = self.topics
+        return self.results.following, self.states.following, topics.statuses, topics.events
+
+    @numbers.setter
+    def numbers(self, numbers: tuple[int, ...]) -> None:
+        topics = self.topics
+        self.results.following, self.states.following, topics.statuses, topics.events = numbers
+
+    def _make(self) -> SharedCamera:
+        tap = Tap(self._on_results, self._on_status, self._on_event, self._on_end, self._on_taken)
+        return SharedCamera(self.settings, tap, self._observers)
+
+    # ------------------------------------------------------------------ life
+
+    async def run(self) -> None:
+        """Have a session, as soon as there is a camera; ends when there will be none."""
+        backoff = self.settings.reconnect
+        delays = iter(()) if backoff is None else backoff.delays()
+        try:
+            while True:
+                try:
+                    await self._camera.open()
+                except (SmartCamError, OSError) as error:
+                    self._fail(error)
+                    delay = next(delays, None)
+                    if delay is None or backoff is None or not backoff.transient(error):
+                        self._over = True
+                        return
+                    await asyncio.sleep(delay)
+                    self._camera = self._make()
+                else:
+                    self.failure = None
+                    return
+        finally:
+            self._opened.set()
+            self._say({"kind": "Tried"})
+
+    async def tried(self, timeout: float) -> None:
+        """Wait until the first try has come to an end, well or not; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await self._opened.wait()
+
+    async def close(self) -> None:
+        """End the session with Disconnect; bounded."""
+        self._opened.clear()  # what is said from now on is no news
+        try:
+            await self.frames.close()
+        finally:
+            await self._camera.close()
+        self.lose_reservation()
+        if self._reminder is not None:
+            self._reminder.cancel()
+        self.flush()
+        self._held.cancel()
+        self._catch_up.cancel()
+        self._states_out.close()
+        self._results_out.close()
+        self.topics.close()
+
+    def _fail(self, error: BaseException) -> None:
+        if not isinstance(error, SmartCamError):
+            error = ConnectionLostError(f"{self.name}: {error}")
+        self.failure = error
+        self._opened.set()
+        self._say({"kind": "Absent"})
+
+    def require(self) -> SharedCamera:
+        """Return the camera.
+
+        Raises:
+            LinkError: there is no session, and why.
+        """
+        if self.failure is not None or not (self._opened.is_set() or self.connected):
+            why = self.failure or "it tries for the first time"
+            raise ConnectionLostError(
+                f"{self.name}: the agent has no session with the camera: {why}"
+            ) from self.failure
+        return self._camera
+
+    @contextlib.contextmanager
+    def counted(self, said: str) -> Iterator[None]:
+        """Count how a trigger in here ends, if ``said`` is one."""
+        outcome = RESULT
+        try:
+            yield
+        except BaseException as exc:
+            outcome = outcome_of(exc)
+            raise
+        finally:
+            if "trigger" in said.lower():
+                self.triggers[outcome] += 1
+
+    async def enter(self, program: str, said: str, timeout: float) -> None:
+        """Let a command of ``program`` begin, as :meth:`Gate.enter` does.
+
+        Raises:
+            ResponseTimeoutError, TriggerTimeoutError: another program has reserved the camera for
+                ``timeout`` seconds more.
+        """
+        try:
+            await self.gate.enter(program, timeout)
+        except TimeoutError as exc:
+            raise self._not_granted(said, timeout) from exc
+
+    async def reserve(self, program: str, reservation: Hashable, timeout: float) -> None:
+        """Keep the commands of other programs out, as :meth:`Gate.reserve` does.
+
+        Where another agent may take the camera over, only who has it can reserve it.
+
+        Raises:
+            ResponseTimeoutError: another program has it for ``timeout`` seconds more.
+            LinkError: there is no session, and another agent may have one.
+        """
+        try:
+            await self.gate.reserve(program, reservation, timeout)
+        except TimeoutError as exc:
+            raise self._not_granted("reserve", timeout) from exc
+        if not (self.final or self.connected):
+            self.gate.release(reservation)
+            raise ConnectionLostError(
+                f"{self.name}: the agent has no session with the camera, and another one may have; "
+                "reserve was not done"
+            )
+
+    def check_reserved(self, reservation: Hashable, said: str) -> None:
+        """Refuse a command of a block whose reservation has ended.
+
+        Raises:
+            ReservationLostError: it has ended, or was another agent's to keep.
+        """
+        if not self.gate.holds(reservation):
+            raise ReservationLostError(
+                f"{self.name}: the agent does not know the reservation in whose block {said} was "
+                "called: it was lost, and commands of others may have come between; "
+                f"{said} was not done"
+            )
+
+    async def keeps(self, reservation: Hashable, timeout: float) -> bool:
+        """Return True if a reservation still holds and no other agent has the camera by now.
+
+        Where another agent may take over, the camera is asked: it serves one client, so that an
+        agent that gets an answer still has the camera.
+
+        Raises:
+            SmartCamError: the camera does not answer.
+        """
+        if not self.final and self.gate.holds(reservation):
+            with contextlib.suppress(UnsupportedError):
+                await self.require().query_application(timeout=timeout)
+        return self.gate.holds(reservation)
+
+    def lose_reservation(self) -> None:
+        """Have the reservation end before its holder releases it, if there is one."""
+        if self.gate.holder is not None:
+            self.gate.forget(self.gate.holder)
+
+    def _on_reservation(self, change: Change, program: str) -> None:
+        self.topics.on_reservation(change, program)
+        if change == "ReservationLost" and self._opened.is_set():
+            self._say({"kind": change, "by": program})
+        else:
+            self.topics.on_state()
+
+    def _not_granted(self, said: str, timeout: float) -> SmartCamError:
+        """Return the error for a program that waited in vain for others to let go of the camera."""
+        holder = self.gate.holder
+        who = "commands of others" if holder is None else f"reserved by {in_words(holder)}, which"
+        text = f"{self.name}: {who} did not let go within {timeout:.3g} s; {said} was not done"
+        return late(said, text)
+
+    # ------------------------------------------------------------------ what the camera is
+
+    def state(self) -> dict[str, Any]:
+        """Return the fields that every state message has of the camera."""
+        camera = self._camera
+        try:
+            status: int | None = int(camera.status)
+        except SmartCamError:
+            status = None
+        # a link that has just ended is no loss yet: what came before is not all told
+        trouble = self.failure or camera.trouble
+        fields: dict[str, Any] = {
+            "connected": trouble is None,
+            "status": status,
+            "endian": camera.endian,
+            "application": camera.active_application,
+        }
+        if not self._opened.is_set():
+            fields["trying"] = True
+        elif trouble is not None:
+            fields |= {"error": to_fields(trouble), "over": self._over and self.final}
+        return fields
+
+    def known(self) -> tuple[bool, int | None, int | None, str | None]:
+        """Return the presence of a session, its status, its application and why there is none."""
+        camera, trouble = self._camera, self.failure or self._camera.trouble
+        try:
+            status: int | None = int(camera.status)
+        except SmartCamError:
+            status = None
+        why = None if trouble is None else str(trouble)
+        return trouble is None, status, camera.active_application, why
+
+    def about(self) -> dict[str, Any]:
+        """Return the fields on the camera that stay the same for a whole session."""
+        camera, settings = self._camera, self.settings
+        fields: dict[str, Any] = {
+            "camera": self.name,
+            "url": camera.url,
+            "protocol_version": camera.protocol_version,
+            "interpret_as": jsonable(settings.interpret_as),
+            "y_down": settings.y_down,
+            "lenient": settings.lenient,
+        }
+        with contextlib.suppress(SmartCamError):
+            fields["capabilities"] = jsonable(camera.capabilities)
+        return fields
+
+    # ------------------------------------------------------------------ what comes
+
+    def _on_status(self, status: Status) -> None:
+        self.topics.on_status(status)
+        camera, number = self._camera, self.states.following
+        if not (camera.connected and self._opened.is_set()):
+            self._say({"kind": "Status"}, hold=HOLD)
+            return
+        data = encode_status(number, int(status), camera.endian, camera.active_application)
+        self._have_said(data, asyncio.get_running_loop().time(), HOLD)
+
+    def _on_event(self, event: CameraEvent) -> None:
+        self._tell(event)
+        if isinstance(event, StatusChanged):
+            return  # a status tells that
+        self.topics.on_event(event)
+        fields: dict[str, Any] = jsonable(event)
+        del fields["camera"]
+        said: dict[str, Any] = {"kind": type(event).__name__, "event": fields}
+        if isinstance(event, (Connected, Reconnected)):
+            said["about"] = self.about()
+        self._say(said)
+        if isinstance(event, Disconnected) and not (event.expected or self.final):
+            self.lose_reservation()  # another agent may have the camera meanwhile
+
+    def _on_end(self) -> None:
+        if self._opened.is_set() and self.failure is None:
+            self._over = True
+            self._say({"kind": "Over"})
+        self.lose_reservation()
+
+    def say_removed(self, why: str) -> None:
+        """Say that this agent shares the camera no more, and why."""
+        self._say({"kind": "Removed", "why": why})
+
+    def _on_taken(self) -> None:
+        """Say that another client has the camera: it is tried again now and then."""
+        self._say({"kind": "Taken"})
+
+    def _say(self, fields: dict[str, Any], *, hold: float = 0.0) -> None:
+        """Send an event with the camera's state; within ``hold`` seconds, or with the next one."""
+        clock = asyncio.get_running_loop().time()
+        said = {**fields, **self.state(), "number": self.states.following, "clock": clock}
+        self._have_said(encode_state(said), clock, hold)
+
+    def _have_said(self, data: bytes, clock: float, hold: float) -> None:
+        self.states.add(1, clock, data)
+        self._fresh_states.append(data)
+        if not hold:
+            self._flush_states()
+        elif len(self._fresh_states) == 1:
+            self._held.set(clock + hold)
+        self.topics.on_state()
+
+    def _on_results(self, results: Sequence[Result[Carried]], current: bool, late: bool) -> None:
+        """Keep results that came together, and say them: soon, with what comes meanwhile."""
+        first = results[0]
+        owner = first.value.owner
+        flags = (CURRENT if current else 0) | (LATE if late else 0)
+        cells = first.value.cells
+        clock = asyncio.get_running_loop().time()
+        run = ResultRun(
+            self.results.following,
+            first.application,
+            self._camera.endian,
+            flags,
+            owner.program,
+            owner.call,
+            clock,
+            first.received_at.timestamp(),
+            timestamp(first.triggered_at),
+            timestamp(None) if first.latency is None else first.latency,
+            [one.raw for one in results],
+            cells,
+        )
+        data = run.encode()
+        self.results.add(len(run.payloads), clock, data)
+        if owner in self.outcomes:
+            self.outcomes[owner].append(data)
+        if self._results_out.heard or self._bundle.heard:
+            self._fresh.append(data)
+            self._fresh_bytes += len(data)
+            if self._fresh_bytes >= FULL:
+                self._flush_results()
+            elif self._due is None:
+                loop = asyncio.get_running_loop()
+                at = self._said_at + GATHER
+                call = self._flush_results
+                self._due = loop.call_at(at, call) if at > loop.time() else loop.call_soon(call)
+        self.topics.on_run(run)
+
+    def untold(self, since: int) -> list[bytes]:
+        """Return the states that are not said yet, from number ``since`` on."""
+        fresh = self._fresh_states
+        return fresh[max(0, since - self.states.following + len(fresh)) :]
+
+    def forget_fresh(self) -> None:
+        """Drop the states that were not sent yet, since all who hear them were told."""
+        self._held.clear()
+        self._fresh_states.clear()
+        self._catch_up.set(asyncio.get_running_loop().time() + CATCH_UP)
+
+    def flush(self, *, states: bool = True) -> None:
+        """Send the results and, with ``states``, the states that were not sent yet."""
+        if states:
+            self._flush_states()
+        self._flush_results()
+        self._bundle.flush()
+
+    def _flush_states(self) -> None:
+        self._held.clear()
+        if self._fresh_states:
+            self._put_states()
+
+    def _put_states(self) -> None:
+        self._catch_up.clear()
+        fresh, self._fresh_states = self._fresh_states, []
+        following = self.states.following
+        self._states_out.put(encode({"epoch": self.epoch, "following": following}, fresh))
+
+    def _flush_results(self) -> None:
+        if self._due is not None:
+            self._due.cancel()
+            self._due = None
+        if self._fresh:
+            self._said_at, self._fresh_bytes = asyncio.get_running_loop().time(), 0
+            fresh, self._fresh = self._fresh, []
+            said = encode_runs(self.epoch, self.results.following, fresh)
+            if self._bundle.heard:
+                self._bundle.add(self.name, said)
+            if self._results_out.heard:
+                self._results_out.put(said)
+                self._remind(0)
+
+    def _on_heard(self, heard: bool) -> None:
+        if heard:
+            self._remind(0)
+
+    def _remind(self, step: int) -> None:
+        """Tell the last number again in a while; after the last reminder, no more."""
+        if self._reminder is not None:
+            self._reminder.cancel()
+            self._reminder = None
+        if step < len(REMINDERS):
+            loop = asyncio.get_running_loop()
+            self._reminder = loop.call_later(REMINDERS[step], self._say_number, step + 1)
+
+    def _say_number(self, step: int) -> None:
+        self._reminder = None
+        if self._results_out.heard:
+            self._results_out.put(encode_runs(self.epoch, self.results.following, []))
+            self._remind(step)

@@ -1,0 +1,357 @@
+"""A fleet file read again by a running agent: what did not change goes on untouched.
+
+All that can go wrong goes wrong before anything is changed: the file is read and checked whole, and
+new emulated cameras are started. What comes then cannot fail any more, and is a task of its own,
+which goes on to its end whoever waits for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import hashlib
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
+from smartcam.fleet._file.fleet_file import FleetFile, load_fleet
+from smartcam.fleet._file.ros import RosCamera
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.fleet._agent.agent import Agent
+    from smartcam.fleet._file.fleet_file import Planned
+    from smartcam.fleet._frames.camera_frames import FramesOf
+    from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+REMOVED, CHANGED = "it was removed from the fleet file", "its entry in the fleet file has changed"
+"""Reasons why a reload ends a camera, as the camera's programs are told."""
+
+READ_TIMEOUT = 10.0
+"""Seconds for reading a file and those that it names; they may be on a network's disk."""
+
+LIVE = frozenset({"cameras"})
+"""Fields of a fleet file that are changed while the agent runs; each other one wants a restart."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class FleetChanges:
+    """The changes in a fleet file that was read again, by the cameras' names.
+
+    Attributes:
+        agent: name of the agent that read the file.
+        added: cameras that are shared from now on.
+        removed: cameras that are shared no more.
+        changed: cameras that are given up and opened again, as the file says now.
+        kept: number of cameras that did not change; their sessions were not touched.
+    """
+
+    agent: str
+    added: tuple[str, ...]
+    removed: tuple[str, ...]
+    changed: tuple[str, ...]
+    kept: int
+
+    def __str__(self) -> str:
+        parts = [
+            f"{len(names)} {what} ({_some(names)})"
+            for what in ("added", "removed", "changed")
+            if (names := getattr(self, what))
+        ]
+        return ", ".join([*parts, f"{self.kept} kept"])
+
+
+def _some(names: tuple[str, ...], most: int = 5) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+class CameraSource(NamedTuple):
+    """The parts of which the session with a camera is made.
+
+    Attributes:
+        settings: settings of the client that has the session.
+        frames: source of the camera's frames; None for none.
+        emulator: closes the emulated camera, where it is one.
+    """
+
+    settings: CameraSettings
+    frames: FramesOf | None
+    emulator: contextlib.AsyncExitStack
+
+
+class LoadedFleet(NamedTuple):
+    """A fleet file that was read and checked.
+
+    Attributes:
+        file: contents of the fleet file.
+        plan: cameras of the file, by name.
+        marks: by name, what tells whether a camera has changed: what the file says of it, and what
+            stands in the files that it names.
+    """
+
+    file: FleetFile
+    plan: dict[str, Planned]
+    marks: dict[str, object]
+
+
+def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
+    """Return a file with its cameras.
+
+    Raises:
+        ValueError: the cameras cannot be.
+    """
+    plan = {planned.name: planned for planned in file.plan()}
+    seen: dict[str, str] = {}
+
+    def digest(named: str | None) -> str | None:
+        if named is None:
+            return None
+        if named not in seen:
+            try:
+                seen[named] = hashlib.sha256((folder / named).read_bytes()).hexdigest()
+            except OSError as exc:
+                seen[named] = str(exc)
+        return seen[named]
+
+    def mark(planned: Planned) -> object:
+        entry, emulated = planned.entry, planned.entry.emulated
+        if emulated is not None:  # that there are others does not change this one
+            emulated = emulated.model_copy(update={"count": 1})
+            entry = entry.model_copy(update={"emulated": emulated})
+        files = [entry.ros2.calibration, entry.ros2.hand_eye]
+        files.append(None if emulated is None else emulated.scenario)
+        files.append(None if entry.frames is None else entry.frames.camera_info)
+        files += _files_in(entry.software, folder)
+        return entry, planned.nth, [digest(one) for one in files]
+
+    return LoadedFleet(file, plan, {name: mark(planned) for name, planned in plan.items()})
+
+
+def _files_in(given: object, folder: Path) -> list[str | None]:
+    """Return the texts in a camera's programs that are names of files."""
+    if isinstance(given, dict):
+        return [one for part in given.values() for one in _files_in(part, folder)]
+    if isinstance(given, list):
+        return [one for part in given for one in _files_in(part, folder)]
+    try:
+        return [given] if isinstance(given, str) and (folder / given).is_file() else []
+    except (OSError, ValueError):  # no name of a file
+        return []
+
+
+class Reloader:
+    """Reads the file of a running agent again; one time after the other.
+
+    Args:
+        folder: folder of relative paths, where a file's contents are given and not its path.
+        make: function that starts a camera's source, given its plan and the folder.
+        now: the file that holds until the first reload.
+
+    Attributes:
+        now: the file that holds now.
+        sources: sources of the cameras' sessions, by name.
+        last: changes, or error, of the last reload; None before the first.
+        outcomes: numbers of reloads that were done, and that were refused.
+        tell: callback for the begin of a reload (None) and for its end (changes or error).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        now: LoadedFleet,
+        make: Callable[[Planned, Path], Awaitable[CameraSource]],
+    ) -> None:
+        self.now: LoadedFleet = now
+        self.sources: dict[str, CameraSource] = {}
+        self.last: FleetChanges | SmartCamError | None = None
+        self.outcomes: dict[str, int] = {"done": 0, "refused": 0}
+        self.tell: Callable[[FleetChanges | SmartCamError | None], None] = lambda _: None
+        self._folder, self._make = folder, make
+        self._one = asyncio.Lock()
+        self._reading: asyncio.Future[tuple[LoadedFleet, FleetChanges]] | None = None
+        self._applying: asyncio.Task[None] | None = None
+        self._closed = False
+
+    async def close(self) -> None:
+        """Wait until what has begun is done; nothing else begins. Bounded."""
+        self._closed = True
+        if self._applying is not None:
+            await asyncio.wait({self._applying})
+
+    async def reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
+        """Have a running agent do as ``file`` says, as :meth:`FleetServer.reload` has it."""
+        async with self._one:
+            self.tell(None)
+            try:
+                changes = await self._typed(agent, file)
+            except SmartCamError as exc:
+                logger.warning("the fleet file was not taken, all stays as it was: %s", exc)
+                self.last = exc
+                raise
+            except BaseException:
+                self.last = ConfigurationError("the reload was cancelled; all stays as it was")
+                if self._applying is not None and not self._applying.done():
+                    self.last = ConfigurationError("nobody waited for the end of the reload")
+                raise
+            else:
+                logger.info("the fleet file was read again: %s", changes)
+                self.last = changes
+                return changes
+            finally:
+                done = isinstance(self.last, FleetChanges)
+                self.outcomes["done" if done else "refused"] += 1
+                self.tell(self.last)
+
+    async def _typed(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
+        try:
+            return await self._reload(agent, file)
+        except SmartCamError:
+            raise
+        except OSError as exc:
+            raise ConfigurationError(f"fleet file: it cannot work: {exc}") from exc
+        except Exception as exc:
+            logger.exception("! the reload failed")
+            raise SmartCamError(f"fleet file: a fault of ours: {exc!r:.200}") from exc
+
+    async def _reload(self, agent: Agent, file: str | Path | FleetFile) -> FleetChanges:
+        if self._applying is not None:  # whoever waited for it was cancelled
+            await asyncio.wait({self._applying})
+        folder = self._folder if isinstance(file, FleetFile) else Path(file).parent
+        new, changes = await self._read(file, folder, agent.name)
+        _refuse_added(agent, changes)
+        async with contextlib.AsyncExitStack() as stack:
+            made: dict[str, CameraSource] = {}
+            for name in (*changes.added, *changes.changed):
+                made[name] = source = await self._make(new.plan[name], folder)
+                stack.push_async_callback(source.emulator.aclose)
+                await asyncio.sleep(0)
+            if self._closed:
+                raise ConnectionClosedError(f"the agent {agent.name} ends; nothing was changed")
+            _refuse_added(agent, changes)  # it may have come meanwhile
+            stack.pop_all()
+            self.now = new
+            work = self._apply(agent, (*changes.removed, *changes.changed), made)
+            self._applying = asyncio.get_running_loop().create_task(work, name="smartcam.reload")
+        await asyncio.shield(self._applying)
+        return changes
+
+    async def _read(
+        self, file: str | Path | FleetFile, folder: Path, agent: str
+    ) -> tuple[LoadedFleet, FleetChanges]:
+        """Read and check a file, and see what it changes, in a thread."""
+        if self._reading is not None:  # whoever waited for it was cancelled, or gave up
+            _, late = await asyncio.wait({self._reading}, timeout=READ_TIMEOUT)
+            if late:
+                raise ConfigurationError(
+                    f"fleet file {file}: the reading that began before has no end yet"
+                )
+
+        old = self.now
+
+        def read() -> tuple[LoadedFleet, FleetChanges]:
+            found = file if isinstance(file, FleetFile) else load_fleet(file)
+            try:
+                new = loaded(found, folder)
+            except ValueError as exc:
+                raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
+            return new, changes_of(old, new, agent)
+
+        self._reading = asyncio.get_running_loop().run_in_executor(None, read)
+        self._reading.add_done_callback(_looked_at)
+        try:
+            async with asyncio.timeout(READ_TIMEOUT):
+                return await asyncio.shield(self._reading)
+        except TimeoutError as exc:
+            raise ConfigurationError(
+                f"fleet file {file}: it could not be read within {READ_TIMEOUT:g} s"
+            ) from exc
+
+    async def _apply(
+        self, agent: Agent, ending: tuple[str, ...], made: dict[str, CameraSource]
+    ) -> None:
+        """Have the agent share other cameras. What ends comes first: addresses may change hands."""
+        ended = await asyncio.gather(
+            *(self._end(agent, name, CHANGED if name in made else REMOVED) for name in ending),
+            return_exceptions=True,
+        )
+        for error in ended:
+            if error is not None:
+                logger.error("! a camera did not close", exc_info=error)
+        for name, source in made.items():
+            self.sources[name] = source
+            if self._closed:
+                continue  # the agent ends, and with it what was made
+            if name in agent.hosts:
+                logger.error("%s ! it is not shared: a program has added one meanwhile", name)
+                continue
+            try:
+                await agent.want(name, source.settings, source.frames)
+            except SmartCamError:
+                logger.exception("%s ! it is not shared", name)
+            await asyncio.sleep(0)
+
+    async def _end(self, agent: Agent, name: str, why: str) -> None:
+        source = self.sources.pop(name, None)
+        try:
+            await agent.drop(name, why)
+        finally:
+            if source is not None:
+                await source.emulator.aclose()
+
+
+def changes_of(old: LoadedFleet, new: LoadedFleet, agent: str) -> FleetChanges:
+    """Return the changes that a new fleet file makes.
+
+    Raises:
+        ConfigurationError: something that cannot be changed while the agent runs; names the field.
+    """
+    for field in FleetFile.model_fields:
+        if field not in LIVE and getattr(old.file, field) != getattr(new.file, field):
+            raise ConfigurationError(
+                f"{field}: it was changed, which wants a restart of the agent {agent}; only "
+                f"{', '.join(sorted(LIVE))} can be changed while it runs"
+            )
+    for name, planned in new.plan.items():
+        if old.file.ros2 is not None and _seen(old.plan.get(name)) != _seen(planned):
+            raise ConfigurationError(
+                f"cameras.{name}.ros2: it was changed, which wants a restart of the agent {agent}"
+            )
+    both = [name for name in new.plan if name in old.plan]
+    changed = tuple(name for name in both if new.marks[name] != old.marks[name])
+    return FleetChanges(
+        agent,
+        tuple(name for name in new.plan if name not in old.plan),
+        tuple(name for name in old.plan if name not in new.plan),
+        changed,
+        len(both) - len(changed),
+    )
+
+
+def _refuse_added(agent: Agent, changes: FleetChanges) -> None:
+    """Refuse cameras whose names others have that programs have added.
+
+    Raises:
+        ConfigurationError: there is one.
+    """
+    for name in changes.added:
+        if name in agent.hosts:
+            raise ConfigurationError(
+                f"cameras.{name}: a program has added a camera of this name by Setup; it is to "
+                "stop it first"
+            )
+
+
+def _seen(planned: Planned | None) -> RosCamera:
+    """Return a camera's entry for ROS; for a camera that is new, the entry's defaults."""
+    return RosCamera.model_validate({}) if planned is None else planned.entry.ros2
+
+
+def _looked_at(future: asyncio.Future[tuple[LoadedFleet, FleetChanges]]) -> None:
+    if not future.cancelled():
+        future.exception()  # it was told to who waited, if anybody did

@@ -1,0 +1,103 @@
+"""``reload`` over the bus: an agent is told to read its file again, and says what came of it."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any, cast
+
+from smartcam.exceptions import LocalProtocolError, ResponseTimeoutError, SmartCamError
+from smartcam.fleet._agent.reload import FleetChanges
+from smartcam.fleet._bus.errors import from_fields, to_fields
+from smartcam.fleet._json.topics import as_json
+from smartcam.models import jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.fleet._agent.agent import Agent
+    from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
+    from smartcam.fleet._bus.keys import Keys
+
+MAX_WAITING_QUESTIONS = 16
+"""Questions that are under way at one agent at most."""
+
+
+class ReloadService:
+    """Answers programs that want an agent's file read again.
+
+    Args:
+        agent: the agent, which does the work in tasks of its own.
+        bus: the agent's end of the bus.
+        keys: keys of the fleet.
+        reload: function that reads the file again and returns the changes.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        bus: Bus,
+        keys: Keys,
+        reload: Callable[[], Awaitable[FleetChanges]],
+    ) -> None:
+        self._agent, self._reload = agent, reload
+        self._waiting = 0
+        self._declared: Handle = bus.answer(keys.reload(agent.name), self._on_question)
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._declared.close()
+
+    def _on_question(self, question: BusQuestion) -> None:
+        if self._waiting >= MAX_WAITING_QUESTIONS:
+            text = f"{self._agent.name}: {self._waiting} reloads are under way; nothing was done"
+            self._say(question, {"error": to_fields(LocalProtocolError(text))})
+            return
+        self._waiting += 1
+        self._agent.begin(self._answer(question), "smartcam.fleet.reload")
+
+    async def _answer(self, question: BusQuestion) -> None:
+        fields: dict[str, Any] = {
+            "error": to_fields(SmartCamError("the agent ends; whether it was done is unknown"))
+        }
+        try:
+            fields = {"changes": jsonable(await self._reload())}
+        except SmartCamError as exc:
+            fields = {"error": to_fields(exc)}
+        finally:
+            self._waiting -= 1
+            self._say(question, fields)
+
+    def _say(self, question: BusQuestion, fields: dict[str, Any]) -> None:
+        question.reply(question.key.replace("*", self._agent.name), as_json(fields))
+        question.close()
+
+
+async def reload_agents(
+    bus: Bus, keys: Keys, agents: list[str], timeout: float
+) -> dict[str, FleetChanges | SmartCamError]:
+    """Have agents read their files again; return what each said, by its name."""
+    found: dict[str, FleetChanges | SmartCamError] = {}
+    pattern = keys.reload(agents[0] if len(agents) == 1 else "*")
+    for key, payload in await bus.ask(pattern, b"", timeout):
+        agent = key.split("/")[-2]
+        found[agent] = _read(agent, payload)
+    for agent in agents:
+        if agent not in found:
+            found[agent] = ResponseTimeoutError(
+                f"reload: no answer of the agent {agent} within {timeout:.3g} s: it may be gone, "
+                "busy, or this program may not ask; whether it was done is unknown",
+                waited=timeout,
+            )
+    return {name: found[name] for name in sorted(found)}
+
+
+def _read(agent: str, payload: bytes) -> FleetChanges | SmartCamError:
+    try:
+        fields = json.loads(payload)
+        if "error" in fields:
+            return from_fields(fields["error"])
+        said = cast("dict[str, Any]", fields["changes"])
+        names = {name: tuple(map(str, said[name])) for name in ("added", "removed", "changed")}
+        return FleetChanges(agent=agent, kept=int(said["kept"]), **names)
+    except (ValueError, KeyError, TypeError, RecursionError) as exc:
+        return SmartCamError(f"reload: the agent {agent} answers what cannot be read: {exc!r:.200}")

@@ -1,0 +1,527 @@
+"""An agent with its cameras, as a fleet file says: what ``smartcam serve`` runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from smartcam._arguments import check_text
+from smartcam._extras import from_part
+from smartcam._server import Server
+from smartcam._zenoh import BusLink, with_ports
+from smartcam.camera import DEFAULT_MAX_QUEUE
+from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
+from smartcam.fleet._agent.agent import Agent
+from smartcam.fleet._agent.reload import CameraSource, FleetChanges, Reloader, loaded
+from smartcam.fleet._agent.reload_service import ReloadService
+from smartcam.fleet._bus.address import DEFAULT_PORT, FleetAddress
+from smartcam.fleet._bus.keys import Keys
+from smartcam.fleet._bus.zenoh import ZenohEnd
+from smartcam.fleet._file.access import access_mistakes, access_of
+from smartcam.fleet._file.fleet_file import FleetFile, load_fleet, software_camera
+from smartcam.fleet._file.ros import RosSection
+from smartcam.fleet._frames.camera_frames import FramesOf
+from smartcam.fleet._security.access import access_control
+from smartcam.fleet._security.certificates import AGENT
+from smartcam.fleet._security.door import Door
+from smartcam.fleet._security.renewal import RETRY_AFTER, CertificateWatch
+from smartcam.frames import FrameAddress
+from smartcam.models import CameraEvent
+from smartcam.settings import masked
+from smartcam.streams import Subscribers, Subscription
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+    from typing import Literal
+
+    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.emulator import WireCamera
+    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._bus.bus import Bus
+    from smartcam.fleet._file.access import Access
+    from smartcam.fleet._file.fleet_file import FramesEntry, Planned
+    from smartcam.fleet._ros import RosFleet
+    from smartcam.frames import FrameSource
+    from smartcam.inspection import SoftwareDevice
+    from smartcam.observers import Observer
+    from smartcam.outlets import OutletState
+    from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+OPEN_TIMEOUT = 10.0
+"""Seconds for coming to the bus."""
+
+
+class FleetServer(Server):
+    """An agent that shares the cameras of a fleet file; made by :func:`smartcam.fleet.serve`.
+
+    Args:
+        file: path of a fleet file, or the contents of one.
+        bus: end of another bus than the file says.
+        folder: folder of the file's relative paths, where ``file`` is not a path itself.
+        restore: whether cameras have their application and run state back after a reconnect, where
+            their entries say nothing; None: where ``ros2`` in the file has nodes that become active
+            by themselves.
+
+    Attributes:
+        file: contents of the fleet file.
+        folder: folder of the file's relative paths.
+        observers: observers of all sessions; add them before the server is started.
+        outlet_states: function that returns the states of the outlets, by name.
+        calibrations: calibrations of the cameras; None where there is no folder for them.
+
+    Raises:
+        ConfigurationError: something in the file cannot work.
+        MissingExtraError: PyYAML, or the bus' engine, is not installed.
+    """
+
+    def __init__(
+        self,
+        file: str | Path | FleetFile,
+        *,
+        bus: Bus | None = None,
+        folder: Path | None = None,
+        restore: bool | None = None,
+    ) -> None:
+        if not isinstance(file, (Path, FleetFile)):
+            file = check_text(file, "fleet file", least=1)
+        self._given = file
+        self.observers: list[Observer] = []
+        self.outlet_states: Callable[[], Mapping[str, OutletState]] = dict
+        found = file if isinstance(file, FleetFile) else load_fleet(file)
+        self.folder: Path = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
+        try:
+            now = loaded(found, self.folder)
+        except ValueError as exc:
+            raise ConfigurationError(f"fleet {found.fleet}: {exc}") from exc
+        self.reloads: Reloader = Reloader(self.folder, now, self._source)
+        listen, connect = self.file.endpoints
+        for _, mistake in access_mistakes(self.file.access, listen):
+            raise ConfigurationError(f"fleet {self.file.fleet}: {mistake}")
+        self._listen, self._connect = listen, connect = with_ports(listen), connect
+        # with certificates nobody may come in beside the router
+        peer = self.file.ros2 is not None and self.file.certificates is None
+        link = BusLink(listen, connect, self.file.certificates, peer)
+        self._bus = bus or ZenohEnd(link, self._more())
+        self._ros: RosFleet | None = None
+        section = self.file.ros2
+        self._restore = (section is not None and section.autostart) if restore is None else restore
+        self.calibrations: CalibrationDesks | None = None
+        # what is told of cameras in ROS, of those that a reload brings, too
+        self._settings: dict[str, CameraSettings] = {}
+        self._ros_frames: dict[str, dict[str, Any]] = {}
+        self._controls: dict[str, Callable[[], Awaitable[FrameSource]]] = {}
+        self._agent: Agent | None = None
+        self._hosts: dict[str, Host] = {}
+        self._events: Subscribers[CameraEvent] = Subscribers()
+        self._stack = contextlib.AsyncExitStack()
+
+    async def start(self) -> None:
+        """Start the emulated cameras, come to the bus, and begin to have sessions.
+
+        Raises:
+            ConnectFailedError: an endpoint cannot be listened on, or reached.
+            ConfigurationError: an option of a camera cannot work.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._agent is not None:
+            return
+        file = self.file
+        async with contextlib.AsyncExitStack() as stack:
+            sources: dict[str, CameraSource] = {}
+            self.reloads = Reloader(self.folder, self.reloads.now, self._source)
+            self.reloads.sources = sources
+            stack.push_async_callback(_end_emulators, sources)
+            for name, planned in self.reloads.now.plan.items():
+                sources[name] = await self._source(planned, self.folder)
+            self.calibrations = self._desks(stack)
+            history = (file.history.results, file.history.bytes)
+            agent = Agent(
+                file.agent_name,
+                Keys(file.fleet),
+                self._bus,
+                {name: source.settings for name, source in sources.items()},
+                history=history,
+                on_event=self._tell,
+                frames={name: source.frames for name, source in sources.items() if source.frames},
+                standby=file.standby,
+                observers=self.observers,
+                on_retired=self._retire,
+                calibrations=self.calibrations,
+            )
+            self._hosts = agent.hosts  # observers want them from their first result on
+            stack.callback(self._forget_hosts)
+            stack.push_async_callback(agent.close)
+            await agent.open(OPEN_TIMEOUT)
+            self._check_role()
+            service = ReloadService(agent, self._bus, Keys(file.fleet), self.reload)
+            stack.push_async_callback(self.reloads.close)
+            stack.callback(service.close)
+            stack.push_async_callback(self._leave_ros)
+            await self._enter_ros()
+            if isinstance(self._bus, ZenohEnd):
+                ports = frozenset(int(one.rpartition(":")[2]) for one in self._listen)
+                door = Door(ports, self._bus.linked)
+                door.open()
+                stack.callback(door.close)
+            if self.file.certificates is not None and isinstance(self._bus, ZenohEnd):
+                watching = self._watch_certificates(self._bus, agent)
+                stack.push_async_callback(_end, watching)
+            self._agent, self._stack = agent, stack.pop_all()
+
+    def _desks(self, stack: contextlib.AsyncExitStack) -> CalibrationDesks | None:
+        """Return the calibrations of the cameras, in the folder that the file says.
+
+        Raises:
+            ConfigurationError: the folder cannot be made.
+        """
+        if self.file.calibrations is None:
+            return None
+        with from_part("calibration", '"calibrations:" in a fleet file needs'):
+            from smartcam.calibration._inside import CalibrationDesks
+        place = self.folder / self.file.calibrations
+        try:
+            found = CalibrationDesks(place)
+        except OSError as exc:
+            raise ConfigurationError(
+                f"calibrations: {place}: expected a folder, or a place for one: {exc.strerror}"
+            ) from exc
+        stack.callback(found.close)
+        return found
+
+    def _retire(self, why: ConfigurationError) -> None:
+        """End all who follow the cameras' events with the error: another agent has the name."""
+        for stream in self._events:
+            stream.end(why)
+
+    def _forget_hosts(self) -> None:
+        self._hosts = {}
+
+    def _more(self) -> dict[str, Any]:
+        """Return further settings of the engine."""
+        found: dict[str, Any] = {}
+        domain: int | None = None
+        if self.file.ros2 is not None:
+            with from_part("ros2", '"ros2:" in a fleet file needs'):
+                from smartcam.ros2 import RosContext
+                from smartcam.ros2._inside import SETTINGS
+
+            found |= SETTINGS
+            domain = RosContext(domain=self.file.ros2.domain).domain
+        if self._access == "roles":
+            found["access_control"] = access_control(domain)
+        return found
+
+    @property
+    def _access(self) -> Access | None:
+        return access_of(self.file.access, self._listen)
+
+    def _check_role(self) -> None:
+        """Refuse to guard by roles with a certificate that has none: nobody could use it.
+
+        Raises:
+            ConfigurationError: the certificate has another role, or none.
+        """
+        identity = self._bus.identity
+        if self._access == "roles" and identity is not None and identity.role != AGENT:
+            raise ConfigurationError(
+                f"fleet {self.file.fleet}: access: roles wants a certificate whose common name is "
+                f"{AGENT}, as smartcam fleet certificates makes them; that of "
+                f"{identity.folder} has {identity.role!r:.60}. access: any-certificate takes every "
+                "certificate of its authority"
+            )
+
+    def _watch_certificates(self, bus: ZenohEnd, agent: Agent) -> asyncio.Task[None]:
+        """Take renewed certificates from now on."""
+        watch = CertificateWatch(
+            bus, listens=bool(self._listen), busy=lambda: agent.busy, away=self._away_from_ros
+        )
+        return asyncio.get_running_loop().create_task(
+            watch.run(), name="smartcam.fleet.certificates"
+        )
+
+    async def _enter_ros(self) -> None:
+        if self.file.ros2 is not None and isinstance(self._bus, ZenohEnd):
+            self._ros = self._seen_in_ros(self._bus)
+            await self._ros.start()
+
+    async def _leave_ros(self) -> None:
+        ros, self._ros = self._ros, None
+        if ros is not None:
+            await ros.stop()
+
+    @contextlib.asynccontextmanager
+    async def _away_from_ros(self) -> AsyncIterator[None]:
+        """Have no nodes for a while: what is said once for all would be lost with the session."""
+        await self._leave_ros()
+        yield
+        while True:
+            try:
+                await self._enter_ros()
+            except SmartCamError as exc:
+                logger.error("ros2 ! %s; it is tried again", exc)  # noqa: TRY400 - the text says it
+                await self._leave_ros()
+                await asyncio.sleep(RETRY_AFTER)
+            else:
+                return
+
+    def _seen_in_ros(self, bus: ZenohEnd) -> RosFleet:
+        with from_part("ros2", '"ros2:" in a fleet file needs'):
+            from smartcam.fleet._ros import RosFleet
+        file, own = self.file, self.file.agent_name
+        said = {name: planned.entry.ros2 for name, planned in self.reloads.now.plan.items()}
+        found = {name: one.load_calibration(self.folder) for name, one in said.items()}
+        places = {name: one.load_hand_eye(self.folder) for name, one in said.items()}
+        return RosFleet(
+            bus,
+            file.fleet,
+            self.address,
+            file.ros2 or RosSection.model_validate({}),
+            cameras=said,
+            settings=self._settings,
+            frames=self._ros_frames,
+            controls=self._controls,
+            calibrations={name: one for name, one in found.items() if one is not None},
+            places={name: one for name, one in places.items() if one is not None},
+            wanted=lambda agent, _camera: agent == own,
+            desks=self.calibrations,
+        )
+
+    async def stop(self) -> None:
+        """End the sessions with Disconnect, and leave the bus. Harmless when done twice."""
+        self._agent = None
+        await self._stack.aclose()
+        for stream in self._events:
+            stream.end(None)
+
+    def __del__(self) -> None:
+        # the event loop has it until it is stopped; so nobody has it when that is gone, too
+        if vars(self).get("_agent") is not None:
+            text = f"agent {self.file.agent_name} of fleet {self.file.fleet} was not stopped"
+            warnings.warn(text, ResourceWarning, source=self, stacklevel=2)
+
+    async def reload(self, file: str | Path | FleetFile | None = None) -> FleetChanges:
+        """Read the fleet file again, and do as it says now; cameras that did not change go on.
+
+        Those keep their sessions, and what is under way ends as if nothing was. A camera that
+        changed is closed and opened again, one that is new is shared at once, whether it is
+        connected or not. Only ``cameras`` can be changed; another field wants a restart. Several
+        at a time are done one after the other.
+
+        Args:
+            file: another file, or what stands in it; None for the one that it was made with.
+
+        Returns:
+            What has changed.
+
+        Raises:
+            ConfigurationError: the file is wrong, or changes what wants a restart; says where. All
+                stays as it was.
+            ConnectionClosedError: it is not started, or it ends.
+
+        Cancellation: nothing has changed; or all of it is changed, also when nobody waits for it.
+        """
+        if self._agent is None:
+            raise ConnectionClosedError("the agent is not started: there is nothing to reload")
+        return await self.reloads.reload(self._agent, self._given if file is None else file)
+
+    async def _source(self, planned: Planned, folder: Path) -> CameraSource:
+        """Return the source of a camera's session; an emulated camera is started for it.
+
+        Raises:
+            SmartCamError: it cannot be.
+        """
+        async with contextlib.AsyncExitStack() as stack:
+            entry = planned.entry
+            frames = None
+            if entry.software is not None:
+                device, frames = await self._see(planned, folder, stack)
+                url = device.url
+                if entry.interpret_as is None:
+                    update = {"interpret_as": device.interpret_as}
+                    entry = entry.model_copy(update=update)
+            else:
+                url = entry.url or await self._emulate(planned, stack)
+            settings = entry.settings(planned.name, url, restore=self._restore)
+            if entry.frames is not None:
+                make = functools.partial(entry.frames.source, folder)
+                make()  # what cannot work is told now
+                address = FrameAddress.parse(entry.frames.url)
+                frames = FramesOf(make, address.shown)
+                if address.scheme in ("v4l2", "gige"):
+                    self._controls[planned.name] = functools.partial(self._frames_of, planned.name)
+            self._settings[planned.name] = settings
+            self._ros_frames[planned.name] = _ros_frames(entry.frames, folder)
+            return CameraSource(settings, frames, stack.pop_all())
+
+    async def _frames_of(self, name: str) -> FrameSource:
+        """Return the open source of a camera's frames.
+
+        Raises:
+            ConfigurationError: the agent does not have the camera.
+            SmartCamError: the source cannot be opened.
+        """
+        host = self._hosts.get(name)
+        if host is None:
+            raise ConfigurationError(f"{name}: the agent does not have it")
+        return await host.frames.source()
+
+    async def _see(
+        self, planned: Planned, folder: Path, stack: contextlib.AsyncExitStack
+    ) -> tuple[SoftwareDevice, FramesOf]:
+        """Start a software camera; return it, and the frames that it has judged."""
+        given = planned.entry.software or {}
+        camera = await asyncio.to_thread(software_camera, planned.name, given, folder)
+        with from_part("inspection", '"software:" in a fleet file needs'):
+            from smartcam.inspection import SoftwareDevice
+            from smartcam.inspection._inside import judged_source
+        device = SoftwareDevice(camera)
+        await stack.enter_async_context(device)
+        drawn = bool(given.get("drawn", True))
+        make = functools.partial(judged_source, device.eyes, drawn=drawn)
+        return device, FramesOf(make, masked(camera.frames))
+
+    async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
+        """Start an emulated camera; return its URL."""
+        from smartcam.emulator import EmulatedCamera, load_scenario
+        from smartcam.emulator._inside import emulated_class
+
+        emulated = planned.entry.emulated
+        if emulated is None:
+            raise ConfigurationError(f"{planned.name}: neither url nor emulated")
+        seed = emulated.seed + planned.nth
+        camera: WireCamera
+        if emulated.scenario is None:
+            camera = EmulatedCamera(seed=seed)
+        else:
+            scenario = load_scenario(self.folder / emulated.scenario)
+            scenario = scenario.model_copy(update={"seed": seed})
+            camera = emulated_class(scenario.protocol).from_scenario(scenario, host="127.0.0.1")
+        await stack.enter_async_context(camera)
+        return camera.url
+
+    async def wait_tried(self) -> None:
+        """Wait until every camera was tried once, well or not; bounded by ``connect_timeout``."""
+        if self._agent is not None:
+            await self._agent.wait_tried()
+
+    def events(
+        self,
+        *,
+        max_queue: int = DEFAULT_MAX_QUEUE,
+        overflow: Literal["drop_oldest", "error"] = "drop_oldest",
+    ) -> Subscription[CameraEvent]:
+        """Subscribe to the events of all cameras: :meth:`smartcam.Camera.events` of each.
+
+        The stream ends with a :exc:`~smartcam.exceptions.ConfigurationError` where another agent
+        of the same name was started before: this one has no cameras then.
+        """
+        stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
+        self._events.add(stream)
+        if self._agent is not None and self._agent.retired_by is not None:
+            stream.end(self._agent.retired_by)
+        return stream
+
+    def _tell(self, event: CameraEvent) -> None:
+        for stream in self._events:
+            stream.offer(event, 0.0)
+
+    @property
+    def file(self) -> FleetFile:
+        """The fleet file, as it was read last."""
+        return self.reloads.now.file
+
+    @property
+    def agent(self) -> Agent | None:
+        """The agent, None before it is started."""
+        return self._agent
+
+    @property
+    def reached(self) -> bool:
+        """True if the agent is on the bus now: started, and not cut off from its router."""
+        return self._agent is not None and self._bus.reached
+
+    @property
+    def bus_bytes(self) -> int:
+        """Bytes that wait to be said on the bus."""
+        return self._bus.waiting_bytes
+
+    @property
+    def busy(self) -> bool:
+        """True while a command of a program is under way."""
+        return self._agent is not None and self._agent.busy
+
+    @property
+    def warning(self) -> str:
+        """Warning that the agent's certificate ends soon, with the cure; empty: nothing to do."""
+        return "" if self._bus.identity is None else self._bus.identity.warning
+
+    @property
+    def name(self) -> str:
+        """The agent's name."""
+        return "" if self._agent is None else self._agent.name
+
+    @property
+    def ros_nodes(self) -> list[str]:
+        """The full names of its cameras' nodes in ROS 2, if it has any."""
+        return [] if self._ros is None else self._ros.names
+
+    @property
+    def hosts(self) -> dict[str, Host]:
+        """Its cameras by name, empty before it is started."""
+        return self._hosts
+
+    @property
+    def address(self) -> FleetAddress:
+        """Address at which programs on this host find the agent."""
+        return address_of((*self._listen, *self._connect)[0], self.file)
+
+    @property
+    def urls(self) -> dict[str, str]:
+        """The fleet URLs of its cameras, by name."""
+        address = self.address
+        return {name: address.of(name).url for name in self.reloads.now.plan}
+
+
+def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
+    """Return the address and lens of a frame source as parameters of v4l2_camera."""
+    if entry is None:
+        return {}
+    found: dict[str, Any] = {"video_device": masked(entry.url)}
+    if url := entry.camera_info_url(folder):
+        found["camera_info_url"] = url
+    return found
+
+
+async def _end_emulators(sources: dict[str, CameraSource]) -> None:
+    for source in sources.values():
+        await source.emulator.aclose()
+
+
+async def _end(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.wait({task})
+
+
+def address_of(endpoint: str, file: FleetFile) -> FleetAddress:
+    """Return the address of a fleet by an endpoint such as ``tcp/127.0.0.1:7447``."""
+    kind, _, place = endpoint.partition("/")
+    host, _, port = place.partition("?")[0].partition("#")[0].rpartition(":")
+    host = host.strip("[]") or place
+    if host in {"0.0.0.0", "::"}:  # noqa: S104 - what is listened on everywhere is here, too
+        host = "127.0.0.1"
+    scheme = "fleet+tls" if kind in {"tls", "quic"} else "fleet"
+    number = int(port) if port.isdecimal() else DEFAULT_PORT
+    # where there are roles each program has a certificate of its own: the agent's commands nothing
+    own = scheme == "fleet+tls" and file.access == "any-certificate"
+    certificates = file.certificates if own else None
+    # a router that others stand around may have several fleets
+    name = None if file.endpoints[0] else file.fleet
+    return FleetAddress(scheme, host, number, name, "", certificates)

@@ -1,0 +1,247 @@
+"""The camera that an agent shares: a client like any other, whose results stay what came.
+
+What a container holds is for each program to say, so here its value is the container itself; with
+which program's trigger brought it. A layout matters only as far as it has an ``@sequence``.
+"""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._client._inside import CameraState, Interpretation, Interpreted, Listeners
+from smartcam.client import SmartCamera
+from smartcam.exceptions import ResponseTimeoutError, SmartCamError, TriggerTimeoutError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from smartcam._client._inside import TriggerRequest
+    from smartcam.models import CameraEvent, Result, Status
+    from smartcam.observers import Observer
+    from smartcam.protocols.messages import ResultContainer
+    from smartcam.settings import CameraSettings
+
+
+class Owner(NamedTuple):
+    """The owner of a trigger: the program's number at its agent, and its call's. 0 is nobody."""
+
+    program: int
+    call: int
+
+
+NOBODY = Owner(0, 0)
+
+
+class Carried(NamedTuple):
+    """The value of a result at an agent: whose it is, and the texts it was put together from."""
+
+    owner: Owner
+    cells: bytes
+
+
+class Carrier(Interpretation):
+    """Reads nothing but the number of a container, where ``layouts`` have one.
+
+    Args:
+        owner: owner of the trigger whose results are carried.
+        layouts: a layout with ``@sequence``, or such layouts by application; None for none.
+        by_application: whether the program reads each application's results in its own way.
+    """
+
+    def __init__(
+        self, owner: Owner = NOBODY, layouts: Any = None, *, by_application: bool = False
+    ) -> None:
+        super().__init__(layouts, lenient=True, y_down=False)
+        self._carried = Carried(owner, b"")
+        self.by_application = by_application
+
+    def of(self, owner: Owner) -> Carrier:
+        """Return the same for another's trigger, which costs less than a new one."""
+        other = Carrier.__new__(Carrier)
+        other.__dict__ = {**self.__dict__, "_carried": Carried(owner, b"")}
+        return other
+
+    def __call__(
+        self, container: ResultContainer, endian: int, *, camera: str, number: int, at: datetime
+    ) -> Interpreted:
+        if container.cells is None and container.fault is None:
+            return Interpreted(self._carried, None, 0)
+        said = json.dumps({"cells": container.cells, "fault": container.fault}).encode()
+        return Interpreted(self._carried._replace(cells=said), None, 0)
+
+    def burst(
+        self,
+        application: int,
+        payloads: list[bytes],
+        endian: int,
+        *,
+        camera: str,
+        number: int,
+        at: datetime,
+    ) -> tuple[Sequence[Any], int]:
+        return [self._carried] * len(payloads), 0
+
+
+class Tap(NamedTuple):
+    """The functions by which an agent is told of one of its cameras."""
+
+    results: Callable[[Sequence[Result[Carried]], bool, bool], None]
+    status: Callable[[Status], None]
+    event: Callable[[CameraEvent], None]
+    end: Callable[[], None]
+    taken: Callable[[], None]
+
+
+class TappedListeners(Listeners):
+    """Hands everything to the agent, too."""
+
+    tap: Tap | None = None
+
+    @property
+    def streams_results(self) -> bool:
+        return True
+
+    @property
+    def hears_results(self) -> bool:
+        return True
+
+    @property
+    def hears_statuses(self) -> bool:
+        return True
+
+    @property
+    def watches_status(self) -> bool:
+        return True
+
+    def publish(self, event: CameraEvent) -> None:
+        super().publish(event)
+        if self.tap is not None:
+            self.tap.event(event)
+
+    def end(self, error: SmartCamError | None) -> None:
+        super().end(error)
+        if self.tap is not None:
+            self.tap.end()
+
+    def offer_status(self, status: Status, now: float) -> None:
+        super().offer_status(status, now)
+        if self.tap is not None:
+            self.tap.status(status)
+
+    def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
+        if self.observed:
+            for result in results:
+                self._observers.result(result)
+        super().offer_burst(results, now, size)
+        if self.tap is not None:
+            self.tap.results(results, True, False)
+
+    def offer_result(self, result: Result, now: float, *, current: bool, late: bool) -> None:
+        super().offer_result(result, now, current=current, late=late)
+        if self.tap is not None:
+            self.tap.results((result,), current, late)
+
+
+class SharedCamera(SmartCamera[Carried]):
+    """A camera whose agent shares it.
+
+    Args:
+        settings: validated options; their interpretation is for the programs.
+        tap: receiver of all that the session brings.
+        observers: observers of the session; a result's value is a :class:`Carried`.
+    """
+
+    def __init__(
+        self, settings: CameraSettings, tap: Tap, observers: Iterable[Observer] = ()
+    ) -> None:
+        super().__init__(settings, observers=observers)
+        self._listeners.tap = tap
+        self._supervisor.on_taken = tap.taken
+
+    _listeners: TappedListeners
+
+    def _make_listeners(self) -> Listeners:
+        return TappedListeners(self.settings.name, self._observers)
+
+    def _make_state(self) -> CameraState:
+        settings = self.settings
+        return CameraState(settings.name, settings.application, self._listeners, shared=True)
+
+    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+        return Carrier()
+
+    @property
+    def taken(self) -> bool:
+        """True if another client has the camera."""
+        return self._supervisor.taken
+
+    def take_again(self) -> None:
+        """Try again now where another client has the camera."""
+        self._supervisor.take_back()
+
+    @property
+    def endian(self) -> int:
+        """The byte order that its last status told."""
+        return self._state.endian
+
+    async def trigger_for(
+        self, request: TriggerRequest, application: int | None, timeout: float
+    ) -> list[Result[Carried]]:
+        """Trigger for a program, as :meth:`trigger` does.
+
+        Args:
+            request: work that the trigger is to do.
+            application: application to have running for the trigger; None for any.
+            timeout: seconds.
+
+        Input data of a trigger without a result, which the camera may still have queued, is no
+        other program's fault: the application is loaded again first, which empties the queue.
+        """
+        if not self._observed:
+            return await self._trigger_in_order(application, request, timeout)
+        called_at = datetime.now(UTC)
+        try:
+            return await self._trigger_in_order(application, request, timeout)
+        except SmartCamError as error:
+            self._observers.error(self.name, error, called_at)
+            raise
+
+    async def _trigger_in_order(
+        self, application: int | None, request: TriggerRequest, timeout: float
+    ) -> list[Result[Carried]]:
+        if request.input_data is not None and self._results.input_in_doubt:
+            begun = self._deadline(0.0)
+            try:
+                await self._lock.load_again(lambda: self._results.input_in_doubt, timeout)
+            except ResponseTimeoutError as exc:
+                text = f"{exc}; no trigger was sent"
+                raise TriggerTimeoutError(text, waited=exc.waited) from exc
+            timeout = max(0.0, timeout - (self._deadline(0.0) - begun))
+        return await self._trigger(application, request, timeout)
+
+    async def ensure(self, application: int, timeout: float) -> None:
+        """Have an application running and ready, as ``application=`` does at the start."""
+        async with self._lock.hold(timeout) as deadline:
+            await self._commands.ensure(application, deadline)
+
+    async def enter(self, application: int, timeout: float) -> Any:
+        """Begin what :meth:`application` does; return what :meth:`leave` wants."""
+        async with self._lock.hold(timeout) as deadline:
+            return await self._lock.enter(application, deadline)
+
+    def leave(self, before: Any) -> None:
+        """Have the camera go back, in the background."""
+        self._lock.leave(before)
+
+    async def leave_and_wait(self, before: Any) -> None:
+        """Go back, and wait for it."""
+        await self._lock.leave_and_wait(before)
+
+    async def refresh(self, timeout: float) -> bool:
+        """Have the last status be of now; return whether it had to be asked for."""
+        deadline = self._deadline(timeout)
+        self._require_session()
+        await self._status.refresh(deadline)
+        return self._connection.features.polled

@@ -1,0 +1,174 @@
+"""Summarise all of an agent's cameras in one answer, from what the agent knows."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.exceptions import SmartCamError
+from smartcam.fleet._bus.bus import always
+from smartcam.fleet._bus.keys import meets
+from smartcam.fleet._json.topics import as_json
+from smartcam.fleet._program.program_name import in_words
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from smartcam.fleet._agent.agent import Agent
+    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
+    from smartcam.fleet._bus.keys import Keys
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+IN_A_TURN = 50
+"""Cameras that are told, or read, before the event loop has another turn."""
+
+MAX_PATTERN_BYTES = 4096
+"""Bytes of a question at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSummary:
+    """An agent's knowledge of a camera.
+
+    Attributes:
+        camera: name of the camera.
+        agent: name of the agent that shares the camera.
+        connected: whether the agent has a session with it.
+        status: last status that the camera told; None before the first.
+        application: active application; None where it is not known.
+        reserved_by: the program that has reserved the camera, in words; None without one.
+        reason: why there is no session; None where there is one.
+    """
+
+    camera: str
+    agent: str
+    connected: bool
+    status: Status | None
+    application: int | None
+    reserved_by: str | None
+    reason: str | None
+
+
+class ToldCamera(NamedTuple):
+    """One camera in an answer.
+
+    Attributes:
+        summary: what the agent knows of the camera.
+        epoch: number of the agent's start, or of this time that it has the camera.
+        following: number of the camera's next result.
+        standby: whether the agent stands by for cameras that others have.
+    """
+
+    summary: CameraSummary
+    epoch: int
+    following: int
+    standby: bool
+
+
+class Summaries:
+    """Answers for all cameras of an agent.
+
+    Args:
+        agent: the agent.
+        keys: keys of the fleet.
+        bus: the agent's end of the bus.
+    """
+
+    def __init__(self, agent: Agent, keys: Keys, bus: Bus) -> None:
+        self._agent, self._keys, self._bus = agent, keys, bus
+        self._declared: Handle | None = None
+
+    def open(self) -> None:
+        """Answer from now on."""
+        key = self._keys.summary(self._agent.name)
+        self._declared = self._bus.answer(key, self._on_question, patient=always)
+
+    def close(self) -> None:
+        """Answer no more."""
+        if self._declared is not None:
+            self._declared.close()
+
+    def _on_question(self, question: BusQuestion) -> None:
+        pattern = str(question.payload[:MAX_PATTERN_BYTES], "utf-8", "replace") or "**"
+        self._agent.begin(self._answer(question, pattern), "smartcam.fleet.summary")
+
+    async def _answer(self, question: BusQuestion, pattern: str) -> None:
+        """Say it in parts, so that a thousand cameras hold up nobody."""
+        key = self._keys.summary(self._agent.name)
+        try:
+            hosts = [one for one in self._agent.hosts.values() if meets(pattern, one.name)]
+            for begin in range(0, len(hosts), IN_A_TURN):
+                cameras = [_row(one) for one in hosts[begin : begin + IN_A_TURN]]
+                said = {
+                    "agent": self._agent.name,
+                    "standby": self._agent.stands_by,
+                    "cameras": cameras,
+                }
+                question.reply(key, as_json(said))
+                await asyncio.sleep(0)
+        finally:
+            question.close()
+
+
+def _row(host: Host) -> list[Any]:
+    connected, status, application, reason = host.known()
+    return [
+        host.name,
+        int(connected),
+        status,
+        application,
+        None if host.gate.holder is None else in_words(host.gate.holder),
+        reason,
+        host.epoch,
+        host.results.following,
+    ]
+
+
+async def ask_cameras(
+    bus: Bus, keys: Keys, agent: str, pattern: str, timeout: float
+) -> list[ToldCamera]:
+    """Return agents' answers on their cameras that came within ``timeout`` seconds.
+
+    Args:
+        bus: an end of the bus.
+        keys: keys of the fleet.
+        agent: name of the agent that is asked; ``*`` for all agents.
+        pattern: pattern of the cameras' names.
+        timeout: seconds to wait for the answers.
+    """
+    answers = await bus.ask(keys.summary(agent), pattern.encode(), timeout)
+    found: list[ToldCamera] = []
+    for _, payload in answers:
+        try:
+            found += _read(payload)
+        except (ValueError, TypeError, KeyError, SmartCamError) as exc:
+            logger.warning("%s ! an agent's cameras cannot be read: %s", keys.fleet, exc)
+        await asyncio.sleep(0)
+    return found
+
+
+def _read(payload: bytes) -> Iterable[ToldCamera]:
+    said: Any = json.loads(payload)
+    agent, standby = str(said["agent"]), bool(said.get("standby"))
+    found: list[ToldCamera] = []
+    for name, connected, status, application, holder, reason, epoch, following in said["cameras"]:
+        word = None if status is None else Status(status)
+        summary = CameraSummary(name, agent, bool(connected), word, application, holder, reason)
+        found.append(ToldCamera(summary, int(epoch), int(following), standby))
+    return found
+
+
+def by_name(told: Iterable[ToldCamera], better: Callable[[ToldCamera], Any]) -> dict[str, Any]:
+    """Return one for each name: where two agents have it for a moment, the better one."""
+    found: dict[str, ToldCamera] = {}
+    for one in told:
+        known = found.get(one.summary.camera)
+        if known is None or better(one) > better(known):
+            found[one.summary.camera] = one
+    return found

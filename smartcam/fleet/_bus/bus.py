@@ -1,0 +1,477 @@
+"""The bus of a fleet: programs and agents say things under keys, and hear what others say.
+
+A key is chunks joined by ``/``; in a pattern ``*`` is one chunk and ``**`` any number of them. What
+one says comes to each who hears, in the order of saying, or not at all: a bus may lose, and never
+waits for anybody. So whoever needs to know numbers what it says.
+
+:class:`MemoryBus` is the one inside a process; :mod:`smartcam.fleet._bus.zenoh` has the one between
+them. Everything here belongs to one event loop, and every callback runs in it.
+"""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+from smartcam.fleet._bus.keys import meets
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from typing import Self
+
+    from smartcam.fleet._security.certificates import Identity
+
+Data = bytes | bytearray | memoryview
+
+
+def never(_: str) -> bool:
+    """Return that nothing with a key is patient."""
+    return False
+
+
+def always(_: str) -> bool:
+    """Return that all with a key is patient."""
+    return True
+
+
+class Handle(abc.ABC):
+    """Something that lasts until it is closed."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """End it; idempotent."""
+
+
+class Publisher(Handle):
+    """An end that publishes under one key, again and again."""
+
+    @property
+    @abc.abstractmethod
+    def heard(self) -> bool:
+        """True if anybody hears the publisher, as far as is known."""
+
+    @abc.abstractmethod
+    def put(self, payload: bytes) -> None:
+        """Say it; never blocks."""
+
+
+class Bus(abc.ABC):
+    """One end of a bus: a program's, or an agent's.
+
+    Attributes:
+        local: whether all ends are in this event loop: parts are then handed on without a copy, and
+            all ends have one clock.
+        identity: identity in the certificate of this end; None without a certificate.
+    """
+
+    local: bool = False
+    identity: Identity | None = None
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes that wait to be said; 0 where nothing ever waits."""
+        return 0
+
+    @property
+    @abc.abstractmethod
+    def reached(self) -> bool:
+        """True if this end is on the bus now, as far as it knows: open, and not cut off."""
+
+    @abc.abstractmethod
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus.
+
+        Raises:
+            ConnectFailedError: there is none within ``timeout`` seconds.
+        """
+
+    @abc.abstractmethod
+    async def close(self) -> None:
+        """Leave the bus; all declarations of this end are gone then. Idempotent."""
+
+    @abc.abstractmethod
+    def put(self, key: str, payload: bytes) -> None:
+        """Say something that somebody waits for; never blocks."""
+
+    @abc.abstractmethod
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        """Send a part of something large behind all else, with a head that describes the part.
+
+        It is dropped where there is no room; never blocks. Nobody may write into ``data`` later.
+        """
+
+    @abc.abstractmethod
+    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+        """Have ``hear(key, head, data)`` called for parts that are said under ``pattern``."""
+
+    @abc.abstractmethod
+    def publisher(
+        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+    ) -> Publisher:
+        """Return a publisher of messages under ``key``.
+
+        Args:
+            key: key of the messages.
+            on_heard: callback told whether anybody hears the key, when that changes.
+            urgent: whether messages wait in one line with those of :meth:`put`; else behind them.
+        """
+
+    @abc.abstractmethod
+    def subscribe(
+        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+    ) -> Handle:
+        """Have ``hear(key, payload)`` called for messages under ``pattern``.
+
+        Args:
+            pattern: pattern of the keys.
+            hear: the callback.
+            patient: whether messages wait behind all others, with a bound of their own.
+        """
+
+    @abc.abstractmethod
+    def answer(
+        self,
+        pattern: str,
+        answer: Callable[[BusQuestion], None],
+        *,
+        patient: Callable[[str], bool] = never,
+    ) -> Handle:
+        """Have ``answer(question)`` called for questions under ``pattern``.
+
+        Args:
+            pattern: pattern of the keys.
+            answer: the callback.
+            patient: whether a question with a key waits as one that is said, see :meth:`subscribe`.
+                It is called in any thread.
+        """
+
+    @abc.abstractmethod
+    async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+        """Return the answers to a question that come within ``timeout`` seconds, by their keys."""
+
+    @abc.abstractmethod
+    def be_present(self, key: str) -> Handle:
+        """Have all know that this end is there, until it is not."""
+
+    @abc.abstractmethod
+    async def present(self, pattern: str, timeout: float) -> list[str]:
+        """Return the keys of the ends that are there, as known within ``timeout`` seconds."""
+
+    @abc.abstractmethod
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        """Have ``see(key, present)`` called for ends that are there, and that come and go."""
+
+
+class BusQuestion(abc.ABC):
+    """A question on the bus, waiting for its answer.
+
+    Attributes:
+        key: key that is asked for, or a pattern.
+        payload: bytes that come with the question.
+    """
+
+    key: str
+    payload: bytes
+
+    @abc.abstractmethod
+    def reply(self, key: str, payload: bytes) -> None:
+        """Answer; several times if there is more than one key to answer for.
+
+        It may be that nothing is said before the question is closed.
+        """
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Close the end, since there is nothing more to say; never block. Idempotent."""
+
+
+# ---------------------------------------------------------------------- inside a process
+
+
+class MemoryBus:
+    """A bus inside this process, for ends in one event loop.
+
+    ``MemoryBus().end()`` gives an end. Deliveries are calls of the event loop, in order.
+    """
+
+    def __init__(self) -> None:
+        self.ends: list[MemoryEnd] = []
+
+    def end(self) -> MemoryEnd:
+        """Return an end that is not open yet."""
+        return MemoryEnd(self)
+
+
+class _Patterned(Protocol):
+    pattern: str
+
+
+P = TypeVar("P", bound=_Patterned)
+
+
+class _ByPattern(Generic[P]):
+    """The declarations of one kind at an end, by pattern: of thousands, those that a key means."""
+
+    def __init__(self) -> None:
+        self._exact: dict[str, dict[P, None]] = {}
+        self._wild: dict[P, None] = {}
+
+    def __iter__(self) -> Iterator[P]:
+        for same in (*self._exact.values(), self._wild):
+            yield from tuple(same)
+
+    def __contains__(self, one: P) -> bool:
+        return one in self._wild or one in self._exact.get(one.pattern, ())
+
+    def add(self, one: P) -> None:
+        same = self._wild if "*" in one.pattern else self._exact.setdefault(one.pattern, {})
+        same[one] = None
+
+    def remove(self, one: P) -> None:
+        self._wild.pop(one, None)
+        same = self._exact.get(one.pattern, {})
+        same.pop(one, None)
+        if not same:
+            self._exact.pop(one.pattern, None)
+
+    def clear(self) -> None:
+        self._exact.clear()
+        self._wild.clear()
+
+    def meeting(self, pattern: str) -> list[P]:
+        """Return the entries whose patterns have a key in common with a pattern, or with a key."""
+        if "*" in pattern:
+            return [one for one in self if meets(one.pattern, pattern)]
+        wild = [one for one in self._wild if meets(one.pattern, pattern)]
+        return [*self._exact.get(pattern, ()), *wild]
+
+
+class _MemoryDeclared(Handle):
+    """A declaration of an end under a pattern."""
+
+    def __init__(
+        self, place: _ByPattern[_MemoryDeclared], pattern: str, call: Callable[..., None]
+    ) -> None:
+        self.pattern = pattern
+        self.call = call
+        self._place = place
+        self._after: Callable[[], None] = _nothing
+        place.add(self)
+
+    def then(self, after: Callable[[], None]) -> Self:
+        """Have ``after`` called once it is closed."""
+        self._after = after
+        return self
+
+    @property
+    def closed(self) -> bool:
+        """True once the declaration is closed."""
+        return self not in self._place
+
+    def close(self) -> None:
+        if not self.closed:
+            self._place.remove(self)
+            self._after()
+
+
+class MemoryEnd(Bus):
+    """One end of a :class:`MemoryBus`."""
+
+    local = True
+
+    def __init__(self, bus: MemoryBus) -> None:
+        self._bus = bus
+        self.heard_parts = _ByPattern[_MemoryDeclared]()
+        self.heard = _ByPattern[_MemoryDeclared]()
+        self.answered = _ByPattern[_MemoryDeclared]()
+        self.watched = _ByPattern[_MemoryDeclared]()
+        self.present_here = _ByPattern[_MemoryDeclared]()
+        self.publishers = _ByPattern[_MemoryPublisher]()
+
+    @property
+    def attached(self) -> bool:
+        """True if this end is on the bus now: open, and not cut off."""
+        return self in self._bus.ends
+
+    @property
+    def reached(self) -> bool:
+        return self.attached
+
+    async def open(self, timeout: float) -> Self:
+        self._loop = asyncio.get_running_loop()
+        self.attach()
+        return self
+
+    async def close(self) -> None:
+        self.detach()
+        places = (self.heard, self.heard_parts, self.answered, self.watched, self.present_here)
+        for place in places:
+            place.clear()
+
+    def attach(self) -> None:
+        """Come to the bus, or back to it."""
+        if not self.attached:
+            self._bus.ends.append(self)
+            self._tell_presence(True)
+            self._tell_heard("**")
+
+    def detach(self) -> None:
+        """Be cut off from it, as by a broken cable: both sides see the other go."""
+        if self.attached:
+            self._tell_presence(False)
+            self._bus.ends.remove(self)
+            self._tell_heard("**")
+
+    def put(self, key: str, payload: bytes) -> None:
+        for end in self._others():
+            for one in end.heard.meeting(key):
+                self._loop.call_soon(_call, one, key, payload)
+
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        for end in self._others():
+            for one in end.heard_parts.meeting(key):
+                self._loop.call_soon(_call, one, key, head, data)
+
+    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+        return _MemoryDeclared(self.heard_parts, pattern, hear)
+
+    def publisher(
+        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+    ) -> Publisher:
+        return _MemoryPublisher(self, self.publishers, key, on_heard)
+
+    def subscribe(
+        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+    ) -> Handle:
+        made = _MemoryDeclared(self.heard, pattern, hear)
+        self._tell_heard(pattern)
+        return made.then(lambda: self._tell_heard(pattern))
+
+    def answer(
+        self,
+        pattern: str,
+        answer: Callable[[BusQuestion], None],
+        *,
+        patient: Callable[[str], bool] = never,
+    ) -> Handle:
+        return _MemoryDeclared(self.answered, pattern, answer)
+
+    async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+        questions = [
+            (one, _MemoryQuestion(pattern, payload))
+            for end in self._others()
+            for one in end.answered.meeting(pattern)
+        ]
+        for one, question in questions:
+            self._loop.call_soon(_call, one, question)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                for _, question in questions:
+                    await question.done.wait()
+        return [answer for _, question in questions for answer in question.answers]
+
+    def be_present(self, key: str) -> Handle:
+        made = _MemoryDeclared(self.present_here, key, _nothing)
+        self._tell(key, True)
+        return made.then(lambda: self._tell(key, False))
+
+    async def present(self, pattern: str, timeout: float) -> list[str]:
+        return [one.pattern for end in self._others() for one in end.present_here.meeting(pattern)]
+
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        made = _MemoryDeclared(self.watched, pattern, see)
+        for end in self._others():
+            for one in end.present_here.meeting(pattern):
+                self._loop.call_soon(_call, made, one.pattern, True)
+        return made
+
+    # ------------------------------------------------------------------ among ends
+
+    def _others(self) -> list[MemoryEnd]:
+        """Return the ends that hear this one: all on the bus, itself too."""
+        return list(self._bus.ends) if self.attached else []
+
+    def _tell_presence(self, present: bool) -> None:
+        """Tell all what of this end is there or not, and this one what of all."""
+        for end in self._others():
+            for one in end.present_here:
+                if end is not self:
+                    for watch in self.watched.meeting(one.pattern):
+                        self._loop.call_soon(_call, watch, one.pattern, present)
+        for one in self.present_here:
+            self._tell(one.pattern, present)
+
+    def _tell(self, key: str, present: bool) -> None:
+        for end in self._others():
+            for one in end.watched.meeting(key):
+                self._loop.call_soon(_call, one, key, present)
+
+    def _tell_heard(self, pattern: str) -> None:
+        """Have whoever says what a pattern means see whether anybody hears."""
+        for end in self._bus.ends:
+            for one in end.publishers.meeting(pattern):
+                one.look()
+
+    def is_heard(self, key: str) -> bool:
+        """Return True if anybody hears this end's messages under ``key``."""
+        return any(end.heard.meeting(key) for end in self._others())
+
+
+class _MemoryPublisher(Publisher):
+    def __init__(
+        self,
+        end: MemoryEnd,
+        place: _ByPattern[_MemoryPublisher],
+        key: str,
+        on_heard: Callable[[bool], None] | None,
+    ) -> None:
+        self.pattern = key
+        self._end, self._place = end, place
+        self._on_heard = on_heard
+        self._heard = False
+        place.add(self)
+        self.look()
+
+    @property
+    def heard(self) -> bool:
+        return self._heard
+
+    def look(self) -> None:
+        """See whether anybody hears."""
+        heard = self._end.is_heard(self.pattern)
+        if heard != self._heard:
+            self._heard = heard
+            if self._on_heard is not None:
+                self._on_heard(heard)
+
+    def put(self, payload: bytes) -> None:
+        self._end.put(self.pattern, payload)
+
+    def close(self) -> None:
+        self._place.remove(self)
+
+
+class _MemoryQuestion(BusQuestion):
+    def __init__(self, key: str, payload: bytes) -> None:
+        self.key, self.payload = key, payload
+        self.answers: list[tuple[str, bytes]] = []
+        self.done = asyncio.Event()
+
+    def reply(self, key: str, payload: bytes) -> None:
+        if not self.done.is_set():
+            self.answers.append((key, payload))
+
+    def close(self) -> None:
+        self.done.set()
+
+
+def _call(one: _MemoryDeclared, *arguments: object) -> None:
+    """Call back what is still wanted; an error in it is nobody else's."""
+    if not one.closed:
+        one.call(*arguments)
+
+
+def _nothing(*_: object) -> None:
+    pass

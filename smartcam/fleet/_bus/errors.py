@@ -1,0 +1,103 @@
+"""Errors on their way over the bus: their kind, text and attributes, and what caused them."""
+
+from __future__ import annotations
+
+import builtins
+import contextlib
+from typing import Any, cast
+
+import smartcam.exceptions
+from smartcam.exceptions import (
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.models import jsonable
+
+MAX_CHAIN = 8
+"""Causes behind causes of one error that cross the bus at most."""
+
+
+def to_fields(error: BaseException, depth: int = MAX_CHAIN) -> dict[str, Any]:
+    """Return an error as JSON. One that is not known crosses as the nearest that is."""
+    known = next((kind.__name__ for kind in type(error).__mro__ if kind.__name__ in _KINDS), None)
+    if known is None:
+        fields: dict[str, Any] = {
+            "kind": SmartCamError.__name__,
+            "text": f"{type(error).__name__}: {error}",
+        }
+    else:
+        # the text of a KeyError is its argument in quotes
+        text = error.args[0] if isinstance(error, KeyError) and error.args else error
+        fields = {"kind": known, "text": str(text)}
+    own = vars(error) if isinstance(error, SmartCamError) else {}
+    attributes = {name: _said(value) for name, value in own.items() if name[0] != "_"}
+    if attributes:
+        fields["attributes"] = attributes
+    if error.__cause__ is not None and depth:
+        fields["cause"] = to_fields(error.__cause__, depth - 1)
+    return fields
+
+
+def from_fields(fields: Any) -> SmartCamError:
+    """Return the error that is said by ``fields``."""
+    error = _from_fields(fields)
+    if isinstance(error, SmartCamError):
+        return error
+    return SmartCamError(f"{type(error).__name__}: {error}")
+
+
+def _from_fields(fields: Any) -> BaseException:
+    if not isinstance(fields, dict):
+        return RemoteProtocolError(f"the agent's error is none: {fields!r:.80}")
+    said = cast("dict[str, Any]", fields)
+    error = _KINDS.get(str(said.get("kind")), SmartCamError)(str(said.get("text", "")))
+    attributes: Any = said.get("attributes")
+    if isinstance(attributes, dict):
+        for name, value in cast("dict[str, Any]", attributes).items():
+            if name in vars(error):  # the kind's own, with their defaults
+                setattr(error, name, _meant(value))
+    if "cause" in said:
+        error.__cause__ = _from_fields(said["cause"])
+    return error
+
+
+def _said(value: object) -> Any:
+    """Return an attribute's value as JSON, which has no tuples and no bytes."""
+    if isinstance(value, (tuple, bytes)):
+        return {type(value).__name__: jsonable(value)}
+    return jsonable(value)
+
+
+def _meant(value: Any) -> Any:
+    if isinstance(value, dict):
+        said = cast("dict[str, Any]", value)
+        if said.keys() == {"tuple"} and isinstance(said["tuple"], list):
+            return tuple(said["tuple"])
+        if said.keys() == {"bytes"} and isinstance(said["bytes"], str):
+            with contextlib.suppress(ValueError):
+                return bytes.fromhex(said["bytes"])
+    return cast("object", value)
+
+
+_KINDS: dict[str, type[BaseException]] = {
+    **{
+        name: kind
+        for name, kind in vars(builtins).items()
+        if isinstance(kind, type) and issubclass(kind, (OSError, LookupError, ValueError))
+        if not issubclass(kind, UnicodeError)  # made of more than a text
+    },
+    **{
+        name: getattr(smartcam.exceptions, name)
+        for name in smartcam.exceptions.__all__
+        if issubclass(getattr(smartcam.exceptions, name), SmartCamError)
+    },
+}
+"""Classes that an error may have on the other side: smartcam's and, for causes, the system's."""
+
+
+def late(said: str, text: str) -> SmartCamError:
+    """Return the error of a call whose time was over before it was done."""
+    kind = TriggerTimeoutError if "trigger" in said.lower() else ResponseTimeoutError
+    return kind(text)

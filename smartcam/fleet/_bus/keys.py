@@ -1,0 +1,174 @@
+"""The keys of a fleet, and which pattern means which key. ``docs/bus.md`` lists them."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ROOT = "smartcam"
+
+ANYONE = "anyone"
+"""The role of a program whose certificate has none, or that has no certificate."""
+
+COMMANDS = frozenset(
+    {
+        "trigger",
+        "switch_application",
+        "ensure",
+        "enter",
+        "leave",
+        "start",
+        "stop",
+        "reset_errors",
+        "set_clock",
+        "set_input",
+        "set_sequence_number",
+        "reboot",
+        "take_back",
+        "request",
+        "reserve",
+        "release",
+        "set_feature",
+        "execute_feature",
+        "trigger_frame",
+    }
+)
+"""Calls that change something, or keep others from doing so; all others are questions."""
+
+FENCED = COMMANDS - {"release", "leave"}
+"""Commands that say in which reservation's block they are called, and are not done without it."""
+
+
+@lru_cache(maxsize=4096)
+def meets(one: str, other: str) -> bool:
+    """Return True if two patterns share a key: ``*`` is one chunk, ``**`` any number."""
+    return _meet(tuple(one.split("/")), tuple(other.split("/")))
+
+
+def _meet(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Return True if the chunks of two patterns meet, in as many steps as pairs of chunks."""
+    # for each beginning of the other one: whether what was seen of the first meets it
+    row: list[bool] = [True]
+    for chunk in other:
+        row.append(row[-1] and chunk == "**")
+    for chunk in one:
+        before, row = row, [row[0] and chunk == "**"]
+        for place, following in enumerate(other):
+            if "**" in (chunk, following):
+                row.append(before[place + 1] or row[-1])
+            else:
+                row.append(before[place] and _same(chunk, following))
+    return row[-1]
+
+
+def _same(one: str, other: str) -> bool:
+    return one == other or "*" in {one, other} or _fits(one, other) or _fits(other, one)
+
+
+def _fits(pattern: str, chunk: str) -> bool:
+    """Return True if a chunk fits a pattern such as ``cam$*``, which the engine knows, too."""
+    first, *parts = pattern.split("$*")
+    if not parts or not chunk.startswith(first):
+        return False
+    *parts, last = parts
+    place = len(first)
+    for part in parts:  # each as early as it can be: then there is most room for the others
+        place = chunk.find(part, place)
+        if place < 0:
+            return False
+        place += len(part)
+    return len(chunk) - place >= len(last) and chunk.endswith(last)
+
+
+class Keys:
+    """The keys of one fleet.
+
+    What is said under which prefix decides who may say it: commands, questions, results, states,
+    presence and what other programs use have prefixes of their own.
+
+    Args:
+        fleet: name of the fleet.
+    """
+
+    def __init__(self, fleet: str) -> None:
+        self.fleet = fleet
+        self.root: str = f"{ROOT}/{fleet}"
+
+    def agent(self, agent: str) -> str:
+        """Presence of an agent."""
+        return f"{self.root}/presence/agent/{agent}"
+
+    def start(self, agent: str, start: str) -> str:
+        """Presence of one start of an agent, by which two agents of one name see each other."""
+        return f"{self.root}/presence/start/{agent}/{start}"
+
+    def camera(self, agent: str, camera: str) -> str:
+        """Presence of a camera: its agent has it, whether it is connected or not."""
+        return f"{self.root}/presence/camera/{agent}/{camera}"
+
+    def program(self, program: str) -> str:
+        """Presence of a program that calls; ``program`` is its name and its secret."""
+        return f"{self.root}/presence/program/{program}"
+
+    def command(self, agent: str, camera: str) -> str:
+        """Return the key of commands to a camera's agent."""
+        return f"{self.root}/command/{agent}/{camera}"
+
+    def ask(self, role: str, agent: str, camera: str) -> str:
+        """Return the key of a role's questions to a camera's agent, which change nothing."""
+        return f"{self.root}/ask/{role}/{agent}/{camera}"
+
+    def reload(self, agent: str) -> str:
+        """Have an agent read its file again."""
+        return f"{self.root}/administer/{agent}/reload"
+
+    def reply(self, program: str) -> str:
+        """Return the key of replies to a program."""
+        return f"{self.root}/reply/{program}"
+
+    def frames(self, program: str) -> str:
+        """Return the key of frames' bytes, to a program that has asked for them."""
+        return f"{self.root}/frames/{program}"
+
+    def states(self, camera: str) -> str:
+        """Return the key of a camera's states."""
+        return f"{self.root}/states/{camera}"
+
+    def results(self, camera: str) -> str:
+        """Return the key of a camera's results."""
+        return f"{self.root}/results/{camera}"
+
+    def bundle(self, agent: str) -> str:
+        """Return the key of the results of all cameras of an agent, together."""
+        return f"{self.root}/bundle/{agent}"
+
+    def summary(self, agent: str) -> str:
+        """Return the key at which an agent answers for all its cameras; in JSON."""
+        return f"{self.root}/summary/{agent}"
+
+    def listing(self, camera: str) -> str:
+        """Return the key at which a camera's description is asked for; in JSON."""
+        return f"{self.root}/cameras/{camera}"
+
+    def topic(self, kind: str, camera: str) -> str:
+        """Return the key of a camera's ``results``, ``status`` or ``events`` in JSON."""
+        return f"{self.root}/topic/{kind}/{camera}"
+
+    def service(self, camera: str, name: str) -> str:
+        """Return the key of a service for programs without smartcam."""
+        return f"{self.root}/service/{camera}/{name}"
+
+    def thesis(self, name: str) -> str:
+        """Return the key of a service of the thesis' interface."""
+        return f"{self.root}/thesis/{name}"
+
+    def thesis_topic(self, name: str) -> str:
+        """Return the key of a topic of somebody's choice."""
+        return f"{self.root}/thesis/topic/{name}"
+
+    def tail(self, key: str, kind: str) -> list[str]:
+        """Return the chunks of ``key`` behind ``kind``, such as ``presence/camera``."""
+        return key.removeprefix(f"{self.root}/{kind}/").split("/")

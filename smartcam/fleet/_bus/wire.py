@@ -1,0 +1,473 @@
+"""Turn the messages between smartcam's own ends of a fleet into bytes, and back.
+
+A message is a JSON object with byte strings behind it: calls, replies, what the camera is. Results
+go as runs: containers of one camera that came together, with consecutive numbers. What each trigger
+needs goes as a few numbers instead of JSON, which costs most of all: its call
+(:class:`TriggerOrder`), its reply (:class:`TriggerReply`), and the statuses meanwhile. Everything
+is little endian. ``docs/bus.md`` has the layouts.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from smartcam.exceptions import RemoteProtocolError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+
+def grace(timeout: float) -> float:
+    """Return the seconds for which a reply is awaited beyond a call's own.
+
+    So the agent gives up first. Half of it may go by until the call is there; then the call has
+    all its time.
+    """
+    return min(0.25, 0.02 + 0.1 * timeout)
+
+
+class BusMessage(NamedTuple):
+    """A JSON object, and the byte strings that came behind it."""
+
+    fields: dict[str, Any]
+    blobs: list[bytes]
+
+
+_LENGTH = struct.Struct("<I")
+_as_json = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
+
+def encode_state(fields: dict[str, Any]) -> bytes:
+    """Return the fields of an event as bytes: one of a message's byte strings."""
+    return _as_json(fields).encode()
+
+
+_STATUS = struct.Struct("<4sQQIq")
+_IS_STATUS = b"scs1"
+_NONE = -(1 << 63)  # in place of a number
+
+
+def encode_status(number: int, status: int, endian: int, application: int | None) -> bytes:
+    """Return a status of a session as bytes, as :func:`encode_state` does; ``number`` is its own.
+
+    Raises:
+        struct.error: it does not fit.
+    """
+    return _STATUS.pack(
+        _IS_STATUS, number, status, endian, _NONE if application is None else application
+    )
+
+
+def decode_state(data: bytes) -> dict[str, Any]:
+    """Return the fields of an event.
+
+    Raises:
+        ValueError: it is nothing of the kind.
+    """
+    if data[:4] == _IS_STATUS and len(data) == _STATUS.size:
+        _, number, status, endian, application = _STATUS.unpack(data)
+        return {
+            "kind": "Status",
+            "connected": True,
+            "number": number,
+            "status": status,
+            "endian": endian,
+            "application": None if application == _NONE else application,
+        }
+    said: Any = json.loads(str(data, "utf-8"))
+    if not isinstance(said, dict) or not isinstance(cast("Any", said).get("number"), int):
+        raise ValueError(f"no state: {data[:40]!r}")  # noqa: TRY004 - as json's own
+    return cast("dict[str, Any]", said)
+
+
+def encode(fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> bytes:
+    """Return a message as bytes."""
+    if blobs:
+        fields = {**fields, "blobs": [len(one) for one in blobs]}
+    head = _as_json(fields).encode()
+    return b"".join((_LENGTH.pack(len(head)), head, *blobs))
+
+
+def decode(payload: bytes, what: str) -> BusMessage:
+    """Return the message in ``payload``.
+
+    Raises:
+        RemoteProtocolError: it is none; ``what`` is said to be broken.
+    """
+    try:
+        (size,) = _LENGTH.unpack_from(payload)
+        end = _LENGTH.size + size
+        if end > len(payload):
+            raise ValueError(f"{size} bytes of JSON were announced, {len(payload)} came in all")
+        fields: Any = json.loads(str(payload[_LENGTH.size : end], "utf-8"))
+        if not isinstance(fields, dict):
+            raise TypeError(f"a JSON object was expected, not {type(fields).__name__}")
+        known = cast("dict[str, Any]", fields)
+        blobs: list[bytes] = []
+        for length in known.pop("blobs", ()):
+            if not isinstance(length, int) or not 0 <= length <= len(payload) - end:
+                raise ValueError(f"a byte string of {length!r} bytes does not fit")
+            blobs.append(payload[end : end + length])
+            end += length
+        if end != len(payload):
+            raise ValueError(f"{len(payload) - end} bytes are left over")
+    except (ValueError, TypeError, struct.error, RecursionError) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return BusMessage(known, blobs)
+
+
+# ---------------------------------------------------------------------- results
+
+CURRENT, LATE = 1, 2
+"""Flags of a run: not known to be an older trigger's; known to be one's that was given up."""
+
+_RUN = struct.Struct("<QIqIBxxxIIddddI")
+_BATCH = struct.Struct("<4sQQI")
+_MAGIC = b"scr1"
+_NO_NUMBER = math.nan
+_NEVER = 253_402_300_800.0  # the year 10,000, which no datetime has
+
+
+class ResultRun(NamedTuple):
+    """Containers of one application that came together.
+
+    Attributes:
+        number: the agent's number of the first container; the others follow.
+        application: application that sent the containers; below 0 where the camera says none.
+        endian: the byte order that the camera's last status told.
+        flags: bits on what is known of all the containers.
+        owner: the agent's number of the program whose trigger brought the containers; else 0.
+        call: number of the trigger at the program that called for it; else 0.
+        clock: the agent's monotonic clock when they came, seconds.
+        at: when the containers came, seconds since 1970, UTC.
+        triggered_at: when their trigger was sent, the same way; NaN without one.
+        latency: seconds from the trigger to the containers; NaN without a trigger.
+        payloads: bytes of each container.
+        cells: JSON with the values that the one payload was put together from, and what speaks
+            against them; empty without.
+    """
+
+    number: int
+    application: int
+    endian: int
+    flags: int
+    owner: int
+    call: int
+    clock: float
+    at: float
+    triggered_at: float
+    latency: float
+    payloads: list[bytes]
+    cells: bytes = b""
+
+    @property
+    def next(self) -> int:
+        """The number behind it."""
+        return self.number + len(self.payloads)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the containers."""
+        return sum(map(len, self.payloads)) + len(self.cells)
+
+    @property
+    def received_at(self) -> datetime:
+        """Time at which the results came."""
+        return datetime.fromtimestamp(self.at, UTC)
+
+    @property
+    def trigger_time(self) -> datetime | None:
+        """Time at which the results' trigger was sent."""
+        at = self.triggered_at
+        return None if math.isnan(at) else datetime.fromtimestamp(at, UTC)
+
+    def since(self, number: int) -> ResultRun:
+        """Return the part of the run with ``number`` and later numbers."""
+        if number <= self.number:
+            return self
+        return self._replace(number=number, payloads=self.payloads[number - self.number :])
+
+    def encode(self) -> bytes:
+        """Return the run as bytes."""
+        payloads = self.payloads
+        count = len(payloads)
+        head = _RUN.pack(
+            self.number,
+            count,
+            self.application,
+            self.endian,
+            self.flags,
+            self.owner,
+            self.call,
+            self.clock,
+            self.at,
+            self.triggered_at,
+            self.latency,
+            len(self.cells),
+        )
+        lengths = struct.pack(f"<{count}I", *map(len, payloads))
+        return b"".join((head, lengths, *payloads, self.cells))
+
+
+def encode_runs(epoch: int, following: int, runs: Sequence[bytes]) -> bytes:
+    """Return runs as one message; ``following`` is the number that the agent gives next."""
+    return b"".join((_BATCH.pack(_MAGIC, epoch, following, len(runs)), *runs))
+
+
+class Batch(NamedTuple):
+    """Runs, in order; the agent's epoch, and the number that it gives next."""
+
+    epoch: int
+    following: int
+    runs: list[ResultRun]
+
+
+def decode_runs(payload: bytes, what: str) -> Batch:
+    """Return the runs in ``payload``.
+
+    Raises:
+        RemoteProtocolError: it is broken.
+    """
+    try:
+        magic, epoch, following, count = _BATCH.unpack_from(payload)
+        if magic != _MAGIC:
+            raise ValueError(f"it begins with {magic!r}, not {_MAGIC!r}")
+        runs: list[ResultRun] = []
+        place = _BATCH.size
+        for _ in range(count):
+            run, place = _decode_run(payload, place)
+            runs.append(run)
+        if place != len(payload):
+            raise ValueError(f"{len(payload) - place} bytes are left over")
+    except (ValueError, struct.error, OverflowError) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return Batch(epoch, following, runs)
+
+
+def _decode_run(payload: bytes, place: int) -> tuple[ResultRun, int]:
+    number, count, application, endian, flags, owner, call, clock, at, trigger, latency, cells = (
+        _RUN.unpack_from(payload, place)
+    )
+    place += _RUN.size
+    known = 0 <= at < _NEVER and (0 <= trigger < _NEVER or math.isnan(trigger))
+    if not 1 <= count <= (len(payload) - place) // 4 or not known:
+        raise ValueError(f"a run of {count} containers at {at} does not fit")
+    lengths = struct.unpack_from(f"<{count}I", payload, place)
+    place += 4 * count
+    if sum(lengths) + cells > len(payload) - place:
+        raise ValueError(f"{sum(lengths) + cells} bytes of containers do not fit")
+    payloads: list[bytes] = []
+    for length in lengths:
+        payloads.append(payload[place : place + length])
+        place += length
+    end = place + cells
+    run = ResultRun(
+        number,
+        application,
+        endian,
+        flags,
+        owner,
+        call,
+        clock,
+        at,
+        trigger,
+        latency,
+        payloads,
+        payload[place:end],
+    )
+    return run, end
+
+
+# ---------------------------------------------------------------------- triggers
+
+_ORDER = struct.Struct("<4sQQddqqIBB")
+_IS_ORDER = b"sct1"
+_WAIT, _BY_APPLICATION, _INPUT, _RESERVED = 1, 2, 4, 8
+_RESERVATION = struct.Struct("<Q")
+_OUTCOME = struct.Struct("<4sQQdQI")
+_IS_OUTCOME = b"sco1"
+
+
+class TriggerOrder(NamedTuple):
+    """A call for a trigger.
+
+    Attributes:
+        call: number of the call.
+        epoch: number of the start of the agent that is called.
+        deadline: time of the agent's clock at which the call ends, seconds.
+        timeout: seconds that the user gave.
+        application: application to have running for the trigger; None for any.
+        expected: application that the results are to be of; None for any.
+        results: number of results that the trigger is to have.
+        wait: whether to wait until the camera takes the trigger.
+        by_application: whether each application's results are read in a way of their own.
+        data: input of the trigger; None for none.
+        layouts: layouts that have the number of a result in them; None for none.
+        reservation: the call that made the reservation in whose block it is; None outside of one.
+    """
+
+    call: int
+    epoch: int
+    deadline: float
+    timeout: float
+    application: int | None
+    expected: int | None
+    results: int
+    wait: bool
+    by_application: bool
+    data: bytes | None
+    layouts: Any = None
+    reservation: int | None = None
+
+
+def encode_order(program: str, order: TriggerOrder) -> bytes:
+    """Return a call of ``program`` as bytes; as a message where it has more than numbers in it."""
+    number, epoch, deadline, timeout, application, expected, results, wait, each, data = order[:10]
+    layouts, reservation = order.layouts, order.reservation
+    flags = wait * _WAIT | each * _BY_APPLICATION | (data is not None) * _INPUT
+    if reservation is not None:
+        flags |= _RESERVED
+    name = program.encode()
+    if layouts is None:
+        try:
+            fence = b"" if reservation is None else _RESERVATION.pack(reservation)
+            head = _ORDER.pack(
+                _IS_ORDER,
+                number,
+                epoch,
+                deadline,
+                timeout,
+                _NONE if application is None else application,
+                _NONE if expected is None else expected,
+                results,
+                flags,
+                len(name),
+            )
+        except struct.error:
+            pass  # the agent says what is wrong with such numbers
+        else:
+            return b"".join((head, name, fence, data or b""))
+    fields: dict[str, Any] = {
+        "program": program,
+        "call": number,
+        "do": "trigger",
+        "epoch": epoch,
+        "deadline": deadline,
+        "timeout": timeout,
+        "arguments": {
+            "application": application,
+            "expected": expected,
+            "results": results,
+            "wait": wait,
+            "by_application": each,
+            "layouts": layouts,
+        },
+    }
+    if reservation is not None:
+        fields["reservation"] = reservation
+    return encode(fields, () if data is None else (data,))
+
+
+def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
+    """Return the program and its call in ``payload``; None where that is a message.
+
+    Raises:
+        RemoteProtocolError: it is broken; ``what`` is.
+    """
+    if payload[:4] != _IS_ORDER:
+        return None
+    try:
+        (_, number, epoch, deadline, timeout, application, expected, results, flags, size) = (
+            _ORDER.unpack_from(payload)
+        )
+        end = _ORDER.size + size
+        program, reservation = str(payload[_ORDER.size : end], "utf-8"), None
+        if flags & _RESERVED:
+            (reservation,) = _RESERVATION.unpack_from(payload, end)
+            end += _RESERVATION.size
+        if len(payload) < end or (len(payload) > end and not flags & _INPUT):
+            raise ValueError(f"{len(payload)} bytes came, {end} were expected")
+    except (ValueError, struct.error) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return program, TriggerOrder(
+        number,
+        epoch,
+        deadline,
+        timeout,
+        None if application == _NONE else application,
+        None if expected == _NONE else expected,
+        results,
+        bool(flags & _WAIT),
+        bool(flags & _BY_APPLICATION),
+        payload[end:] if flags & _INPUT else None,
+        None,
+        reservation,
+    )
+
+
+class TriggerReply(NamedTuple):
+    """The reply to a trigger that has succeeded.
+
+    Attributes:
+        call: the number of the call.
+        epoch: number of the agent's start.
+        clock: time of the agent's clock, seconds.
+        states: the number that the agent gives what happens next.
+        told: what happened and was not said before.
+        batch: results of the trigger, and the number that the agent gives the next one.
+    """
+
+    call: int
+    epoch: int
+    clock: float
+    states: int
+    told: list[bytes]
+    batch: Batch
+
+
+def encode_outcome(
+    call: int, epoch: int, clock: float, states: int, told: Sequence[bytes], runs: bytes
+) -> bytes:
+    """Return a reply as bytes; ``runs`` is what :func:`encode_runs` gives, the rest as it has."""
+    count = len(told)
+    head = _OUTCOME.pack(_IS_OUTCOME, call, epoch, clock, states, count)
+    lengths = struct.pack(f"<{count}I", *map(len, told))
+    return b"".join((head, lengths, *told, runs))
+
+
+def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
+    """Return the reply to a trigger in ``payload``; None where that is a message.
+
+    Raises:
+        RemoteProtocolError: it is broken; ``what`` is.
+    """
+    if payload[:4] != _IS_OUTCOME:
+        return None
+    try:
+        _, call, epoch, clock, states, count = _OUTCOME.unpack_from(payload)
+        place = _OUTCOME.size
+        lengths = struct.unpack_from(f"<{count}I", payload, place)
+        place += 4 * count
+        told: list[bytes] = []
+        for length in lengths:
+            told.append(payload[place : place + length])
+            place += length
+        if place > len(payload):
+            raise ValueError(f"{place} bytes were announced, {len(payload)} came")
+    except (ValueError, struct.error) as exc:
+        raise RemoteProtocolError(f"{what} is broken: {exc}") from exc
+    return TriggerReply(call, epoch, clock, states, told, decode_runs(payload[place:], what))
+
+
+def timestamp(at: datetime | None) -> float:
+    """Return a time as seconds since 1970; NaN for None."""
+    return _NO_NUMBER if at is None else at.timestamp()
+
+
+def joined(runs: Iterable[ResultRun]) -> list[bytes]:
+    """Return runs as bytes."""
+    return [run.encode() for run in runs]

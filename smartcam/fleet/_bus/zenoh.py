@@ -1,0 +1,467 @@
+"""The bus between processes and hosts: Zenoh, whose binding calls back in threads of its own.
+
+What comes is put into one queue, and a burst wakes the event loop once. Nothing is said in a way
+that could make the loop wait: what does not fit into the engine's buffers is dropped there, and who
+hears it finds the gap by the numbers. What is long, or much, goes out in a thread, which may wait.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import functools
+import logging
+import re
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from smartcam._zenoh import (
+    MAX_WAITING_BYTES,
+    NOT_ZENOH,
+    QUERY_BYTES,
+    BusLink,
+    ZenohDeclared,
+    ZenohSession,
+    direct,
+    quietly,
+)
+from smartcam.exceptions import ConnectFailedError, SmartCamError
+from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle, Publisher, never
+from smartcam.fleet._security.certificates import LOOK, read_identity, shake_hands
+from smartcam.fleet._security.door import plain_host
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from typing import Self
+
+    from smartcam.fleet._bus.bus import Data
+    from smartcam.fleet._security.certificates import Identity
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+LONG = 1 << 16
+"""Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
+
+LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
+"""The place of the other end of a connection, as the engine writes it."""
+
+CALM = 0.01
+"""Seconds in which a few messages go out at once, and further ones together."""
+
+MAX_EXPRESS_MESSAGES, MAX_DIRECT_MESSAGES = 8, 64
+"""Messages in that time that each go out at once, and those that the loop says itself. The engine
+has room for 16 packets of a kind on their way: the next go in packets of many, up to a millisecond
+later, and what comes then is said by the thread, for the engine would drop it."""
+
+
+class ZenohEnd(ZenohSession, Bus):
+    """One end of a bus that Zenoh makes.
+
+    Args:
+        link: endpoints and certificates by which this end joins the bus.
+        more: further settings of the engine, by their paths.
+    """
+
+    def __init__(self, link: BusLink, more: Mapping[str, Any] | None = None) -> None:
+        super().__init__(link, more)
+        self._warned: tuple[bytes, int] | None = None
+        self._looking: asyncio.Task[None] | None = None
+        self._sender: ThreadPoolExecutor | None = None
+        self._sending = 0
+        self._behind: collections.Counter[str] = collections.Counter()
+        self._calm_since, self._said = -CALM, 0
+        zenoh = self._zenoh
+        control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
+        self._dropping, self._waiting_for_room = (
+            {
+                express: {"priority": priority, "express": express, "congestion_control": one}
+                for express in (False, True)
+            }
+            for one in (control.DROP, control.BLOCK)
+        )
+        self._behind_all = {
+            "priority": zenoh.Priority.DATA_LOW,
+            "express": True,
+            "congestion_control": control.DROP,
+        }
+
+    def _threads(self) -> list[ThreadPoolExecutor]:
+        sender, self._sender = self._sender, None
+        return super()._threads() + ([] if sender is None else [sender])
+
+    # ------------------------------------------------------------------ life
+
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus.
+
+        Raises:
+            ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds; the
+                text says what is wrong with a certificate.
+            ConfigurationError: the certificates cannot work.
+        """
+        folder = self._link.certificates
+        if folder is None:
+            return await self._open_plain(timeout)
+        loop = asyncio.get_running_loop()
+        end = loop.time() + timeout
+        await self.look_at_certificates()
+        try:
+            await super().open(timeout - min(LOOK, timeout / 3))  # to find out why not
+        except ConnectFailedError as exc:
+            if self._link.listen:
+                raise
+            if why := await self._why_refused(Path(folder), end - loop.time()):
+                raise self._failed(why) from exc
+            raise
+        self._looking = loop.create_task(self._look_now_and_then(), name="smartcam.fleet.look")
+        return self
+
+    async def _open_plain(self, timeout: float) -> Self:
+        try:
+            return await super().open(timeout)
+        except ConnectFailedError as exc:
+            if exc.attempts[0] != NOT_ZENOH:
+                raise
+            text = f"{exc}, or it wants TLS and a certificate: fleet+tls://"
+            raise ConnectFailedError(text, attempts=exc.attempts) from exc
+
+    async def close(self) -> None:
+        """Leave the bus; what was declared is gone with it. Idempotent."""
+        looking, self._looking = self._looking, None
+        if looking is not None:
+            looking.cancel()
+        await super().close()
+
+    async def look_at_certificates(self) -> Identity:
+        """Read whose its certificates are, as they are now; warn if they end soon, also later.
+
+        Raises:
+            ConnectFailedError: they have expired.
+            ConfigurationError: they cannot work.
+        """
+        folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
+        identity = await loop.run_in_executor(None, read_identity, folder)
+        if identity.expired:
+            raise self._failed(identity.expired)
+        said = identity.digest, identity.urgency
+        if identity.urgency and said != self._warned:
+            logger.warning("%s ! %s", self._link.place, identity.warning)
+        self._warned, self.identity = said, identity
+        return identity
+
+    async def _look_now_and_then(self) -> None:
+        """Warn of certificates that end soon, as long as it is open."""
+        while self.identity is not None:
+            await asyncio.sleep(self.identity.look_after)
+            try:
+                await self.look_at_certificates()
+            except SmartCamError as exc:
+                logger.error("%s ! %s", self._link.place, exc)  # noqa: TRY400 - the text says it
+
+    async def _why_refused(self, folder: Path, left: float) -> str:
+        """Return one endpoint's objection to a handshake; empty if no endpoint has any."""
+        each = max(0.0, min(LOOK, left / len(self._link.connect)))
+        for endpoint in self._link.connect:
+            kind, _, place = endpoint.partition("/")
+            host, _, port = place.rpartition(":")
+            if kind == "tls":
+                found = await shake_hands(host.strip("[]"), int(port), folder, each)
+                if found.trouble:
+                    return found.trouble
+        return ""
+
+    @property
+    def reached(self) -> bool:
+        session = self._session
+        if session is None:
+            return False
+        # links, for the engine tells that all are gone before it forgets the router that was lost
+        return bool(self._link.mode != "client" or session.info.links())
+
+    def linked(self) -> set[tuple[str, int]] | None:
+        """Return the places of the ends that have come in; None while they are not known."""
+        if self._session is None:
+            return None
+        found = (place_of(str(link.dst)) for link in self._session.info.links())
+        return {place for place in found if place is not None}
+
+    # ------------------------------------------------------------------ what is said
+
+    @property
+    def waiting_bytes(self) -> int:
+        return self._sending
+
+    def put(self, key: str, payload: bytes) -> None:
+        session = self._session
+        if session is None:
+            return
+        now = self._loop.time()
+        if now - self._calm_since > CALM:
+            self._calm_since, self._said = now, 0
+        self._said += 1
+        # what is said by itself goes out at once, a burst together: there is not room for many
+        express = self._said <= MAX_EXPRESS_MESSAGES
+        # a router, and a peer, has one to each who listens
+        way = "" if self._link.mode == "client" else key
+        if len(payload) > LONG or self._said > MAX_DIRECT_MESSAGES or way in self._behind:
+            self._hand_over(way, session, key, payload, self._waiting_for_room[express])
+            return
+        try:
+            session.put(key, payload, **self._dropping[express])
+        except self._zenoh.ZError as exc:  # it ends meanwhile
+            logger.debug("the fleet's bus: %s", exc)
+
+    def put_part(self, key: str, head: bytes, data: Data) -> None:
+        if self._session is not None:
+            said = bytes(data) if isinstance(data, memoryview) else data
+            quietly(self._session.put, key, said, attachment=head, **self._behind_all)
+
+    def subscribe_parts(self, pattern: str, hear: Callable[[str, bytes, Data], None]) -> Handle:
+        def on_sample(sample: Any) -> None:
+            head = sample.attachment
+            data = sample.payload.to_bytes()
+            if head is not None and not self.full(len(data)):
+                said, key = head.to_bytes(), str(sample.key_expr)
+                self.in_loop(declared.call, len(data), hear, key, said, data)
+
+        declared = _OnBus(self)
+        return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
+
+    def _hand_over(
+        self, way: str, session: Any, key: str, payload: bytes, how: dict[str, Any]
+    ) -> None:
+        """Have a thread say it, which waits until there is room; what goes the same way, too."""
+        if self._sender is None:
+            self._sender = ThreadPoolExecutor(1, "smartcam-fleet")
+        size = len(payload)
+        if self._sending + size > MAX_WAITING_BYTES:
+            logger.warning("%s ! %d bytes wait to be said; more is dropped", key, self._sending)
+            return
+
+        def say() -> None:
+            _put(session, key, payload, how)
+            with self._lock:
+                self._sending -= size
+                self._behind[way] -= 1
+                if not self._behind[way]:
+                    del self._behind[way]
+
+        with self._lock:
+            self._sending += size
+            self._behind[way] += 1
+        self._sender.submit(say)
+
+    def publisher(
+        self, key: str, on_heard: Callable[[bool], None] | None = None, *, urgent: bool = False
+    ) -> Publisher:
+        return _ZenohPublisher(self, key, on_heard, urgent=urgent)
+
+    def subscribe(
+        self, pattern: str, hear: Callable[[str, bytes], None], *, patient: bool = False
+    ) -> Handle:
+        in_loop = self.in_loop_patiently if patient else self.in_loop
+        full = functools.partial(self.full, patient=True) if patient else self.full
+
+        key = None if "*" in pattern else pattern  # which saves asking for it
+
+        def on_sample(sample: Any) -> None:
+            payload = sample.payload.to_bytes()
+            if not full(len(payload)):
+                said = key or str(sample.key_expr)
+                in_loop(declared.call, len(payload), hear, said, payload)
+
+        declared = _OnBus(self)
+        return declared.of(lambda session: session.declare_subscriber(pattern, direct(on_sample)))
+
+    def answer(
+        self,
+        pattern: str,
+        answer: Callable[[BusQuestion], None],
+        *,
+        patient: Callable[[str], bool] = never,
+    ) -> Handle:
+        def on_query(query: Any) -> None:
+            question = _ZenohQuestion(self, query)
+            waits, size = patient(question.key), QUERY_BYTES + len(question.payload)
+            if self.full(size, patient=waits):
+                quietly(query.drop)
+                return
+            in_loop = self.in_loop_patiently if waits else self.in_loop
+            in_loop(declared.call, size, answer, question)
+
+        declared = _OnBus(self)
+        return declared.of(
+            lambda session: session.declare_queryable(pattern, direct(on_query), complete=False)
+        )
+
+    async def ask(self, pattern: str, payload: bytes, timeout: float) -> list[tuple[str, bytes]]:
+        zenoh = self._zenoh
+        return await self._answers(
+            lambda session, hear: session.get(
+                pattern,
+                hear,
+                payload=payload,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=timeout,
+            ),
+            timeout,
+        )
+
+    async def _answers(
+        self, ask: Callable[[Any, Any], None], timeout: float
+    ) -> list[tuple[str, bytes]]:
+        """Return all answers; ``ask`` sends the question, given the session and a callback."""
+        zenoh, session = self._zenoh, self._session
+        answers: list[tuple[str, bytes]] = []
+        done = self._loop.create_future()
+
+        def add(key: str, payload: bytes) -> None:
+            answers.append((key, payload))
+
+        def end() -> None:
+            if not done.done():
+                done.set_result(None)
+
+        def on_reply(reply: Any) -> None:
+            if reply.ok is not None:
+                payload = reply.ok.payload.to_bytes()
+                self.in_loop(add, len(payload), str(reply.ok.key_expr), payload)
+
+        if session is None:
+            return answers
+        ended = functools.partial(self.in_loop, end, 0)
+        ask(session, zenoh.handlers.Callback(on_reply, ended, indirect=False))
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                await done
+        return answers
+
+    # ------------------------------------------------------------------ who is there
+
+    def be_present(self, key: str) -> Handle:
+        return _OnBus(self).of(lambda session: session.liveliness().declare_token(key))
+
+    async def present(self, pattern: str, timeout: float) -> list[str]:
+        found = await self._answers(
+            lambda session, hear: session.liveliness().get(pattern, hear, timeout=timeout), timeout
+        )
+        return [key for key, _ in found]
+
+    def watch(self, pattern: str, see: Callable[[str, bool], None]) -> Handle:
+        put = self._zenoh.SampleKind.PUT
+
+        there: dict[str, None] = {}
+
+        def on_presence(key: str, present: bool) -> None:
+            if present:
+                there[key] = None
+            else:
+                there.pop(key, None)
+            see(key, present)
+
+        def lost() -> None:  # who has gone when there is a new session is not told of then
+            for key in [*there]:
+                on_presence(key, False)
+
+        def on_sample(sample: Any) -> None:
+            self.in_loop(declared.call, 0, on_presence, str(sample.key_expr), sample.kind == put)
+
+        declared = _OnBus(self).when_lost(lost)
+        return declared.of(
+            lambda session: session.liveliness().declare_subscriber(
+                pattern, direct(on_sample), history=True
+            )
+        )
+
+    # ------------------------------------------------------------------ for what is declared
+
+    def publish(self, publisher: Any, payload: bytes) -> None:
+        """Have a publisher say something."""
+        if publisher is not None:  # else its session is about to be there
+            quietly(publisher.put, payload)
+
+
+class _OnBus(ZenohDeclared, Handle):
+    pass
+
+
+class _ZenohPublisher(Publisher):
+    def __init__(
+        self, end: ZenohEnd, key: str, on_heard: Callable[[bool], None] | None, *, urgent: bool
+    ) -> None:
+        zenoh = end.engine
+        self._end = end
+        self._heard = False
+        self._told = on_heard
+
+        def declare(session: Any) -> Any:
+            return session.declare_publisher(
+                key,
+                congestion_control=zenoh.CongestionControl.DROP,
+                priority=zenoh.Priority.INTERACTIVE_HIGH if urgent else zenoh.Priority.DATA,
+                express=False,
+            )
+
+        def on_matching(status: Any) -> None:
+            end.later(self._declared.call, self._on_heard, status.matching)
+
+        self._declared = _OnBus(end)
+        self._publisher: Any = None
+        self._declared.of(lambda session: self._declare(declare(session), on_matching))
+
+    def _declare(self, publisher: Any, on_matching: Callable[[Any], None]) -> Any:
+        again, self._publisher = self._publisher is not None, publisher
+        publisher.declare_matching_listener(direct(on_matching))
+        heard = bool(publisher.matching_status.matching)
+        if again:
+            self._end.later(self._declared.call, self._on_heard, heard)
+        else:
+            self._heard = heard
+        return publisher
+
+    def _on_heard(self, heard: bool) -> None:
+        if heard != self._heard:
+            self._heard = heard
+        if self._told is not None:
+            self._told(heard)
+
+    @property
+    def heard(self) -> bool:
+        return self._heard
+
+    def put(self, payload: bytes) -> None:
+        self._end.publish(self._publisher, payload)
+
+    def close(self) -> None:
+        self._declared.close()
+
+
+class _ZenohQuestion(BusQuestion):
+    def __init__(self, end: ZenohEnd, query: Any) -> None:
+        self.key = str(query.key_expr)
+        self.payload = b"" if query.payload is None else query.payload.to_bytes()
+        self._end, self._query = end, query
+        self._replies: list[tuple[str, bytes]] = []
+
+    def reply(self, key: str, payload: bytes) -> None:
+        self._replies.append((key, payload))
+
+    def close(self) -> None:
+        query, self._query = self._query, None
+        if query is not None:
+            self._end.reply(
+                query, self._replies, encoding=self._end.engine.Encoding.APPLICATION_JSON
+            )
+
+
+def place_of(said: str) -> tuple[str, int] | None:
+    """Return the address and the port that the engine writes; None where there are none."""
+    there = LINK.match(said)
+    return None if there is None else (plain_host(there["host"]), int(there["port"]))
+
+
+def _put(session: Any, key: str, payload: bytes, how: dict[str, Any]) -> None:
+    quietly(session.put, key, payload, **how)

@@ -1,0 +1,1 @@
+"""Read fleet files; each section has a module."""

@@ -1,0 +1,45 @@
+"""Read the section of a fleet file on who may use the bus, and refuse what cannot work."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from smartcam._accepting import is_loopback
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+Access = Literal["roles", "any-certificate", "anyone-may-command"]
+
+ANYONE: Access = "anyone-may-command"
+
+CURE = "smartcam fleet certificates makes certificates: then listen: tls/..., certificates: DIR"
+
+Mistake = tuple[tuple[str, ...], str]
+
+
+def access_of(said: Access | None, listen: Sequence[str]) -> Access | None:
+    """Return the access that holds: with TLS at least roles, or any certificate could command."""
+    tls = any(one.startswith("tls/") for one in listen)
+    return said or ("roles" if tls else None)
+
+
+def access_mistakes(said: Access | None, listen: Sequence[str]) -> Iterator[Mistake]:
+    """Yield the mistakes in the access of a fleet file."""
+    plain = [one for one in listen if not one.startswith("tls/")]
+    open_to_all = [one for one in plain if not is_loopback(one[4:].rpartition(":")[0])]
+    access = access_of(said, listen)
+    if access == "roles" and plain:
+        yield (
+            ("listen",),
+            f"{plain[0]} asks for no certificate, so nobody there has a role: expected tls/ "
+            "endpoints alone, or access: any-certificate beside them",
+        )
+    elif access != ANYONE and open_to_all:
+        yield (
+            ("listen",),
+            f"{open_to_all[0]} takes everybody who reaches it, without a certificate, and who is "
+            f"in may command the cameras. {CURE}. Or say that you want it so: access: {ANYONE}",
+        )
+    elif said in {"roles", "any-certificate"} and listen and len(plain) == len(listen):
+        yield ("access",), f"{said} wants listen: tls/... and certificates"

@@ -1,0 +1,664 @@
+"""Fleet files: which cameras an agent shares, and where; read from YAML."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, cast
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
+
+from smartcam._arguments import check_path
+from smartcam._client._inside import Interpretation
+from smartcam._extras import from_part
+from smartcam.backoff import Backoff
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.fleet._bus.address import (
+    CHUNK,
+    MAX_CHUNKS,
+    MAX_NAME_CHARACTERS,
+    check_name,
+    check_word,
+    missing_certificates,
+)
+from smartcam.fleet._file.access import Access, access_mistakes
+from smartcam.fleet._file.operations import OperationsSection  # noqa: TC001 - pydantic does
+from smartcam.fleet._file.recording import RecordSection, mistakes_of
+from smartcam.fleet._file.ros import Fields, RosCamera, RosSection, node_names
+from smartcam.fleet._file.standby import Standby, standby_of
+from smartcam.layout._inside import read_model
+from smartcam.settings import (
+    CameraSettings,
+    Seconds,
+    is_fleet,
+    masked,
+    parse_address,
+    validated,
+    with_ids,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+    from pathlib import Path
+
+    from smartcam.frames import FrameSource
+    from smartcam.geometry import CameraModel
+    from smartcam.inspection import CellCamera
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+
+MAX_CAMERAS_PER_AGENT = 10_000
+"""Cameras of one agent; each emulated one has a port of its own."""
+
+_ENDPOINT = re.compile(r"(tcp|tls)/(\[[0-9A-Fa-f:.]+\]|[\w.-]+):(\d{1,5})", re.ASCII)
+_PATTERN = "/**"
+
+
+def _word(text: str) -> str:
+    return check_word(text, "name")
+
+
+Word = Annotated[
+    str,
+    AfterValidator(_word),
+    WithJsonSchema({"type": "string", "pattern": f"^{CHUNK}$", "maxLength": MAX_NAME_CHARACTERS}),
+]
+
+
+def _endpoints(least_port: int) -> Any:
+    """Return the validator of one endpoint, or of several, with ports of ``least_port`` or more."""
+
+    def checked(given: object) -> list[str] | None:
+        if given is None:
+            return None
+        found: list[str] = []
+        for one in cast("list[object]", given) if isinstance(given, list) else [given]:
+            parts = _ENDPOINT.fullmatch(one) if isinstance(one, str) else None
+            if parts is None or not least_port <= int(parts[3]) <= 0xFFFF:
+                raise ValueError(
+                    f"expected tcp/HOST:PORT or tls/HOST:PORT, or a list of them; got {one!r:.80}"
+                )
+            found.append(parts[0])
+        return found
+
+    return PlainValidator(checked)
+
+
+_ENDPOINT_SCHEMA = {"type": "string", "pattern": f"^{_ENDPOINT.pattern}$"}
+_ENDPOINTS_SCHEMA = WithJsonSchema(
+    {
+        "anyOf": [
+            _ENDPOINT_SCHEMA,
+            {"type": "array", "items": _ENDPOINT_SCHEMA},
+            {"type": "null"},
+        ]
+    }
+)
+
+
+class Retry(Fields):
+    """The delays before a camera that is not there, or was lost, is tried again."""
+
+    initial: float = Field(0.1, ge=0, description="the first delay, seconds")
+    factor: float = Field(2.0, ge=1, description="how much longer each delay is than the last")
+    maximum: float = Field(10.0, ge=0, description="the longest delay, seconds")
+    jitter: float = Field(0.3, ge=0, le=1, description="share of a delay that is left to chance")
+    attempts: int | None = Field(None, ge=1, description="tries until it is given up; none: never")
+
+    def backoff(self) -> Backoff:
+        """Return the same for a client.
+
+        Raises:
+            ConfigurationError: the values do not go together.
+        """
+        return Backoff(**self.model_dump())
+
+
+def _never(given: object) -> object:
+    return None if given is False else given
+
+
+def _or_false(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"const": False})
+
+
+def _or_bool(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"type": "boolean"})
+
+
+class Emulated(Fields):
+    """Emulated cameras, to try a plant on a desk."""
+
+    count: int = Field(1, ge=1, le=MAX_CAMERAS_PER_AGENT, description="how many")
+    scenario: str | None = Field(
+        None, description="a scenario file with one camera, beside this file; default as the demo's"
+    )
+    seed: int = Field(1, ge=0, description="of the first one's noise; each next one has one more")
+
+
+class FramesEntry(Fields):
+    """The source of a camera's frames."""
+
+    url: str = Field(description="v4l2:///dev/video0, rtsp://HOST/..., or a file beside this one")
+    linger: float = Field(
+        2.0, ge=0, le=3600, description="seconds that it goes on streaming after the last who looks"
+    )
+    stall: Seconds | None = Field(
+        5.0,
+        description="seconds without a frame after which it counts as stuck; null: it waits for "
+        "triggers",
+    )
+    camera_info: str | None = Field(
+        None,
+        description="file with the lens, beside this one: a calibration of smartcam's, or ROS' "
+        "camera_info",
+    )
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        """Show all of it but a password, which is not for logs."""
+        for name, value in super().__repr_args__():
+            yield name, masked(value) if name == "url" else value
+
+    def source(self, folder: Path) -> FrameSource:
+        """Return the source of the frames; it is not open.
+
+        Args:
+            folder: folder that the fleet file is in.
+
+        Raises:
+            SmartCamError: the URL, or the lens, cannot work.
+            OSError: the lens cannot be read.
+        """
+        from smartcam import frames
+
+        url = self.url if "://" in self.url else str(folder / self.url)
+        return frames.open(url, camera_info=self.lens(folder), stall=self.stall, linger=self.linger)
+
+    def lens(self, folder: Path) -> CameraModel | None:
+        """Return the lens, None where none is said.
+
+        Raises:
+            CalibrationError: the file is no lens.
+            OSError: it cannot be read.
+        """
+        if self.camera_info is None:
+            return None
+        from smartcam.calibration import IntrinsicCalibration
+        from smartcam.calibration.formats import read_cameras
+
+        path = folder / self.camera_info
+        if _is_ours(path):
+            return IntrinsicCalibration.load(path).camera
+        return read_cameras(path, "camera_info").cameras[0]
+
+    def camera_info_url(self, folder: Path) -> str:
+        """Return the URL of ROS' ``camera_info``; empty where that is none of ROS' files."""
+        if self.camera_info is None:
+            return ""
+        path = (folder / self.camera_info).absolute()
+        return "" if path.exists() and _is_ours(path) else path.as_uri()
+
+
+def _is_ours(path: Path) -> bool:
+    """Return True if a file is a calibration of smartcam's.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return file.read(64).lstrip()[:1] == b"{"
+
+
+def _frames(given: object) -> object:
+    """Take a URL alone for a mapping with nothing else in it."""
+    return {"url": given} if isinstance(given, str) else given
+
+
+def _or_url(schema: dict[str, Any]) -> None:
+    schema["anyOf"].append({"type": "string"})
+
+
+_SOURCES = ("url", "emulated", "software")
+"""The keys of an entry, one of which says where the camera is."""
+
+
+class CameraEntry(Fields):
+    """A camera, or several emulated ones."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        json_schema_extra={"oneOf": [{"required": [name]} for name in _SOURCES]}
+    )
+
+    url: str | None = Field(None, description="where the camera is: bvs://HOST, insight://HOST")
+    emulated: Emulated | None = Field(None, description="an emulated one instead")
+    software: dict[str, Any] | None = Field(
+        None,
+        description="a plain camera whose pictures are inspected here instead: frames, calibration "
+        "and applications, as in a cell file",
+    )
+    model: str | None = Field(None, description="picks the protocol where url is a bare host")
+    application: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | str | None = Field(
+        None, description="application to have running and ready: its id, or its name"
+    )
+    application_names: dict[str, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(
+        {}, description="names of applications and their ids; a name stands wherever an id may"
+    )
+    interpret_as: str | dict[int | str, str] | None = Field(
+        None,
+        description="what result containers hold, for programs that do not say: an interpreter, a "
+        "layout, or one for each application",
+    )
+    y_down: bool = Field(False, description="the camera's y axis points down")
+    lenient: bool = Field(False, description="any non-zero byte is a true bool")
+    restore: bool | None = Field(
+        None,
+        description="after a reconnect have application and run state back; default: where nodes "
+        "of ROS become active by themselves",
+    )
+    connect_timeout: Seconds = Field(10.0, description="for a session, all attempts together")
+    switch_timeout: Seconds = Field(10.0, description="for a switch until the camera is ready")
+    request_timeout: Seconds = Field(5.0, description="for the answer to a request")
+    liveness_timeout: Seconds | None = Field(
+        5.0, description="for a sign of life of a camera that is asked for one; null: no end"
+    )
+    frames: Annotated[FramesEntry | None, BeforeValidator(_frames)] = Field(
+        None,
+        description="where its pictures come from: a URL, or a mapping with more",
+        json_schema_extra=_or_url,
+    )
+    ros2: RosCamera = Field(
+        RosCamera.model_validate({}), description="how it is seen in ROS 2, if the fleet is"
+    )
+    reconnect: Annotated[Retry | None, BeforeValidator(_never)] = Field(
+        Retry.model_validate({}),
+        description="when a lost camera is tried again; false: never",
+        json_schema_extra=_or_false,
+    )
+
+    @model_validator(mode="after")
+    def _one_of(self) -> CameraEntry:
+        given = [name for name in _SOURCES if getattr(self, name) is not None]
+        if len(given) != 1:
+            got = " and ".join(given) or "none of them"
+            raise ValueError(f"expected one of {', '.join(_SOURCES)}; got {got}")
+        return self
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        """Show all of it but a password, which is not for logs."""
+        for name, value in super().__repr_args__():
+            yield name, masked(value) if name == "url" and isinstance(value, str) else value
+
+    def settings(self, name: str, url: str, *, restore: bool = False) -> CameraSettings:
+        """Return the settings of the session with a camera.
+
+        Args:
+            name: name of the camera in the fleet.
+            url: where the camera is.
+            restore: value of ``restore`` where the entry has none.
+
+        Raises:
+            ConfigurationError: an option cannot work.
+        """
+        own = {*_SOURCES, "model", "reconnect", "frames", "ros2"}
+        options: dict[str, Any] = self.model_dump(exclude=own)
+        reconnect = None if self.reconnect is None else self.reconnect.backoff()
+        options["restore"] = restore if self.restore is None else self.restore
+        return CameraSettings.make(
+            url, self.model, {**options, "name": name, "reconnect": reconnect}
+        )
+
+
+class History(Fields):
+    """The results of each camera that are kept for programs which were cut off for a while."""
+
+    results: int = Field(20_000, ge=1, le=10_000_000, description="results")
+    bytes: int = Field(1 << 24, ge=1, le=1 << 34, description="their bytes, about")
+
+
+class Planned(NamedTuple):
+    """A camera of a fleet file.
+
+    Attributes:
+        name: name of the camera in the fleet.
+        entry: entry of the camera in the file.
+        nth: place of the camera among the emulated ones of its entry, from 0.
+    """
+
+    name: str
+    entry: CameraEntry
+    nth: int
+
+
+def _named(given: object) -> object:
+    """Refuse what YAML has not read as a text: it takes 12 and yes for something else."""
+    if isinstance(given, dict):
+        for name in cast("dict[object, object]", given):
+            if not isinstance(name, str):
+                raise ValueError(f"the name {name!r:.40} is no text: put it in quotes")  # noqa: TRY004 - as pydantic wants
+    return given
+
+
+def _names(schema: dict[str, Any]) -> None:
+    tail = rf"(/{CHUNK}){{0,{MAX_CHUNKS - 1}}}(/\*\*)?"
+    schema["propertyNames"] = {"pattern": f"^{CHUNK}{tail}$", "maxLength": MAX_NAME_CHARACTERS}
+
+
+class FleetFile(Fields):
+    """The cameras that one agent shares."""
+
+    fleet: Word = Field("plant", description="name of the fleet; several agents may be of one")
+    agent: Word | None = Field(
+        None, description="name of this agent, unique in the fleet; default: host and process"
+    )
+    listen: Annotated[list[str] | str | None, _endpoints(0), _ENDPOINTS_SCHEMA] = Field(
+        None,
+        description="endpoints to listen on; this agent is the router, too, then. "
+        "tcp/127.0.0.1:7447 where nothing is said to connect to; port 0 takes a free one",
+    )
+    connect: Annotated[list[str] | str | None, _endpoints(1), _ENDPOINTS_SCHEMA] = Field(
+        None, description="endpoints of routers or other agents, such as tls/plant-server:7447"
+    )
+    certificates: str | None = Field(
+        None,
+        description="folder with ca.pem, cert.pem and key.pem, beside this file; for tls endpoints",
+    )
+    access: Access | None = Field(
+        None,
+        description="who may use what listens: roles (of certificates), any-certificate, or "
+        "anyone-may-command, which takes everybody who reaches it; default: roles with tls, else "
+        "whoever is on this computer",
+    )
+    history: History = Field(
+        History.model_validate({}), description="what is kept of each camera's last results"
+    )
+    ros2: RosSection | None = Field(
+        None, description="have the cameras seen in ROS 2; {} is enough"
+    )
+    operations: OperationsSection | None = Field(
+        None, description="how smartcam serve is watched: health, numbers, log; {} is enough"
+    )
+    record: RecordSection | None = Field(
+        None, description="record the cameras beside the agent; {} is enough"
+    )
+    outlets: dict[str, dict[str, Any]] | None = Field(
+        None,
+        description="where results go, by the outlet's name: mqtt, sqlite, those of plug-ins",
+    )
+    calibrations: str | None = Field(
+        None,
+        min_length=1,
+        description="folder, beside this file, that the calibration services write to; it is made "
+        "if need be. Without it they refuse",
+    )
+    standby: Annotated[Standby | None, BeforeValidator(standby_of)] = Field(
+        None,
+        description="stand by for cameras that another agent has, and take over when it is gone: "
+        "true, or a mapping with more",
+        json_schema_extra=_or_bool,
+    )
+    cameras: Annotated[dict[str, CameraEntry], BeforeValidator(_named)] = Field(
+        description="by name, such as line1/cam3; emulated ones at a name that ends in /**; {}: "
+        "none, the agent is a router for others",
+        json_schema_extra=_names,
+    )
+
+    @property
+    def endpoints(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Endpoints to listen on, and those to connect to."""
+        listen, connect = tuple(self.listen or ()), tuple(self.connect or ())
+        return (listen, connect) if listen or connect else ((DEFAULT_LISTEN,), ())
+
+    @property
+    def agent_name(self) -> str:
+        """The agent's name."""
+        if self.agent is not None:
+            return self.agent
+        host = socket.gethostname().partition(".")[0].lower()
+        kept = "".join(
+            one if one.isascii() and (one.isalnum() or one in "_-") else "_" for one in host
+        )
+        return f"{kept or 'agent'}-{os.getpid()}"
+
+    def plan(self) -> list[Planned]:
+        """Return the cameras of the file.
+
+        Raises:
+            ValueError: a name cannot be one, or comes twice; or there are too many.
+        """
+        found: dict[str, Planned] = {}
+        for name, entry in self.cameras.items():
+            _add(found, name, entry)
+        return [*found.values()]
+
+
+def _add(found: dict[str, Planned], name: str, entry: CameraEntry) -> None:
+    """Add the cameras of an entry to those that are there."""
+    for planned in _planned(name, entry):
+        if planned.name in found:
+            raise ValueError(f"there is a camera {planned.name} already")
+        found[planned.name] = planned
+    if len(found) > MAX_CAMERAS_PER_AGENT:
+        raise ValueError(
+            f"{len(found)} cameras up to here, expected {MAX_CAMERAS_PER_AGENT} at most"
+        )
+
+
+def _planned(name: str, entry: CameraEntry) -> Iterator[Planned]:
+    many = name.endswith(_PATTERN)
+    if not many and "*" in name:
+        raise ValueError(f"{name!r:.120} means several: expected a name that ends in {_PATTERN}")
+    count = 1 if entry.emulated is None else entry.emulated.count
+    if not many:
+        check_name(name)
+        if count > 1:
+            raise ValueError(f"{count} cameras want a name such as {name}{_PATTERN}")
+        yield Planned(name, entry, 0)
+        return
+    if entry.emulated is None:
+        raise ValueError("only emulated cameras have a pattern for a name")
+    stem, width = name.removesuffix(_PATTERN), len(str(count))
+    for n in range(count):
+        yield Planned(check_name(f"{stem}/cam{n + 1:0{width}}"), entry, n)
+
+
+# ---------------------------------------------------------------------- reading one
+
+
+def load_fleet(path: str | Path) -> FleetFile:
+    """Read a fleet file.
+
+    Raises:
+        ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,
+            line and field.
+        MissingExtraError: PyYAML is not installed.
+    """
+    if isinstance(path, str) and "://" in path:
+        raise _no_file(path)
+    path = check_path(path, "path", "fleet")
+    folder = path.parent
+    file = read_model(
+        path, "fleet", FleetFile, "cameras", lambda found: next(_mistakes(found, folder), None)
+    )
+    if file.certificates is None:
+        return file
+    return file.model_copy(update={"certificates": str(folder / file.certificates)})
+
+
+def _no_file(url: str) -> ConfigurationError:
+    """Return the error for an address where a fleet file is wanted."""
+    shown = masked(url)
+    if is_fleet(url):
+        return ConfigurationError(
+            f"fleet: expected a fleet file, got {shown!r}: an agent serves that fleet already"
+        )
+    return ConfigurationError(
+        f"fleet: expected a fleet file, got the address {shown!r}: write a file with the line "
+        f'cameras: {{line1/cam1: {{url: "{shown}"}}}} and name that file'
+    )
+
+
+def fleet_schema() -> dict[str, Any]:
+    """Return the JSON Schema of fleet files."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **FleetFile.model_json_schema(),
+        "title": "smartcam fleet",
+    }
+
+
+Mistake = tuple["Sequence[int | str]", str]
+
+
+def _mistakes(file: FleetFile, folder: Path) -> Iterator[Mistake]:
+    """Yield the mistakes in a file, and their places."""
+    yield from access_mistakes(file.access, file.endpoints[0])
+    yield from _of_certificates(file, folder)
+    if not file.cameras and not file.endpoints[0]:
+        text = "an agent without cameras is a router for others: expected listen, which it lacks"
+        yield ("cameras",), text
+    if file.record is not None:
+        yield from mistakes_of(file.record, folder)
+    if file.outlets is not None:
+        with from_part("mqtt", '"outlets:" in a fleet file needs'):
+            from smartcam.outlets._inside import mistakes_of as outlet_mistakes
+        yield from outlet_mistakes(file.outlets)
+    found: dict[str, Planned] = {}
+    taken: dict[tuple[str, int], str] = {}
+    for name, entry in file.cameras.items():
+        place = ("cameras", name)
+        try:
+            _add(found, name, entry)
+        except ValueError as exc:
+            yield place, str(exc)
+        for where, text in _of_entry(name, entry, taken, folder):
+            yield (*place, *where), text
+    if file.ros2 is not None:
+        yield from _of_ros(found)
+
+
+def _of_ros(found: dict[str, Planned]) -> Iterator[Mistake]:
+    try:
+        node_names([*found])
+    except ValueError as exc:
+        yield ("cameras",), str(exc)
+
+
+def _of_certificates(file: FleetFile, folder: Path) -> Iterator[Mistake]:
+    listen, connect = file.endpoints
+    tls = [one for one in (*listen, *connect) if one.startswith("tls/")]
+    if file.certificates is None:
+        if tls:
+            yield ("listen" if tls[0] in listen else "connect",), f"{tls[0]} wants certificates"
+        return
+    if missing := missing_certificates(folder / file.certificates):
+        yield ("certificates",), missing
+
+
+def _of_entry(
+    name: str, entry: CameraEntry, taken: dict[tuple[str, int], str], folder: Path
+) -> Iterator[Mistake]:
+    """Give what cannot work of a camera; ``taken``: whose each address is."""
+    if entry.url is not None:
+        try:
+            address = parse_address(entry.url, model=entry.model)
+        except SmartCamError as exc:
+            yield ("url",), str(exc)
+            return
+        other = taken.setdefault((address.host, address.port), name)
+        if other != name:
+            yield ("url",), f"this is the camera {other}, and a camera takes one client"
+    elif entry.model is not None:
+        yield ("model",), "is for a url"
+    elif entry.emulated is not None and entry.emulated.scenario is not None:
+        yield from _of_scenario(folder / entry.emulated.scenario)
+    elif entry.software is not None:
+        yield from _of_software(name, entry.software, folder)
+    if entry.frames is not None:
+        yield from _of_frames(entry.frames, folder)
+    seen = entry.ros2
+    for key, load in (
+        ("calibration", lambda: seen.load_calibration(folder)),
+        ("hand_eye", lambda: seen.load_hand_eye(folder)),
+        ("calibrated_at", seen.robot_pose),
+    ):
+        try:
+            load()
+        except (SmartCamError, OSError) as exc:
+            yield ("ros2", key), str(exc)
+    if entry.reconnect is not None:
+        try:
+            entry.reconnect.backoff()
+        except ConfigurationError as exc:
+            yield ("reconnect",), str(exc)
+            return
+    if isinstance(entry.application, str) and not entry.application_names:
+        yield ("application",), "a name is given, and application_names has none"
+    try:
+        with_ids(entry.model_dump(include={"application", "application_names", "interpret_as"}))
+    except ConfigurationError as exc:
+        yield ("application_names",), str(exc)
+    specs = entry.interpret_as
+    each = specs.items() if isinstance(specs, dict) else [(None, specs)]
+    for application, spec in each:
+        if spec is not None:
+            try:
+                Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
+            except SmartCamError as exc:
+                numbered = () if application is None else (application,)
+                yield ("interpret_as", *numbered), str(exc)
+
+
+def _of_frames(entry: FramesEntry, folder: Path) -> Iterator[Mistake]:
+    try:
+        entry.lens(folder)
+    except (SmartCamError, OSError) as exc:
+        yield ("frames", "camera_info"), str(exc)
+        return
+    try:
+        entry.source(folder)
+    except SmartCamError as exc:
+        yield ("frames", "url"), str(exc)
+
+
+def software_camera(name: str, given: dict[str, Any], folder: Path) -> CellCamera:
+    """Return the software camera that an entry says.
+
+    Raises:
+        ConfigurationError: something of it cannot work.
+        MissingExtraError: what it needs is not installed.
+    """
+    with from_part("inspection", '"software:" in a fleet file needs'):
+        from smartcam.inspection import Software, make_camera
+    return make_camera(name, validated(Software, given, f"{name}: software"), folder)
+
+
+def _of_software(name: str, given: dict[str, Any], folder: Path) -> Iterator[Mistake]:
+    with from_part("inspection", '"software:" in a fleet file needs'):
+        from smartcam.inspection import Software, software_mistakes
+    try:
+        software = Software.model_validate(given)
+    except ValidationError as exc:
+        first = exc.errors(include_url=False)[0]
+        yield ("software", *first["loc"]), first["msg"].removeprefix("Value error, ")
+        return
+    for place, text in software_mistakes(name, software, folder):
+        yield ("software", *place), text
+
+
+def _of_scenario(path: Path) -> Iterator[Mistake]:
+    from smartcam.emulator import load_scenario
+
+    try:
+        load_scenario(path)
+    except ConfigurationError as exc:
+        yield ("emulated", "scenario"), str(exc)

@@ -1,0 +1,60 @@
+"""Read the section of a fleet file on recording beside the agent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from smartcam._file_values import Age, Patterns, Size, chosen
+from smartcam.fleet._file.ros import Fields
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class RecordSection(Fields):
+    """Recording beside the agent: of each camera files that follow each other, in one folder."""
+
+    folder: str = Field(
+        "recordings", min_length=1, description="where the files are, beside this file; made if new"
+    )
+    size: Size = Field(1e8, description="a camera's next file begins behind so much: 100 MB")
+    age: Age = Field(3600.0, description="or behind so long: 1 h, 30 min, 1 d")
+    keep: Size = Field(
+        1e10, description="of all files together; beyond it the oldest are deleted: 10 GB"
+    )
+    cameras: Patterns = Field(
+        ("**",), description="which ones: names, * for one part of them, ** for any number"
+    )
+    frames: bool = Field(
+        True,
+        description="record what went over the wire, too; without it a replay has results and "
+        "statuses only",
+    )
+
+    def chooses(self, camera: str) -> bool:
+        """Return True if a camera of this name is recorded."""
+        return chosen(self.cameras, camera)
+
+    def path(self, folder: Path) -> Path:
+        """Return the folder of the files.
+
+        Args:
+            folder: folder that the fleet file is in.
+        """
+        return folder / Path(self.folder).expanduser()
+
+
+def mistakes_of(section: RecordSection, folder: Path) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the mistakes in the section, and their places."""
+    if section.keep < 2 * section.size:
+        yield (
+            ("record", "keep"),
+            f"expected twice the size of a file, {2 * section.size:g} bytes, or more; "
+            f"got {section.keep:g}",
+        )
+    path = section.path(folder)
+    if path.exists() and not path.is_dir():
+        yield ("record", "folder"), f"{path} is there, and is no folder"

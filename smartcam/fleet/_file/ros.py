@@ -1,0 +1,138 @@
+"""Read the sections of a fleet file on ROS 2."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from smartcam._ros_names import as_name, check_namespace
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam.calibration import HandEyeCalibration
+    from smartcam.calibration._inside import AnyCalibration
+    from smartcam.geometry import Transform
+
+MAX_DOMAIN_ID = 0xFFFFFFFF
+MAX_FRAME_CHARACTERS = 200
+
+
+class Fields(BaseModel):
+    """The base of every part of a fleet file."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+
+Frame = Annotated[str, Field(min_length=1, max_length=MAX_FRAME_CHARACTERS)]
+Namespace = Annotated[str, AfterValidator(check_namespace)]
+
+
+class RosSection(Fields):
+    """The view of the cameras in ROS 2."""
+
+    domain: int | None = Field(
+        None,
+        ge=0,
+        le=MAX_DOMAIN_ID,
+        description="number of the domain; default: ROS_DOMAIN_ID, or 0",
+    )
+    namespace: Namespace = Field("/", description="in front of the cameras' names")
+    distribution: Literal["humble", "jazzy", "kilted", "lyrical", "rolling"] = Field(
+        "jazzy",
+        description="of ROS: its type hashes are part of all names; through rclpy, the default is "
+        "the installed one",
+    )
+    autostart: bool = Field(True, description="the nodes become active by themselves")
+    through: Literal["zenoh", "rclpy"] = Field(
+        "zenoh",
+        description="who speaks: smartcam itself, as rmw_zenoh does; or the rclpy that is "
+        "installed, over any middleware",
+    )
+    args: tuple[str, ...] = Field(
+        (), description="arguments for rclpy, such as --ros-args -p use_sim_time:=true"
+    )
+
+
+class RosCamera(Fields):
+    """The view of one camera in ROS 2."""
+
+    frame_id: Frame | None = Field(
+        None, description="frame of reference of its results; default: the camera's name"
+    )
+    parent_frame: Frame | None = Field(
+        None, description="the robot's frame, such as base_link; default: as a calibration calls it"
+    )
+    flange_frame: Frame | None = Field(
+        None,
+        description="frame of the part of the robot that carries the camera, such as tool0; "
+        "default: as a calibration calls it",
+    )
+    calibration: str | None = Field(
+        None, description="file with the calibration, beside this one: results are the robot's then"
+    )
+    calibrated_at: Annotated[tuple[float, ...], Field(min_length=7, max_length=7)] | None = Field(
+        None,
+        description="where the part that carries the camera was in the robot's frame for the "
+        "calibration: x, y, z in metres, and the quaternion x, y, z, w",
+    )
+    hand_eye: str | None = Field(
+        None,
+        description="file with a hand-eye calibration, beside this one: where the camera is, for "
+        "/tf_static",
+    )
+
+    def load_calibration(self, folder: Path) -> AnyCalibration | None:
+        """Return the calibration, None where none is said.
+
+        Args:
+            folder: folder that the fleet file is in.
+
+        Raises:
+            CalibrationError: the file holds something else.
+            OSError: the file cannot be read.
+        """
+        if self.calibration is None:
+            return None
+        from smartcam.calibration import load_calibration
+
+        return load_calibration(folder / self.calibration)
+
+    def load_hand_eye(self, folder: Path) -> HandEyeCalibration | None:
+        """Return the hand-eye calibration, None where none is said; as ``load_calibration``."""
+        if self.hand_eye is None:
+            return None
+        from smartcam.calibration import HandEyeCalibration
+
+        return HandEyeCalibration.load(folder / self.hand_eye)
+
+    def robot_pose(self) -> Transform | None:
+        """Return the pose of ``calibrated_at``, None where none is said.
+
+        Raises:
+            CalibrationError: the numbers are no pose.
+        """
+        if self.calibrated_at is None:
+            return None
+        from smartcam.geometry import Transform
+
+        place, turn = self.calibrated_at[:3], self.calibrated_at[3:]
+        return Transform.from_quaternion("robot", self.flange_frame or "flange", place, turn)
+
+
+def node_names(cameras: list[str]) -> dict[str, str]:
+    """Return the name in the graph of each camera.
+
+    Raises:
+        ValueError: two have the same.
+    """
+    found: dict[str, str] = {}
+    for camera in cameras:
+        name = as_name(camera)
+        other = found.setdefault(name, camera)
+        if other != camera:
+            raise ValueError(f"{other} and {camera} would both be /{name} in ROS")
+    return {camera: name for name, camera in found.items()}

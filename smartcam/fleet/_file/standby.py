@@ -1,0 +1,20 @@
+"""Read the section of a fleet file on standing by."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from smartcam.fleet._file.ros import Fields
+
+
+class Standby(Fields):
+    """The way an agent stands by for cameras that another one of the fleet has."""
+
+    preference: int = Field(
+        0, ge=0, le=3, description="of several that stand by, the lowest takes over first"
+    )
+
+
+def standby_of(given: object) -> object:
+    """Return the section that ``standby: true`` or ``false`` stands for; else what is given."""
+    return {} if given is True else None if given is False else given

@@ -1,0 +1,1 @@
+"""Frames of shared cameras: at the agent, on the bus, and in a program."""

@@ -1,0 +1,273 @@
+"""Frames of a fleet's camera at a program: one on request, and a stream that readers read."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import (
+    CalibrationError,
+    FrameLostError,
+    FrameSourceError,
+    FrameTimeoutError,
+    RemoteProtocolError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.fleet._frames.features import FleetFeatures
+from smartcam.fleet._frames.wire import from_fields
+from smartcam.frames import StreamFormat, find_format
+from smartcam.geometry import CameraModel
+
+if TYPE_CHECKING:
+    from smartcam.fleet._bus.bus import Data
+    from smartcam.fleet._frames.wire import FleetFrame, FrameForm
+    from smartcam.fleet._frames.wish import StreamWish
+    from smartcam.fleet._program.caller import Caller
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+OPEN_TIMEOUT = 15.0
+"""Seconds for an agent to open its device."""
+
+ANSWER_TIME = 2.0
+"""Seconds beyond a trigger's own in which its agent says what became of it."""
+
+MAX_LENSES = 16
+
+
+class StreamCounts:
+    """The counts that a stream's last frame gave of those before it."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, int, int, int] | None = None
+
+    def since(self, said: dict[str, Any], came: int = 1) -> tuple[int, int]:
+        """Return the numbers of frames skipped and lost since the last reply; ``came`` are here."""
+        now = int(said["stream"]), int(said["sent"]), int(said["skipped"]), int(said["lost"])
+        last, self._last = self._last, now
+        if last is None or last[0] != now[0]:  # the first one, or the agent took it for over
+            last = now[0], 0, 0, 0
+        sent, skipped, lost = (
+            max(0, new - old) for new, old in zip(now[1:], last[1:], strict=True)
+        )
+        return skipped, lost + max(0, sent - came)  # those that were sent and did not come
+
+
+class FrameCaller:
+    """Asks a camera's agent for frames.
+
+    Args:
+        name: name of the camera, for frames and texts.
+        caller: calls the agent.
+    """
+
+    def __init__(self, name: str, caller: Caller) -> None:
+        self.name, self._caller = name, caller
+        self._lenses: dict[tuple[int, int], CameraModel | None] = {}
+
+    async def about(self, wish: StreamWish) -> StreamFormat:
+        """Return the format of the frames, as the device tells it; the device is opened for that.
+
+        Raises:
+            SmartCamError: as the agent says.
+        """
+        loop = asyncio.get_running_loop()
+        reply = await self._caller.call("about_frames", loop.time() + OPEN_TIMEOUT)
+        said = reply.fields["answer"]
+        try:
+            rates = tuple(float(rate) for rate in said["rates"])
+            size = int(said["width"]), int(said["height"])
+            return StreamFormat(find_format(wish.pixels(str(said["format"]))), *size, rates)
+        except (KeyError, TypeError, ValueError) as exc:
+            raise RemoteProtocolError(f"{self.name}: what the agent says of it: {exc!r}") from exc
+
+    async def one(
+        self,
+        encoding: FrameForm,
+        timeout: float,
+        *,
+        max_age: float | None = None,
+        moment: float | None = None,
+        fresh: bool = False,
+    ) -> FleetFrame:
+        """Return one frame.
+
+        Args:
+            encoding: form in which the frame is to come.
+            timeout: seconds to wait for the frame.
+            max_age: seconds since the frame was captured, at most; None for any.
+            moment: time of ``time.monotonic()`` after which the frame is to be exposed.
+            fresh: whether the frame is to be exposed after this call.
+
+        Raises:
+            FrameTimeoutError: none came in time.
+            SmartCamError: as the agent says.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout
+        arguments = {**encoding.fields(), "max_age": max_age, "fresh": fresh}
+        if moment is not None:
+            # what the agent's clock says then, or later: none that is older passes for it
+            arguments["after"] = self._caller.clock_at_most(moment + self._ahead)
+        try:
+            while True:  # nothing is done by it, so it may be asked again where a part was dropped
+                _, frame = await self.ask("frame", deadline, arguments, StreamCounts())
+                if frame is not None:
+                    return frame
+                if loop.time() >= deadline:
+                    raise FrameTimeoutError(
+                        f"{self.name}: a frame was sent, but did not come here whole within "
+                        f"{timeout:g} s",
+                        source=self.name,
+                    )
+        except ResponseTimeoutError as exc:
+            raise FrameTimeoutError(str(exc), source=self.name) from exc
+
+    @property
+    def features(self) -> FleetFeatures:
+        """The features of the camera's device."""
+        return FleetFeatures(self.name, self._caller)
+
+    async def trigger(self, encoding: FrameForm, timeout: float, *, wait: bool) -> FleetFrame:
+        """Have the device triggered, and return the picture that this trigger caused.
+
+        Raises:
+            FrameLostError: the picture was taken, and did not come here whole.
+            TriggerTimeoutError: the agent said nothing; whether it was triggered is unknown.
+            SmartCamError: as the agent says.
+        """
+        deadline = asyncio.get_running_loop().time() + timeout + ANSWER_TIME
+        arguments = {**encoding.fields(), "wait": wait}
+        try:
+            _, frame = await self.ask(
+                "trigger_frame", deadline, arguments, StreamCounts(), timeout=timeout
+            )
+        except ResponseTimeoutError as exc:
+            raise TriggerTimeoutError(str(exc), waited=exc.waited) from exc
+        if frame is None:
+            raise FrameLostError(
+                f"{self.name}: the picture of the trigger was taken, and did not come here whole"
+            )
+        return frame
+
+    async def ask(
+        self,
+        do: str,
+        deadline: float,
+        arguments: dict[str, Any],
+        counts: StreamCounts,
+        timeout: float | None = None,
+    ) -> tuple[dict[str, Any], FleetFrame | None]:
+        """Ask once; return what the agent says, and the frame if there is one that came whole.
+
+        Args:
+            do: ``frame``, ``trigger_frame``, or ``next_frame`` of a stream.
+            deadline: loop time until which the agent has to have it.
+            arguments: arguments of the call.
+            counts: counts of the stream.
+            timeout: seconds that the user gave; what there is until ``deadline`` by default.
+        """
+        answer, frames = await self.ask_all(do, deadline, arguments, counts, timeout)
+        return answer, frames[-1] if frames else None
+
+    async def ask_all(
+        self,
+        do: str,
+        deadline: float,
+        arguments: dict[str, Any],
+        counts: StreamCounts,
+        timeout: float | None = None,
+    ) -> tuple[dict[str, Any], list[FleetFrame]]:
+        """Ask once, as :meth:`ask` does; of H.264 several encoded frames come together."""
+        caller = self._caller
+        caller.require()
+        number = caller.program.next_call()
+        incoming = caller.program.frames.expect(caller, number)
+        said_at = asyncio.get_running_loop().time()
+        try:
+            reply = await caller.call(do, deadline, arguments, number=number, timeout=timeout)
+            answer = reply.fields["answer"]
+            said = answer.get("frame")
+            if said is None:
+                return answer, []
+            data = await incoming.whole(int(said["size"]))
+            if data is None:
+                return answer, []
+            caller.bound(float(answer["came"]), said_at)
+            units = answer.get("units", [said])
+            stream = "stream" in answer
+            skipped, lost = counts.since(answer, len(units)) if stream else (0, int(said["lost"]))
+            epoch, place = int(reply.fields["epoch"]), 0
+            frames: list[FleetFrame] = []
+            for unit in units:
+                end = place + int(unit["size"])
+                part = data if len(units) == 1 else memoryview(data)[place:end]
+                frames.append(await self._made(unit, part, lost, epoch, deadline))
+                place, lost = end, 0
+            if place != len(data):
+                raise ValueError(f"{len(data)} bytes of {place}")
+        except (KeyError, TypeError, ValueError) as exc:
+            if isinstance(exc, SmartCamError):
+                raise
+            raise RemoteProtocolError(f"{self.name}: what the agent says: {exc!r}") from exc
+        finally:
+            incoming.forget()
+        return {**answer, "skipped": skipped}, frames
+
+    async def _made(
+        self, said: dict[str, Any], data: Data, lost: int, epoch: int, deadline: float
+    ) -> FleetFrame:
+        """Return the frame for an agent's fields and bytes."""
+        earliest, latest = self._caller.here(float(said["captured"]))
+        return from_fields(
+            said,
+            data,
+            captured=(earliest + latest) / 2 - self._ahead,
+            doubt=(latest - earliest) / 2,
+            lost=lost,
+            source=self.name,
+            camera_info=await self._lens(epoch, int(said["lens"]), deadline),
+        )
+
+    @property
+    def _ahead(self) -> float:
+        """Lead of the loop's clock over the one that frames are timed by, seconds."""
+        if self._caller.program.bus.local:
+            return 0.0  # they keep the time that they have
+        return asyncio.get_running_loop().time() - time.monotonic()
+
+    async def _lens(self, epoch: int, number: int, deadline: float) -> CameraModel | None:
+        """Return the lens that a frame names."""
+        if not number:
+            return None
+        key = epoch, number
+        if key not in self._lenses:
+            reply = await self._caller.call("lens", deadline, {"lens": number})
+            said = reply.fields["answer"]["lens"]
+            try:
+                found = None if said is None else CameraModel.from_data(said)
+            except CalibrationError as exc:
+                raise RemoteProtocolError(f"{self.name}: the agent's lens: {exc}") from exc
+            self._lenses[key] = found
+            if len(self._lenses) > MAX_LENSES:
+                del self._lenses[next(iter(self._lenses))]
+        return self._lenses[key]
+
+    def leave(self, stream: int) -> None:
+        """End a stream."""
+        self._caller.tell("leave_frames", {"stream": stream})
+
+    def next_stream(self) -> int:
+        """Return the number of another stream."""
+        return self._caller.program.next_call()
+
+
+def as_source_error(name: str, error: SmartCamError) -> FrameSourceError:
+    """Return an error as readers of frames expect it."""
+    made = FrameSourceError(str(error), source=name)
+    made.__cause__ = error
+    return made

@@ -1,0 +1,469 @@
+"""A camera's frames at its agent: one source, for all programs that look.
+
+Who wants a stream asks for one frame after the other: the next request is here before the next
+frame is, so nothing is late, and a program that asks no more gets no more. Between two requests the
+agent keeps a reader for it, which skips and counts as any other. That one ends with its program, or
+when nothing was asked for a while; with the last one the device stops.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import math
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+from smartcam.exceptions import (
+    FrameFormatError,
+    FrameTimeoutError,
+    LocalProtocolError,
+    UnsupportedError,
+)
+from smartcam.fleet._frames.features import feature_fields
+from smartcam.fleet._frames.stream import FrameStream, PictureStream, VideoStream
+from smartcam.fleet._frames.wire import MAX_FRAME_BYTES, VIDEO, FrameForm, to_fields
+from smartcam.fleet._program.program_name import role_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterator
+
+    from smartcam.fleet._frames.encoding import FrameEncoder
+    from smartcam.fleet._frames.sender import FrameSender
+    from smartcam.fleet._frames.stream import FrameOrder, TakenFrame
+    from smartcam.fleet._frames.video import SharedVideo
+    from smartcam.frames import Frame, FrameSource, SourceStatistics
+    from smartcam.geometry import CameraModel
+
+T = TypeVar("T")
+
+MAX_STREAMS_PER_ROLE = 256
+"""Streams of one camera that the programs of one role may have."""
+
+MAX_STREAMS_PER_PROGRAM = 16
+"""Streams of one camera that one program may have."""
+
+MAX_FRAME_CALLS_PER_PROGRAM = 16
+"""Calls for frames of one camera that one program may have under way: each may keep a frame."""
+
+MAX_ENCODINGS = 16
+"""Ways of encoding whose last frame is kept, for who wants the same."""
+
+MAX_VIDEO_SETTINGS = 4
+"""Settings of H.264 that are encoded at one time."""
+
+MAX_LENSES = 16
+
+
+class FramesOf(NamedTuple):
+    """The source of a camera's frames.
+
+    Attributes:
+        make: returns the source; None: there is none.
+        url: address of the source, without a password; for people.
+    """
+
+    make: Callable[[], FrameSource] | None
+    url: str | None
+
+
+NO_FRAMES = FramesOf(None, None)
+
+
+class _Encoded(NamedTuple):
+    """The last frame that was encoded in one way."""
+
+    frame: Frame
+    task: asyncio.Task[Frame]
+
+
+@dataclass(eq=False)
+class SharedFrames:
+    """The frames of one camera, for programs.
+
+    Args:
+        name: name of the camera.
+        make: function that returns the camera's source; None: the camera has none.
+        sender: sender of the frames' bytes.
+        encoder: encoder that makes frames small before they are sent.
+        url: address of the source, without a password; for people.
+    """
+
+    name: str
+    make: Callable[[], FrameSource] | None
+    sender: FrameSender
+    encoder: FrameEncoder
+    url: str | None = None
+    _source: FrameSource | None = None
+    _opening: asyncio.Task[FrameSource] | None = None
+    _viewers: dict[tuple[str, int], FrameStream] = field(
+        default_factory=dict[tuple[str, int], FrameStream]
+    )
+    _asking: dict[str, int] = field(default_factory=dict[str, int])
+    _videos: dict[FrameForm, SharedVideo] = field(default_factory=dict[FrameForm, "SharedVideo"])
+    _encoded: dict[FrameForm, _Encoded] = field(default_factory=dict[FrameForm, _Encoded])
+    _lenses: dict[int, CameraModel] = field(default_factory=dict[int, "CameraModel"])
+    _numbers: itertools.count[int] = field(default_factory=lambda: itertools.count(1))
+    _tasks: set[asyncio.Task[Any]] = field(default_factory=set["asyncio.Task[Any]"])
+    _closed: bool = False
+
+    # ------------------------------------------------------------------ life
+
+    async def close(self) -> None:
+        """End all streams, and give the device back. Idempotent."""
+        self._closed = True
+        for viewer in self._viewers.values():
+            viewer.close()
+        self._viewers.clear()
+        for video in [*self._videos.values()]:
+            await video.close()
+        self._videos.clear()
+        tasks = [*self._tasks]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        self._encoded.clear()
+        source, self._source = self._source, None
+        if source is not None:
+            await source.close()
+
+    @property
+    def viewers(self) -> int:
+        """Number of streams."""
+        return len(self._viewers)
+
+    @property
+    def statistics(self) -> SourceStatistics | None:
+        """Statistics of the source; None where it is not open."""
+        return None if self._source is None else self._source.statistics()
+
+    def forget(self, program: str) -> None:
+        """Drop the streams of a program that is gone."""
+        for key in [key for key in self._viewers if key[0] == program]:
+            self._viewers.pop(key).close()
+
+    async def source(self) -> FrameSource:
+        """Return the source, opened where it is not.
+
+        Raises:
+            UnsupportedError: the camera has none.
+            FrameSourceError: it cannot be opened; the next one tries again.
+
+        Cancellation: it is opened all the same, for who comes next.
+        """
+        if self._source is not None:
+            return self._source
+        if self.make is None:
+            raise UnsupportedError(
+                f"{self.name} has no frames: its entry in the fleet file wants frames: URL, such "
+                "as v4l2:///dev/video0"
+            )
+        if self._closed:
+            raise LocalProtocolError(f"{self.name}: the agent ends")
+        if self._opening is None or self._opening.done():
+            self._opening = self._begin(self._open(self.make()), "frames")
+        return await asyncio.shield(self._opening)
+
+    async def _open(self, source: FrameSource) -> FrameSource:
+        await source.__aenter__()
+        self._source = source
+        return source
+
+    # ------------------------------------------------------------------ calls
+
+    async def about(self, timeout: float) -> dict[str, Any]:
+        """Return the format of the camera's frames, as the device tells it."""
+        with self._within(timeout, "the device"):
+            async with asyncio.timeout(timeout):
+                made = (await self.source()).format
+        return {
+            "format": made.format.name,
+            "width": made.width,
+            "height": made.height,
+            "rates": list(made.rates),
+        }
+
+    async def one(
+        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
+    ) -> dict[str, Any]:
+        """Send one frame, as :meth:`get` has it."""
+        came = asyncio.get_running_loop().time()
+        frame, took = await self.get(order, max_age=max_age, after=after, fresh=fresh)
+        self._send([frame], order)
+        return {"came": came, "frame": self._said(frame, took)}
+
+    async def get(
+        self, order: FrameOrder, *, max_age: float | None, after: float | None, fresh: bool
+    ) -> tuple[Frame, float]:
+        """Return one frame, and the seconds that it took to encode it.
+
+        Args:
+            order: the asking program, and the form in which the frame is to come.
+            max_age: seconds since the frame was captured, at most; None for any.
+            after: time of the agent's clock after which the frame is to be exposed.
+            fresh: whether the frame is to be exposed after this request came.
+        """
+        now = time.monotonic() + self.sender.ahead
+        with self._counted(order), self._within(order.timeout, "a frame"):
+            async with asyncio.timeout(order.timeout):
+                source = await self.source()
+                if fresh or after is not None:
+                    moment = now if after is None else after
+                    frame = await source.after(moment - self.sender.ahead, timeout=None)
+                else:
+                    age = math.inf if max_age is None else max_age
+                    frame = await source.newest(max_age=age, timeout=None)
+                return await self._encode(frame, order.encoding)
+
+    async def trigger(self, order: FrameOrder, *, wait: bool) -> dict[str, Any]:
+        """Trigger the device, and send the picture that this trigger caused."""
+        came = asyncio.get_running_loop().time()
+        frame, took = await self.triggered(order, wait=wait)
+        self._send([frame], order)
+        return {"came": came, "frame": self._said(frame, took)}
+
+    async def triggered(self, order: FrameOrder, *, wait: bool) -> tuple[Frame, float]:
+        """Trigger the device; return its picture, and the seconds that it took to encode it."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + order.timeout
+        with self._counted(order):
+            with self._within(order.timeout, "the device"):
+                async with asyncio.timeout(order.timeout):
+                    source = await self.source()
+            frame = await source.trigger(
+                timeout=max(1e-3, end - loop.time()), when_busy="wait" if wait else "refuse"
+            )
+            return await self._encode(frame, order.encoding)
+
+    async def features(
+        self, name: str | None, timeout: float, *, names_only: bool, value_only: bool
+    ) -> dict[str, Any]:
+        """Return the features of the device, or one of them, as JSON."""
+        features = (await self._soon(timeout)).features
+        if names_only:
+            return {"names": await features.names(timeout=timeout)}
+        if name is None:
+            found = [*(await features.describe(timeout=timeout)).values()]
+        elif value_only:
+            return {"value": await features[name].get(timeout=timeout)}
+        else:
+            found = [await features[name].describe(timeout=timeout)]
+        return {"features": [feature_fields(one) for one in found]}
+
+    async def set_feature(self, name: str, value: Any, timeout: float) -> dict[str, Any]:
+        """Set a feature; return the value that the device has then."""
+        source = await self._soon(timeout)
+        return {"value": await source.features[name].set(value, timeout=timeout)}
+
+    async def execute_feature(self, name: str, timeout: float) -> None:
+        """Execute a command of the device, to its end."""
+        await (await self._soon(timeout)).features[name].execute(timeout=timeout)
+
+    async def _soon(self, timeout: float) -> FrameSource:
+        """Return the source, opened where it is not."""
+        with self._within(timeout, "the device"):
+            async with asyncio.timeout(timeout):
+                return await self.source()
+
+    async def next(self, order: FrameOrder, stream: int) -> dict[str, Any]:
+        """Send what a stream has not had; say that there is none after a while."""
+        came = asyncio.get_running_loop().time()
+        key = order.program, stream
+        with self._counted(order):
+            viewer = self._viewers.get(key)
+            if viewer is None:
+                viewer = await self._view(key, order)
+            if viewer.busy:
+                raise LocalProtocolError(f"{self.name}: two requests for the frames of one stream")
+            if isinstance(viewer, VideoStream) != (order.encoding.name == VIDEO):
+                raise LocalProtocolError(f"{self.name}: a stream does not become {VIDEO}, nor back")
+            viewer.wake()
+            try:
+                taken = await viewer.take(order)
+            except FrameTimeoutError:
+                raise
+            except TimeoutError:
+                return {"came": came}
+            except StopAsyncIteration:
+                self._leave(key, viewer)
+                return {"came": came, "ended": True}
+            except Exception:
+                self._leave(key, viewer)
+                raise
+            finally:
+                if self._viewers.get(key) is viewer:
+                    viewer.rest(lambda: self._leave(key, viewer))
+        self._send([one.frame for one in taken], order)
+        return {"came": came, "stream": viewer.number, **viewer.counts(), **self._all_said(taken)}
+
+    async def _view(self, key: tuple[str, int], order: FrameOrder) -> FrameStream:
+        """Begin a stream."""
+        with self._within(order.timeout, "the device"):
+            async with asyncio.timeout(order.timeout):
+                source = await self.source()
+        if key in self._viewers:
+            return self._viewers[key]
+        theirs = sum(program == key[0] for program, _ in self._viewers)
+        role = role_of(key[0])
+        like = sum(role_of(program) == role for program, _ in self._viewers)
+        if like >= MAX_STREAMS_PER_ROLE or theirs >= MAX_STREAMS_PER_PROGRAM:
+            raise LocalProtocolError(
+                f"{self.name}: {like} streams of frames of role {role}, {theirs} of them this "
+                "program's; no more are possible"
+            )
+        number = next(self._numbers)
+        viewer: FrameStream
+        if order.encoding.name == VIDEO:
+            viewer = VideoStream(number, self._video(source, order.encoding), self._leave_video)
+        else:
+            viewer = PictureStream(number, source.reader(timeout=None), self._encode)
+        self._viewers[key] = viewer
+        return viewer
+
+    def _video(self, source: FrameSource, form: FrameForm) -> SharedVideo:
+        """Return the H.264 stream of one setting, for one more viewer."""
+        from smartcam.fleet._frames.video import SharedVideo
+
+        video = self._videos.get(form)
+        if video is None or video.over:
+            if len(self._videos) >= MAX_VIDEO_SETTINGS:
+                raise LocalProtocolError(
+                    f"{self.name}: {len(self._videos)} settings of H.264 are encoded; no more are "
+                    "possible"
+                )
+            rates = source.format.rates
+            encoder = self.encoder.h264(min(rates) if rates else None, form.bitrate)
+            video = self._videos[form] = SharedVideo(source, encoder, self.name)
+        video.viewers += 1
+        return video
+
+    def _leave_video(self, video: SharedVideo) -> None:
+        """Take one viewer from an H.264 stream, and end a stream without viewers."""
+        video.viewers -= 1
+        if video.viewers:
+            return
+        for form in [form for form, one in self._videos.items() if one is video]:
+            del self._videos[form]
+        ending = video.end()
+        self._tasks.add(ending)
+        ending.add_done_callback(self._done)
+
+    def leave(self, program: str, stream: int) -> None:
+        """End a stream; one that is not there is none."""
+        viewer = self._viewers.get((program, stream))
+        if viewer is not None:
+            self._leave((program, stream), viewer)
+
+    def _leave(self, key: tuple[str, int], viewer: FrameStream) -> None:
+        if self._viewers.get(key) is viewer:
+            del self._viewers[key]
+        viewer.close()
+        if not self._viewers:
+            self._encoded.clear()
+
+    def lens(self, number: int) -> dict[str, Any]:
+        """Return a lens that frames have named by its number, and where they name another."""
+        found = self._lenses.get(number)
+        return {"lens": None if found is None else found.to_data()}
+
+    # ------------------------------------------------------------------ a frame
+
+    def _send(self, frames: list[Frame], order: FrameOrder) -> None:
+        """Send the bytes of frames.
+
+        Raises:
+            FrameFormatError: there are more of them than a frame may have.
+        """
+        size = sum(len(frame.data) for frame in frames)
+        if size > MAX_FRAME_BYTES:
+            raise FrameFormatError(
+                f"{self.name}: a frame of {size} bytes, expected {MAX_FRAME_BYTES} at most",
+                source=self.name,
+            )
+        data = frames[0].data if len(frames) == 1 else b"".join(one.data for one in frames)
+        self.sender.send(order.program, order.call, data)
+
+    def _said(self, frame: Frame, took: float) -> dict[str, Any]:
+        """Return the fields that describe a frame."""
+        return to_fields(frame, self.sender.ahead, took, self._lens_number(frame.camera_info))
+
+    def _all_said(self, taken: list[TakenFrame]) -> dict[str, Any]:
+        """Return the fields that describe all frames that go together."""
+        if not taken[-1].number:
+            return {"frame": self._said(taken[-1].frame, taken[-1].took)}
+        units = [{**self._said(one.frame, one.took), "number": one.number} for one in taken]
+        return {"frame": {"size": sum(unit["size"] for unit in units)}, "units": units}
+
+    async def _encode(self, frame: Frame, encoding: FrameForm) -> tuple[Frame, float]:
+        """Return a frame encoded, once for all that want the same, and the seconds it took."""
+        if encoding.name == "raw":
+            return frame, 0.0
+        last = self._encoded.pop(encoding, None)
+        if last is None or last.frame is not frame:
+            last = _Encoded(
+                frame, self._begin(self.encoder.encoded(frame, encoding), encoding.name)
+            )
+        self._encoded[encoding] = last
+        if len(self._encoded) > MAX_ENCODINGS:
+            del self._encoded[next(iter(self._encoded))]
+        began = time.perf_counter()
+        made = await asyncio.shield(last.task)
+        return made, 0.0 if made is frame else time.perf_counter() - began
+
+    def _begin(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
+        """Have something done for whoever waits for it; it ends with the agent."""
+        task = asyncio.get_running_loop().create_task(
+            work, name=f"smartcam.fleet.{self.name}.{what}"
+        )
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+        return task
+
+    def _done(self, task: asyncio.Task[Any]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled():
+            task.exception()  # it was told to who waited, if anybody did
+
+    def _lens_number(self, lens: CameraModel | None) -> int:
+        if lens is None:
+            return 0
+        for number, known in self._lenses.items():
+            if known is lens:
+                return number
+        number = next(self._numbers)
+        self._lenses[number] = lens
+        if len(self._lenses) > MAX_LENSES:
+            del self._lenses[next(iter(self._lenses))]
+        return number
+
+    @contextlib.contextmanager
+    def _counted(self, order: FrameOrder) -> Iterator[None]:
+        """Count the calls of a program that are under way."""
+        under_way = self._asking.get(order.program, 0)
+        if under_way >= MAX_FRAME_CALLS_PER_PROGRAM:
+            raise LocalProtocolError(
+                f"{self.name}: {under_way} calls of this program for frames are under way"
+            )
+        self._asking[order.program] = under_way + 1
+        try:
+            yield
+        finally:
+            left = self._asking[order.program] - 1
+            if left:
+                self._asking[order.program] = left
+            else:
+                del self._asking[order.program]
+
+    @contextlib.contextmanager
+    def _within(self, seconds: float, what: str) -> Iterator[None]:
+        """Have a timeout say what it waited for."""
+        try:
+            yield
+        except TimeoutError as exc:
+            if isinstance(exc, FrameTimeoutError):
+                raise
+            raise FrameTimeoutError(
+                f"{self.name}: waited {seconds:.3g} s for {what}, in vain", source=self.name
+            ) from None

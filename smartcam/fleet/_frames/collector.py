@@ -1,0 +1,129 @@
+"""The bytes of frames at a program: parts in order, as long as somebody waits for them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import ProtocolError
+from smartcam.fleet._frames.sender import SMALL, WINDOW
+from smartcam.fleet._frames.wire import decode_part
+
+if TYPE_CHECKING:
+    from smartcam.fleet._bus.bus import Data, Handle
+    from smartcam.fleet._frames.wire import FramePart
+    from smartcam.fleet._program.caller import Caller
+    from smartcam.fleet._program.program import Program
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+PART_TIMEOUT = 2.0
+"""Seconds without another part after which the rest of a frame will not come: it was dropped."""
+
+
+class Incoming:
+    """A frame whose bytes come.
+
+    Args:
+        collector: collector that hands on the frame's parts.
+        caller: caller that tells the agent what has come.
+        call: number of the call that the frame answers.
+    """
+
+    def __init__(self, collector: FrameCollector, caller: Caller, call: int) -> None:
+        self._collector, self._caller, self._call = collector, caller, call
+        self._data: Data = b""
+        self._total: int | None = None
+        self._torn = False
+        self._wanted = False
+        self._stirred = asyncio.Event()
+
+    def take(self, part: FramePart, data: Data) -> None:
+        """Take a part; a part that does not follow the parts before ends the frame."""
+        if self._torn or self.complete:
+            return
+        have = len(self._data)
+        fits = part.offset == have and have + len(data) <= part.total
+        if not fits or self._total not in {None, part.total} or (not data and part.total):
+            self._torn = True
+        elif len(data) == part.total:
+            self._total, self._data = part.total, data
+        else:
+            if not isinstance(self._data, bytearray):
+                self._data = bytearray()
+            self._total = part.total
+            self._data += data
+        over = self._torn or self.complete
+        if part.total > (SMALL if over else WINDOW) and not self._caller.program.bus.local:
+            self._caller.come(self._call, None if over else len(self._data))
+        self._stirred.set()
+
+    @property
+    def complete(self) -> bool:
+        """True once all of the frame is here."""
+        return self._total is not None and len(self._data) == self._total
+
+    async def whole(self, size: int) -> Data | None:
+        """Return the frame's bytes; None where some were lost on the way, or do not come in time.
+
+        Args:
+            size: number of bytes that the frame is to have.
+        """
+        self._wanted = True
+        try:
+            while not self.complete and not self._torn:
+                self._stirred.clear()
+                async with asyncio.timeout(PART_TIMEOUT):
+                    await self._stirred.wait()
+        except TimeoutError:
+            return None
+        return self._data if self.complete and len(self._data) == size else None
+
+    def forget(self) -> None:
+        """Drop the frame, since nobody waits for it any more."""
+        self._collector.forget(self._call)
+        if (self._wanted or self._total is not None) and not self.complete and not self._torn:
+            self._caller.come(self._call, None)
+
+
+class FrameCollector:
+    """Takes the bytes of frames for a program.
+
+    Args:
+        program: the program.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self._program = program
+        self._handle: Handle | None = None
+        self._incoming: dict[int, Incoming] = {}
+
+    def expect(self, caller: Caller, call: int) -> Incoming:
+        """Return the incoming frame that takes the bytes that answer a call."""
+        if self._handle is None:
+            program = self._program
+            key = program.keys.frames(program.name)
+            self._handle = program.bus.subscribe_parts(key, self._hear)
+        incoming = self._incoming[call] = Incoming(self, caller, call)
+        return incoming
+
+    def forget(self, call: int) -> None:
+        """Drop a frame for which nobody waits any more, and all parts of it that come."""
+        self._incoming.pop(call, None)
+
+    def close(self) -> None:
+        """Take nothing more. Idempotent."""
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            handle.close()
+
+    def _hear(self, key: str, head: bytes, data: Data) -> None:
+        try:
+            part = decode_part(head)
+        except ProtocolError as exc:
+            logger.warning("%s ! %s", self._program.name, exc)
+            return
+        incoming = self._incoming.get(part.call)
+        if incoming is not None:
+            incoming.take(part, data)

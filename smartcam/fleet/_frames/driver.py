@@ -1,0 +1,75 @@
+"""The scheme ``fleet://`` of frame sources: the frames of a camera that an agent shares."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
+
+from smartcam.exceptions import SmartCamError
+from smartcam.fleet._frames.caller import as_source_error
+from smartcam.fleet._frames.shared_driver import SharedFrameDriver
+from smartcam.fleet._frames.wish import StreamWish
+from smartcam.fleet._opening import fleet_camera
+
+if TYPE_CHECKING:
+    from smartcam.fleet._program.camera import FleetCamera
+    from smartcam.frames import FrameAddress, StreamFormat
+
+
+_NUMBERS = {"quality": (1, 100), "bitrate": (1e4, 1e9), "latency": (1e-3, 60.0)}
+"""Smallest and largest value of each number in a stream's URL."""
+
+
+class FleetFrameDriver(SharedFrameDriver):
+    """Frames of a fleet's camera: ``fleet://HOST/CAMERA?encoding=jpeg&quality=15``.
+
+    ``bitrate`` and ``latency`` are as :meth:`smartcam.Camera.frames` has them. The other parameters
+    are those of :func:`smartcam.connect`: ``fleet``, ``certificates``.
+    """
+
+    def __init__(self, address: FrameAddress) -> None:
+        url, said = _split(address.url)
+        numbers = {
+            name: address.number(name, said[name], least, most)
+            for name, (least, most) in _NUMBERS.items()
+            if name in said
+        }
+        quality = numbers.get("quality")
+        wish = StreamWish.checked(
+            said.get("encoding", "raw"),
+            None if quality is None else int(quality),
+            numbers.get("bitrate"),
+            numbers.get("latency"),
+            f"{address.shown!r}",
+        )
+        self._url = url
+        self._camera = self._make()
+        super().__init__(address, self._camera.frame_caller, wish)
+
+    def _make(self) -> FleetCamera[Any]:
+        return fleet_camera(self._url, {}, ())
+
+    async def open(self) -> StreamFormat:
+        """Come to the agent, and have it open the device."""
+        if self._camera.ended:  # it was closed before
+            self._camera = self._make()
+            self._frames = self._camera.frame_caller
+        try:
+            await self._camera.attend(self._camera.settings.connect_timeout, session=False)
+        except SmartCamError as exc:
+            raise as_source_error(self.name, exc) from exc
+        return await super().open()
+
+    async def close(self) -> None:
+        """Leave the agent."""
+        await super().close()
+        await self._camera.close()
+
+
+def _split(url: str) -> tuple[str, dict[str, str]]:
+    """Return a fleet URL, and the options for frames from its query."""
+    parts = urlsplit(url)
+    said = parse_qsl(parts.query, keep_blank_values=True)
+    own = {key: value for key, value in said if key in {"encoding", *_NUMBERS}}
+    query = urlencode([(key, value) for key, value in said if key not in own])
+    return urlunsplit(parts._replace(query=query)), own

@@ -1,0 +1,62 @@
+"""Encode an agent's frames: the one place that knows the codecs."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from smartcam.fleet._frames.wire import FrameForm
+    from smartcam.frames import Codecs, Frame, H264Encoder
+
+FORMATS = {"jpeg": "MJPEG", "png": "PNG", "jpegxl": "JPEGXL", "h264": "H264"}
+"""Pixel format of frames in each encoding."""
+
+
+class FrameEncoder:
+    """Encodes frames of all cameras of an agent, in threads that begin with the first one."""
+
+    def __init__(self) -> None:
+        self._codecs: Codecs | None = None
+
+    async def encoded(self, frame: Frame, encoding: FrameForm) -> Frame:
+        """Return a frame encoded; one that its camera has encoded so is left as it is.
+
+        Raises:
+            FrameFormatError: its pixels are not for this codec, or its bytes are wrong.
+            MissingExtraError: the codec is not installed.
+        """
+        if frame.format.name == FORMATS[encoding.name] and encoding.quality is None:
+            return frame
+        codecs = self._threads()
+        if encoding.name == "jpeg":
+            if encoding.quality is None:
+                return await codecs.jpeg(frame)
+            return await codecs.jpeg(frame, quality=encoding.quality)
+        return await (codecs.png if encoding.name == "png" else codecs.jpegxl)(frame)
+
+    def h264(self, fps: float | None, bitrate: int | None) -> H264Encoder:
+        """Return an encoder of one stream, in the same threads.
+
+        Args:
+            fps: frames a second, as far as is known.
+            bitrate: bits a second; None: of even quality.
+
+        Raises:
+            MissingExtraError: the codec is not installed.
+        """
+        rate = 30.0 if fps is None else min(1000.0, max(0.01, fps))
+        return self._threads().h264_encoder(fps=rate, bitrate=bitrate)
+
+    def _threads(self) -> Codecs:
+        if self._codecs is None:
+            from smartcam.frames import Codecs  # with numpy, which not every agent needs
+
+            self._codecs = Codecs()
+            self._codecs.begin()
+        return self._codecs
+
+    async def close(self) -> None:
+        """End the threads; what they are at is finished. Idempotent."""
+        codecs, self._codecs = self._codecs, None
+        if codecs is not None:
+            await codecs.close()

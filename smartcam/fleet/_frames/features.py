@@ -1,0 +1,134 @@
+"""Features of a shared camera's device, as an agent tells and sets them."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from smartcam.exceptions import RemoteProtocolError
+from smartcam.frames import DeviceFeatures, Feature, FeatureValue
+
+if TYPE_CHECKING:
+    from smartcam.fleet._program.caller import Caller
+
+CALL_TIMEOUT: Final = 60.0
+"""Seconds for a call, where whoever asked has no earlier deadline of its own."""
+
+MAX_FEATURES: Final = 10_000
+
+_KINDS: Final = ("integer", "float", "boolean", "enumeration", "string", "command")
+_ACCESS: Final = ("rw", "ro", "wo", "")
+
+
+def feature_fields(feature: Feature) -> dict[str, Any]:
+    """Return a feature as JSON; a number that JSON does not have is none."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in dataclasses.asdict(feature).items()
+    }
+
+
+def read_feature(said: object, who: str) -> Feature:
+    """Return the feature that an agent's fields describe.
+
+    Raises:
+        RemoteProtocolError: they describe none.
+    """
+    try:
+        fields = cast("dict[str, Any]", said)
+        kind, access, value = fields["kind"], fields["access"], fields["value"]
+        if kind not in _KINDS or access not in _ACCESS:
+            raise ValueError(f"kind {kind!r:.40}, access {access!r:.40}")
+        if value is not None:
+            value = read_value(value, who)
+        read: dict[str, Any] = {"kind": kind, "access": access, "value": value}
+        for name in ("minimum", "maximum", "step"):
+            read[name] = None if fields[name] is None else _number(fields[name])
+        for name in ("name", "unit", "description", "problem"):
+            read[name] = str(fields[name])
+        for name in ("entries", "selectors"):
+            read[name] = tuple(map(str, fields[name]))
+        return Feature(**read)
+    except (KeyError, TypeError, ValueError) as exc:
+        raise RemoteProtocolError(f"{who}: what the agent says of a feature: {exc!r}") from exc
+
+
+def read_value(said: object, who: str) -> FeatureValue:
+    """Return a value that an agent says.
+
+    Raises:
+        RemoteProtocolError: it is none.
+    """
+    if isinstance(said, (bool, int, float, str)):
+        return said
+    raise RemoteProtocolError(f"{who}: what the agent says is no value of a feature: {said!r:.80}")
+
+
+def _number(said: object) -> float:
+    if isinstance(said, bool) or not isinstance(said, (int, float)):
+        raise TypeError(f"{said!r:.40} is no number")
+    return said
+
+
+class FleetFeatures(DeviceFeatures):
+    """The features of a camera's device, asked of its agent.
+
+    Args:
+        name: name of the camera.
+        caller: calls the agent.
+    """
+
+    def __init__(self, name: str, caller: Caller) -> None:
+        self._name, self._caller = name, caller
+
+    async def _call(self, do: str, **arguments: Any) -> dict[str, Any]:
+        deadline = asyncio.get_running_loop().time() + CALL_TIMEOUT
+        reply = await self._caller.call(do, deadline, arguments)
+        return cast("dict[str, Any]", reply.fields["answer"])
+
+    async def names(self) -> list[str]:
+        """Return the names of all features."""
+        said = await self._call("features", names_only=True)
+        return [str(one) for one in self._list(said, "names")]
+
+    async def describe_all(self) -> dict[str, Feature]:
+        """Return all features with their values and ranges as they are now."""
+        return {one.name: one for one in await self._described()}
+
+    async def describe(self, name: str) -> Feature:
+        """Return a feature with its value and range as they are now."""
+        found = await self._described(name=name)
+        if len(found) != 1:
+            raise RemoteProtocolError(f"{self._name}: expected one feature, got {len(found)}")
+        return found[0]
+
+    async def _described(self, **arguments: Any) -> list[Feature]:
+        said = await self._call("features", **arguments)
+        return [read_feature(one, self._name) for one in self._list(said, "features")]
+
+    def _list(self, said: dict[str, Any], name: str) -> list[Any]:
+        """Return a list of what an agent says.
+
+        Raises:
+            RemoteProtocolError: it is none, or has too many items.
+        """
+        found = said.get(name)
+        if not isinstance(found, list) or len(found) > MAX_FEATURES:
+            raise RemoteProtocolError(f"{self._name}: the agent says no list of {name}")
+        return found
+
+    async def get(self, name: str) -> FeatureValue:
+        """Return the value of a feature."""
+        said = await self._call("features", name=name, value_only=True)
+        return read_value(said.get("value"), self._name)
+
+    async def set(self, name: str, value: FeatureValue) -> FeatureValue:
+        """Set a feature; return the value that the device has then."""
+        said = await self._call("set_feature", name=name, value=value)
+        return read_value(said.get("value"), self._name)
+
+    async def execute(self, name: str) -> None:
+        """Execute a command, and wait until the device has done it."""
+        await self._call("execute_feature", name=name)

@@ -1,0 +1,147 @@
+"""An agent's end of frames on their way: never more of them than a program has said it takes.
+
+Each program has a window of bytes that are under way to it. It says what has come, and gets more
+then. So a program that is slow, stopped or dead fills no queue but its own, nobody waits for it,
+and what it does not take in time is skipped where the frames are. There is no task in it: what
+comes pushes the next part out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from smartcam.fleet._frames.wire import FramePart, encode_part
+
+if TYPE_CHECKING:
+    from smartcam.fleet._bus.bus import Bus, Data
+    from smartcam.fleet._bus.keys import Keys
+
+PART = 1 << 17
+"""Bytes of a part: the loop takes less than 0.1 ms to hand them to the engine."""
+
+WINDOW = 3 * PART
+"""Bytes under way to one program. The engine's queue has room for 16 packets of 64 kB, and drops
+what does not fit; where a router stands between, two programs have it together."""
+
+SMALL = 1 << 16
+"""Bytes of a frame that is one packet, and not counted: nobody says that it has come."""
+
+MAX_WAITING_BYTES = 1 << 26
+"""Bytes of frames that may wait for one program; the oldest of which nothing is under way are given
+up."""
+
+STALE = 10.0
+"""Seconds after which a frame of which nothing came there is given up."""
+
+
+@dataclass(eq=False)
+class _Transfer:
+    """A frame under way."""
+
+    call: int
+    data: memoryview
+    moved_at: float
+    sent: int = 0
+    come: int = 0
+
+    @property
+    def under_way(self) -> int:
+        return self.sent - self.come
+
+
+@dataclass(eq=False)
+class _Window:
+    """All frames under way to one program, oldest first."""
+
+    transfers: collections.OrderedDict[int, _Transfer] = field(
+        default_factory=collections.OrderedDict[int, _Transfer]
+    )
+
+    @property
+    def under_way(self) -> int:
+        return sum(one.under_way for one in self.transfers.values())
+
+    @property
+    def waiting(self) -> int:
+        return sum(len(one.data) for one in self.transfers.values())
+
+
+class FrameSender:
+    """Sends frames to programs.
+
+    Args:
+        bus: the agent's end of the bus.
+        keys: keys of the fleet.
+    """
+
+    def __init__(self, bus: Bus, keys: Keys) -> None:
+        self._bus, self._keys = bus, keys
+        self._windows: dict[str, _Window] = {}
+
+    @property
+    def ahead(self) -> float:
+        """Lead of the agent's clock over the one that frames are timed by, seconds.
+
+        Where all ends are in one process, frames keep the time that they have.
+        """
+        if self._bus.local:
+            return 0.0
+        return asyncio.get_running_loop().time() - time.monotonic()
+
+    def send(self, program: str, call: int, data: Data) -> None:
+        """Send a frame's bytes as the answer to a call: what there is room for now."""
+        total = len(data)
+        if self._bus.local or total <= SMALL:
+            self._put(program, FramePart(call, 0, total), data)
+            return
+        window = self._windows.setdefault(program, _Window())
+        now = asyncio.get_running_loop().time()
+        for one in [*window.transfers.values()]:
+            # what is under way stays so, unless it is long ago
+            full = window.waiting + total > MAX_WAITING_BYTES and not one.under_way
+            if full or now - one.moved_at > STALE:
+                del window.transfers[one.call]
+        window.transfers[call] = _Transfer(call, memoryview(data), now)
+        self._push(program, window)
+
+    def come(self, program: str, call: int, offset: int | None) -> None:
+        """Note up to where a frame has come at a program; None: whole, or no more is wanted."""
+        window = self._windows.get(program)
+        transfer = None if window is None else window.transfers.get(call)
+        if window is None or transfer is None:
+            return
+        transfer.moved_at = asyncio.get_running_loop().time()
+        transfer.come = max(transfer.come, min(offset or 0, transfer.sent))
+        if offset is None or transfer.come == len(transfer.data):
+            del window.transfers[call]
+        if window.transfers:
+            self._push(program, window)
+        else:
+            del self._windows[program]
+
+    def forget(self, program: str) -> None:
+        """Drop the frames of a program that is gone."""
+        self._windows.pop(program, None)
+
+    def close(self) -> None:
+        """Send nothing more."""
+        self._windows.clear()
+
+    def _push(self, program: str, window: _Window) -> None:
+        """Send parts as long as there is room; of those begun first, first."""
+        room = WINDOW - window.under_way
+        for one in window.transfers.values():
+            while one.sent < len(one.data):
+                part = one.data[one.sent : one.sent + PART]
+                if len(part) > room:
+                    return
+                room -= len(part)
+                self._put(program, FramePart(one.call, one.sent, len(one.data)), part)
+                one.sent += len(part)
+
+    def _put(self, program: str, part: FramePart, data: Data) -> None:
+        self._bus.put_part(self._keys.frames(program), encode_part(part), data)

@@ -1,0 +1,212 @@
+"""Frames of a fleet's camera as a source: one asked for after the other."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from smartcam._extras import load
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameSourceError,
+    ResponseTimeoutError,
+    SmartCamError,
+    UnsupportedError,
+)
+from smartcam.fleet._frames.caller import StreamCounts, as_source_error
+from smartcam.fleet._frames.stream import HOLD
+from smartcam.fleet._frames.wire import VIDEO, FrameForm
+from smartcam.frames import FrameDriver
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.fleet._frames.caller import FrameCaller
+    from smartcam.fleet._frames.units import VideoUnits
+    from smartcam.fleet._frames.wire import FleetFrame
+    from smartcam.fleet._frames.wish import StreamWish
+    from smartcam.frames import (
+        AwaitedTrigger,
+        DeviceFeatures,
+        Frame,
+        FrameAddress,
+        FrameSink,
+        StreamFormat,
+    )
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+ANSWER = 4.0
+"""Seconds for the answer to a request of a stream, beyond those that it waits for a frame: to
+encode it, and for the way."""
+
+MAX_UNANSWERED_REQUESTS = 3
+"""Requests in a row without an answer after which a stream has ended."""
+
+MAX_BROKEN_FRAMES = 10
+"""Frames in a row that did not come whole after which a stream has ended, too."""
+
+
+class SharedFrameDriver(FrameDriver):
+    """Frames of a fleet's camera that is open.
+
+    Args:
+        address: address of the camera.
+        frames: caller that asks the agent for frames.
+        wish: form and rate in which the frames are to come.
+    """
+
+    times_frames = True
+
+    def __init__(self, address: FrameAddress, frames: FrameCaller, wish: StreamWish) -> None:
+        super().__init__(address)
+        self._frames, self._wish = frames, wish
+        self._task: asyncio.Task[None] | None = None
+        self._video: VideoUnits | None = None
+
+    @property
+    def name(self) -> str:
+        """The camera's name."""
+        return self._frames.name
+
+    async def open(self) -> StreamFormat:
+        """Have the agent open the device.
+
+        Raises:
+            FrameSourceError: it cannot, or there is no agent.
+            UnsupportedError: the camera has no frames.
+            MissingExtraError: what decodes H.264 is not installed here.
+        """
+        if self._wish.form.name == VIDEO and self._wish.decode:
+            load("av")
+        try:
+            return await self._frames.about(self._wish)
+        except (FrameSourceError, UnsupportedError, ConfigurationError):
+            raise
+        except SmartCamError as exc:
+            raise as_source_error(self.name, exc) from exc
+
+    @property
+    def features(self) -> DeviceFeatures:
+        """The features of the device, which the camera's agent has."""
+        return self._frames.features
+
+    async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame:
+        """Have the camera's agent trigger the device, and return the picture.
+
+        Raises:
+            SmartCamError: as the agent says.
+        """
+        form = self._wish.form
+        picture = FrameForm("raw", None) if form.name == VIDEO else form
+        return await self._frames.trigger(picture, timeout, wait=not refuse)
+
+    async def trigger(
+        self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
+    ) -> None:
+        """Refuse to have a line set: the agent cannot call a function of this program.
+
+        Raises:
+            UnsupportedError: always.
+        """
+        del pending, fire
+        raise UnsupportedError(
+            f"{self.name}: its agent triggers it by software; `fire` cannot be called there"
+        )
+
+    async def start(self, sink: FrameSink) -> None:
+        """Ask for one frame after the other."""
+        if self._wish.form.name == VIDEO:
+            from smartcam.fleet._frames.units import VideoUnits
+
+            self._video = VideoUnits(decode=self._wish.decode)
+        stream = self._frames.next_stream()
+        self._task = asyncio.get_running_loop().create_task(
+            self._ask(sink, stream), name=f"frames of {self.name}"
+        )
+        self._task.add_done_callback(lambda _: self._frames.leave(stream))
+
+    async def stop(self) -> None:
+        """Ask no more."""
+        task, self._task = self._task, None
+        video, self._video = self._video, None
+        try:
+            if task is not None:
+                task.cancel()
+                await asyncio.wait([task])
+        finally:
+            if video is not None:
+                await video.close()
+
+    async def close(self) -> None:
+        """Ask no more."""
+        await self.stop()
+
+    async def _ask(self, sink: FrameSink, stream: int) -> None:
+        try:
+            end = await self._until_end(sink, stream)
+        except Exception as exc:
+            logger.exception("%s ! its frames end", self.name)
+            end = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
+        sink.ended(end)
+
+    async def _until_end(self, sink: FrameSink, stream: int) -> FrameSourceError | None:
+        """Take frames until there will be none, and return why."""
+        loop = asyncio.get_running_loop()
+        counts, silent, torn = StreamCounts(), 0, 0
+        while True:
+            try:
+                deadline = loop.time() + HOLD + ANSWER
+                answer, frames = await self._frames.ask_all(
+                    "next_frame", deadline, self._arguments(stream), counts
+                )
+            except FrameSourceError as exc:
+                return exc
+            except ResponseTimeoutError as exc:
+                silent += 1
+                if silent >= MAX_UNANSWERED_REQUESTS:
+                    return as_source_error(self.name, exc)
+                continue
+            except SmartCamError as exc:
+                return as_source_error(self.name, exc)
+            silent = 0
+            if frames:
+                torn = 0
+                if answer["skipped"]:
+                    sink.skipped(answer["skipped"])
+                await self._give(sink, answer, frames)
+            elif answer.get("ended"):
+                return None
+            elif "frame" in answer:
+                torn += 1
+                if torn >= MAX_BROKEN_FRAMES:
+                    return FrameSourceError(
+                        f"{self.name}: {torn} frames in a row did not come here whole",
+                        source=self.name,
+                    )
+
+    def _arguments(self, stream: int) -> dict[str, Any]:
+        """Return the arguments of the call for the next frame."""
+        arguments = {**self._wish.form.fields(), "stream": stream}
+        rate = self._wish.rate
+        if rate is not None:
+            arguments |= {"quality": rate.quality, "rest": rate.rest}
+        if self._video is not None:
+            arguments["have"] = self._video.have
+        return arguments
+
+    async def _give(
+        self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]
+    ) -> None:
+        """Give the frames that came to the readers."""
+        if self._video is not None:
+            await self._video.give(sink, answer, frames)
+            return
+        frame, rate = frames[-1], self._wish.rate
+        if rate is not None:
+            here, age = frame.age, float(answer["frame"]["age"])
+            rate.sent(len(frame.data), frame.captured + age, here - age, age=age)
+            frame = replace(frame, rate=rate.statistics())
+        sink.frame(frame)

@@ -1,0 +1,173 @@
+"""The streams of frames that programs have at an agent: what each is given next."""
+
+from __future__ import annotations
+
+import asyncio
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.fleet._frames.pace import FramePace
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.fleet._frames.video import SharedVideo
+    from smartcam.fleet._frames.wire import FrameForm
+    from smartcam.frames import Frame, FrameReader
+
+IDLE = 3.0
+"""Seconds without a request after which a stream has ended."""
+
+HOLD = 1.0
+"""Seconds that a request waits for a frame at most; then it is answered that there is none."""
+
+
+class FrameOrder(NamedTuple):
+    """An order of a frame: the program that wants it, and the form.
+
+    Attributes:
+        program: name of the program.
+        call: number of the program's call.
+        encoding: form in which the frame is to come.
+        timeout: seconds that the call may take.
+        rest: seconds from one frame of a stream to the next, at least.
+        have: for H.264, number of the last encoded frame that the program has; 0 for none.
+    """
+
+    program: str
+    call: int
+    encoding: FrameForm
+    timeout: float
+    rest: float = 0.0
+    have: int = 0
+
+
+class TakenFrame(NamedTuple):
+    """A frame for a program.
+
+    Attributes:
+        frame: the frame in the form in which it is to come.
+        took: seconds to encode it.
+        number: for H.264, place of the frame in the stream; else 0.
+    """
+
+    frame: Frame
+    took: float
+    number: int = 0
+
+
+@dataclass(eq=False)
+class FrameStream(ABC):
+    """A stream of a program.
+
+    Attributes:
+        number: number of the stream.
+        busy: whether a frame of the stream is asked for.
+    """
+
+    number: int
+    idle: asyncio.TimerHandle | None = field(default=None, kw_only=True)
+    busy: bool = field(default=False, kw_only=True)
+
+    def rest(self, close: Callable[[], None]) -> None:
+        """Count the stream as idle; ``close`` is called if it stays so."""
+        self.busy = False
+        self.idle = asyncio.get_running_loop().call_later(IDLE, close)
+
+    def wake(self) -> None:
+        """Count the stream as busy: something is asked for."""
+        self.busy = True
+        if self.idle is not None:
+            self.idle.cancel()
+            self.idle = None
+
+    @abstractmethod
+    async def take(self, order: FrameOrder) -> list[TakenFrame]:
+        """Return the next frame, or several frames of H.264.
+
+        Raises:
+            TimeoutError: there is none for now.
+            StopAsyncIteration: it has ended.
+            SmartCamError: why it has ended.
+        """
+
+    @abstractmethod
+    def counts(self) -> dict[str, int]:
+        """Return the numbers of frames sent, skipped and lost, to be told with the next frames."""
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        self.wake()
+
+
+@dataclass(eq=False)
+class PictureStream(FrameStream):
+    """A stream of frames that are each for themselves: the newest one.
+
+    Args:
+        reader: reader of the source.
+        encode: function that encodes a frame and returns the seconds that this took.
+    """
+
+    reader: FrameReader
+    encode: Callable[[Frame, FrameForm], Awaitable[tuple[Frame, float]]]
+    pace: FramePace = field(default_factory=FramePace)
+
+    async def take(self, order: FrameOrder) -> list[TakenFrame]:
+        loop, reader = asyncio.get_running_loop(), self.reader
+        since, until = self.pace.asked(loop.time(), reader.came, order.rest)
+        async with asyncio.timeout(min(order.timeout, HOLD)):
+            await reader.fresh(since, until)
+            frame = await anext(reader)
+        self.pace.took(reader.came, reader.statistics().offered)
+        async with asyncio.timeout(order.timeout):
+            taken = TakenFrame(*await self.encode(frame, order.encoding))
+        self.pace.gave(loop.time())
+        return [taken]
+
+    def counts(self) -> dict[str, int]:
+        account = self.reader.statistics()
+        return {"sent": account.delivered, "skipped": account.skipped, "lost": account.lost}
+
+    def close(self) -> None:
+        super().close()
+        self.reader.close()
+
+
+@dataclass(eq=False)
+class VideoStream(FrameStream):
+    """A stream of H.264: all encoded frames since those that are there.
+
+    Args:
+        video: the encoder's stream, at which others look, too.
+        leave: function that is called at the end; None after it.
+    """
+
+    video: SharedVideo
+    leave: Callable[[SharedVideo], None] | None
+    _highest: int = 0
+    _sent: int = 0
+    _first: tuple[int, int] | None = None  # offered and lost before the first one
+    _last: tuple[int, int] = (0, 0)
+
+    async def take(self, order: FrameOrder) -> list[TakenFrame]:
+        async with asyncio.timeout(min(order.timeout, HOLD)):
+            units = await self.video.after(order.have)
+        if self._first is None:
+            self._first = units[0].offered - 1, units[0].lost
+        self._sent += sum(unit.number > self._highest for unit in units)
+        self._highest = max(self._highest, units[-1].number)
+        self._last = units[-1].offered, units[-1].lost
+        return [TakenFrame(unit.frame, unit.took, unit.number) for unit in units]
+
+    def counts(self) -> dict[str, int]:
+        offered, lost = self._first or (0, 0)
+        skipped = self._last[0] - offered - self._sent
+        return {"sent": self._sent, "skipped": skipped, "lost": self._last[1] - lost}
+
+    def close(self) -> None:
+        super().close()
+        leave, self.leave = self.leave, None
+        if leave is not None:
+            leave(self.video)

@@ -1,0 +1,81 @@
+"""H.264 of a shared camera at a program: encoded frames in order, and pictures of them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import FrameFormatError, RemoteProtocolError
+from smartcam.frames import Codecs
+
+if TYPE_CHECKING:
+    from smartcam.fleet._frames.wire import FleetFrame
+    from smartcam.frames import FrameSink
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+TAKE = 1.0
+"""Seconds that readers have for an encoded frame before the next one of the same answer."""
+
+
+class VideoUnits:
+    """Takes encoded frames, and gives pictures.
+
+    Args:
+        decode: False: it gives the encoded frames.
+
+    Attributes:
+        have: number of the last encoded frame of which there is a picture; 0: none is.
+
+    Raises:
+        MissingExtraError: what decodes is not installed.
+    """
+
+    def __init__(self, *, decode: bool) -> None:
+        self.have = 0
+        self._codecs = Codecs(threads=1)
+        self._codecs.begin()
+        self._decoder = self._codecs.h264_decoder() if decode else None
+
+    async def close(self) -> None:
+        """End the thread. Idempotent."""
+        await self._codecs.close()
+
+    async def give(self, sink: FrameSink, answer: dict[str, Any], frames: list[FleetFrame]) -> None:
+        """Give what came, in order; what cannot be decoded counts as lost, and is asked for anew.
+
+        Raises:
+            RemoteProtocolError: the agent does not say which frames these are.
+        """
+        try:
+            numbers = [int(unit["number"]) for unit in answer["units"]]
+        except (KeyError, TypeError, ValueError) as exc:
+            raise RemoteProtocolError(f"what the agent says of H.264: {exc!r}") from exc
+        for place, (number, frame) in enumerate(zip(numbers, frames, strict=True)):
+            if self._decoder is None:
+                self.have = number
+                await self._give_encoded(sink, frame, last=place == len(frames) - 1)
+                continue
+            try:
+                if number != self.have + 1:
+                    self._decoder.lost()
+                picture = await self._decoder.decode(frame)
+            except FrameFormatError as exc:
+                logger.warning("%s", exc)
+                picture = None
+            if picture is None:  # the next one that comes is a key frame
+                self.have = 0
+                sink.lost(len(frames) - place)
+                return
+            self.have = number
+            sink.frame(picture)
+
+    async def _give_encoded(self, sink: FrameSink, frame: FleetFrame, *, last: bool) -> None:
+        """Give an encoded frame; readers take it before the next one, unless they are slow."""
+        sink.frame(frame)
+        if not last:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(TAKE):
+                    await sink.taken()

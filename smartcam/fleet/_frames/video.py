@@ -1,0 +1,164 @@
+"""H.264 of a camera's frames at its agent: one encoder per setting, for all programs that look.
+
+A frame of H.264 is nothing without those before it. So the last few are kept, and who asks gets all
+that came since those it has; who is too late for that gets nothing until the next key frame, which
+is made for it, though not more often than every so often.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import secrets
+import time
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import FrameSourceError
+
+if TYPE_CHECKING:
+    from smartcam.frames import Frame, FrameSource, H264Encoder
+
+LATE = 0.3
+"""Seconds that an encoded frame is kept for programs that have the frames before it."""
+
+MAX_UNITS_KEPT = 64
+
+KEY_EVERY = 1.0
+"""Seconds from one key frame to the next at least."""
+
+
+class VideoUnit(NamedTuple):
+    """An encoded frame.
+
+    Attributes:
+        number: number of the unit, one more than of the unit before.
+        frame: the encoded frame.
+        took: seconds to encode it.
+        key: whether the unit can be decoded without the units before it.
+        made: time of the loop's clock at which the unit was made.
+        offered: number of frames that the source gave until then.
+        lost: number of frames that the source lost until then.
+    """
+
+    number: int
+    frame: Frame
+    took: float
+    key: bool
+    made: float
+    offered: int
+    lost: int
+
+
+class SharedVideo:
+    """One stream of H.264.
+
+    Args:
+        source: source of the frames.
+        encoder: encoder for this stream alone.
+        name: name of the camera.
+    """
+
+    def __init__(self, source: FrameSource, encoder: H264Encoder, name: str) -> None:
+        self._encoder = encoder
+        self._reader = source.reader(timeout=None)
+        self._kept: collections.deque[VideoUnit] = collections.deque(maxlen=MAX_UNITS_KEPT)
+        self._stirred = asyncio.Event()
+        self._over: tuple[Exception | None] | None = None
+        self._name = name
+        self._last_key = -KEY_EVERY
+        self._key_wanted = False
+        self.viewers = 0
+        self._task = asyncio.get_running_loop().create_task(
+            self._run(), name=f"smartcam.fleet.{name}.h264"
+        )
+        self._task.add_done_callback(self._ended)
+
+    def _ended(self, _: asyncio.Task[None]) -> None:
+        """Wake the readers at the task's end, even of a task that was cancelled before it began."""
+        if self._over is None:
+            self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
+        self._reader.close()
+        self._kept.clear()
+        self._stirred.set()
+
+    @property
+    def over(self) -> bool:
+        """True once nothing more comes."""
+        return self._over is not None
+
+    async def close(self) -> None:
+        """Encode nothing more; who waits is told. Idempotent."""
+        await asyncio.wait([self.end()])
+
+    def end(self) -> asyncio.Task[None]:
+        """Begin to close; return the task that ends then."""
+        if self._over is None:
+            self._over = (FrameSourceError(f"{self._name}: its video ended", source=self._name),)
+        self._reader.close()
+        self._stirred.set()
+        self._task.cancel()
+        return self._task
+
+    async def after(self, have: int) -> list[VideoUnit]:
+        """Return encoded frames that follow one, or that begin anew, as soon as there are some.
+
+        Args:
+            have: number of the last one that is there; 0: none is.
+
+        Raises:
+            FrameSourceError: the source ended with it.
+            FrameFormatError: its frames cannot become video.
+            StopAsyncIteration: it ended.
+        """
+        while True:
+            if found := self._following(have):
+                return found
+            if self._over is not None:
+                if self._over[0] is not None:
+                    raise self._over[0]
+                raise StopAsyncIteration
+            self._stirred.clear()
+            await self._stirred.wait()
+
+    def _following(self, have: int) -> list[VideoUnit]:
+        kept = self._kept
+        if not kept or kept[-1].number == have:
+            return []
+        fresh = asyncio.get_running_loop().time() - LATE
+        found: list[VideoUnit] = []
+        for unit in reversed(kept):
+            if unit.made < fresh and found:
+                break  # too late for all of these
+            found.append(unit)
+            if unit.key or unit.number == have + 1:
+                return found[::-1]
+        self._key_wanted = True
+        return []
+
+    async def _run(self) -> None:
+        try:
+            async for frame in self._reader:
+                account = self._reader.statistics()
+                await self._encode(frame, account.offered, account.lost)
+            self._over = self._over or (None,)
+        except asyncio.CancelledError:
+            raise
+        except Exception as error:  # noqa: BLE001 - it is told to who looks
+            self._over = (error,)
+
+    async def _encode(self, frame: Frame, offered: int, lost: int) -> None:
+        from smartcam.frames._inside import entry_point
+
+        loop = asyncio.get_running_loop()
+        if self._key_wanted and loop.time() - self._last_key >= KEY_EVERY:
+            self._encoder.begin_anew()
+        began = time.perf_counter()
+        made = await self._encoder.encode(frame)
+        took = time.perf_counter() - began
+        key, _ = entry_point(bytes(made.data))
+        if key:
+            self._last_key, self._key_wanted = loop.time(), False
+        number = self._kept[-1].number + 1 if self._kept else secrets.randbits(31) + 1
+        unit = VideoUnit(number, made, took, key, loop.time(), offered, lost)
+        self._kept.append(unit)
+        self._stirred.set()

@@ -1,0 +1,275 @@
+"""Frames on their way over the bus: what is said of one, and the parts that its bytes come in.
+
+The reply to a call for a frame says all of it but its bytes. These come under a key of their own,
+in parts, since the engine drops what is longer than its queue; a part is dropped where there is no
+room, and never waited for.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from smartcam.exceptions import ConfigurationError, RemoteProtocolError
+from smartcam.fleet._frames.features import read_value
+from smartcam.frames import Frame, FrameTrigger, Moment
+
+if TYPE_CHECKING:
+    from smartcam.fleet._bus.bus import Data
+    from smartcam.frames import RateStatistics
+    from smartcam.geometry import CameraModel
+
+MAX_FRAME_BYTES = 1 << 28
+"""Bytes of a frame at most: 14,000 x 10,000 pixels of 16 bits."""
+
+ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
+"""Encodings of frames; raw is as the camera gave them."""
+
+
+VIDEO = "h264"
+"""Further encoding, for streams only."""
+
+MIN_BITRATE, MAX_BITRATE = 10_000, 1_000_000_000
+
+
+class FrameForm(NamedTuple):
+    """The form in which frames are to come.
+
+    Attributes:
+        name: one of :data:`ENCODINGS`, or :data:`VIDEO`.
+        quality: quality of JPEG, 1 to 100; None for the codec's own.
+        bitrate: bit rate of H.264, bits a second; None for even quality.
+    """
+
+    name: str = "raw"
+    quality: int | None = None
+    bitrate: int | None = None
+
+    @classmethod
+    def checked(
+        cls,
+        name: object,
+        quality: object,
+        who: str,
+        *,
+        bitrate: object = None,
+        stream: bool = False,
+    ) -> FrameForm:
+        """Return the form of frames for checked arguments.
+
+        Args:
+            name: the encoding.
+            quality: None where nothing is said.
+            who: name of the asker, for error texts.
+            bitrate: None where nothing is said.
+            stream: whether it is for a stream, which video can be.
+
+        Raises:
+            ConfigurationError: there is no such encoding, or it has no such quality or bit rate.
+        """
+        known = (*ENCODINGS, VIDEO) if stream else ENCODINGS
+        if name not in known:
+            why = ": it is for streams, no frame of it is a picture by itself"
+            raise ConfigurationError(
+                f"{who}: encoding: expected {', '.join(known)}, got {name!r:.40}"
+                f"{why if name == VIDEO else ''}"
+            )
+        for what, value, of, least, most in (
+            ("quality", quality, "jpeg", 1, 100),
+            ("bitrate", bitrate, VIDEO, MIN_BITRATE, MAX_BITRATE),
+        ):
+            if value is None:
+                continue
+            if name != of:
+                raise ConfigurationError(f"{who}: {what}: {name} has none, got {value!r:.40}")
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+                raise ConfigurationError(
+                    f"{who}: {what}: expected {least} to {most}, got {value!r:.40}"
+                )
+        return cls(str(name), cast("int | None", quality), cast("int | None", bitrate))
+
+    def fields(self) -> dict[str, Any]:
+        """Return the form as arguments of a call."""
+        said = {"encoding": self.name, "quality": self.quality}
+        return said if self.bitrate is None else {**said, "bitrate": self.bitrate}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FleetFrame(Frame):
+    """A frame that came over the bus.
+
+    Attributes:
+        encoding_time: seconds that its agent took to encode it; 0 where it is as the camera gave
+            it, or was encoded for somebody else before.
+        rate: what held the stream's bit rate or latency when it came, and why; None: nothing did.
+    """
+
+    encoding_time: float = 0.0
+    rate: RateStatistics | None = None
+
+
+def to_fields(frame: Frame, ahead: float, encoding_time: float, lens: int) -> dict[str, Any]:
+    """Return the fields that describe a frame, as JSON.
+
+    Args:
+        frame: the frame.
+        ahead: seconds that the agent's clock is ahead of ``time.monotonic()``.
+        encoding_time: as :class:`FleetFrame` has it.
+        lens: number of the frame's ``camera_info``; 0 for none.
+    """
+    return {
+        "format": frame.format.name,
+        "width": frame.width,
+        "height": frame.height,
+        "stride": frame.stride,
+        "captured": frame.captured + ahead,
+        "utc": frame.utc,
+        "moment": frame.moment.name,
+        "duration": frame.duration,
+        "device_time": frame.device_time,
+        "sequence": frame.sequence,
+        "lost": frame.lost,
+        "age": frame.age,
+        "size": len(frame.data),
+        "encoding_time": encoding_time,
+        "lens": lens,
+        **_more(frame, ahead),
+    }
+
+
+def _more(frame: Frame, ahead: float) -> dict[str, Any]:
+    """Return the fields that few frames have."""
+    said: dict[str, Any] = {}
+    chunks = {
+        name: value
+        for name, value in frame.chunks.items()
+        if not isinstance(value, float) or math.isfinite(value)
+    }
+    if chunks:
+        said["chunks"] = chunks
+    if frame.remark:
+        said["remark"] = frame.remark
+    if frame.trigger is not None:
+        said["trigger"] = {
+            "number": frame.trigger.number,
+            "fired": frame.trigger.fired + ahead,
+            "evidence": [*frame.trigger.evidence],
+        }
+    return said
+
+
+def _read_more(said: dict[str, Any], captured: float, who: str) -> dict[str, Any]:
+    """Return the fields that :func:`_more` made, by this side's clock."""
+    chunks, remark, trigger = said.get("chunks", {}), said.get("remark", ""), said.get("trigger")
+    if not isinstance(chunks, dict):
+        raise TypeError("its chunks are none")
+    read: dict[str, Any] = {
+        "chunks": {
+            str(name): read_value(value, who)
+            for name, value in cast("dict[str, Any]", chunks).items()
+        },
+        "remark": str(remark),
+    }
+    if trigger is not None:
+        fired = float(trigger["fired"]) - float(said["captured"]) + captured
+        evidence = tuple(map(str, trigger["evidence"]))
+        read["trigger"] = FrameTrigger(int(trigger["number"]), fired, evidence)
+    return read
+
+
+def from_fields(
+    said: dict[str, Any],
+    data: Data,
+    *,
+    captured: float,
+    doubt: float,
+    lost: int,
+    source: str,
+    camera_info: CameraModel | None,
+) -> FleetFrame:
+    """Return the frame that an agent's fields describe; other arguments give what they lack.
+
+    Args:
+        said: fields made by :func:`to_fields`.
+        data: bytes of the frame.
+        captured: when the frame was taken, by this side's ``time.monotonic()``.
+        doubt: seconds by which ``captured`` may be wrong.
+        lost: number of frames lost before this one.
+        source: the camera's name.
+        camera_info: model of the camera's lens; None for none.
+
+    Raises:
+        RemoteProtocolError: the fields describe no frame.
+        FrameFormatError: pixels that this version does not know.
+    """
+    from smartcam.frames import find_format  # with numpy, which not everybody needs
+
+    try:
+        width, height, stride = int(said["width"]), int(said["height"]), int(said["stride"])
+        duration, device = float(said["duration"]), said["device_time"]
+        pixels = str(said["format"])
+        if width <= 0 or height <= 0 or stride < 0 or not 0 <= duration < math.inf:
+            raise ValueError(f"{width}x{height}, rows of {stride} bytes")
+        fields: dict[str, Any] = {
+            "moment": Moment[str(said["moment"])],
+            "utc": float(said["utc"]),
+            "device_time": None if device is None else float(device),
+            "sequence": int(said["sequence"]),
+            "encoding_time": float(said["encoding_time"]),
+            **_read_more(said, captured, source),
+        }
+    except (KeyError, TypeError, ValueError) as exc:
+        raise RemoteProtocolError(f"{source}: what the agent says of a frame: {exc!r}") from exc
+    return FleetFrame(
+        data=data,
+        format=find_format(pixels),
+        width=width,
+        height=height,
+        stride=stride,
+        captured=captured,
+        duration=duration + doubt,
+        lost=lost,
+        source=source,
+        camera_info=camera_info,
+        **fields,
+    )
+
+
+_PART = struct.Struct("<4sQQQ")
+_IS_PART = b"scf1"
+
+
+class FramePart(NamedTuple):
+    """The place of a part in its frame.
+
+    Attributes:
+        call: number of the call that the frame answers.
+        offset: place of the part's first byte in the frame's bytes.
+        total: bytes of the frame.
+    """
+
+    call: int
+    offset: int
+    total: int
+
+
+def encode_part(part: FramePart) -> bytes:
+    """Return the head of a part as bytes."""
+    return _PART.pack(_IS_PART, *part)
+
+
+def decode_part(head: bytes) -> FramePart:
+    """Return the part of a frame that its head describes.
+
+    Raises:
+        RemoteProtocolError: the head is not that of a part.
+    """
+    try:
+        magic, call, offset, total = _PART.unpack(head)
+    except struct.error as exc:
+        raise RemoteProtocolError(f"a part of a frame is broken: {exc}") from exc
+    if magic != _IS_PART or total > MAX_FRAME_BYTES:
+        raise RemoteProtocolError(f"a part of a frame of {total} bytes begins with {magic!r}")
+    return FramePart(call, offset, total)

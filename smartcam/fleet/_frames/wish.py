@@ -1,0 +1,71 @@
+"""Read a program's wish for a stream: its encoding, and the control of bit rate or latency."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._frames.encoding import FORMATS
+from smartcam.fleet._frames.wire import VIDEO, FrameForm
+from smartcam.frames import RateControl, find_format
+
+
+class StreamWish(NamedTuple):
+    """A program's wish for a stream.
+
+    Attributes:
+        form: form in which frames come.
+        rate: control of the stream's bit rate or latency; None for no control.
+        decode: whether H.264 becomes pictures again.
+    """
+
+    form: FrameForm = FrameForm()
+    rate: RateControl | None = None
+    decode: bool = True
+
+    @classmethod
+    def checked(
+        cls,
+        encoding: str,
+        quality: int | None,
+        bitrate: float | None,
+        latency: float | None,
+        who: str,
+        *,
+        decode: bool = True,
+    ) -> StreamWish:
+        """Return a checked wish; ``who`` asks, the rest is as for :meth:`smartcam.Camera.frames`.
+
+        Raises:
+            ConfigurationError: these do not go together, or one is out of its range.
+        """
+        if bitrate is None and latency is None:
+            return cls(FrameForm.checked(encoding, quality, who, stream=True), None, decode)
+        if encoding == VIDEO and latency is None and bitrate is not None:
+            form = FrameForm.checked(VIDEO, quality, who, bitrate=round(bitrate), stream=True)
+            return cls(form, None, decode)
+        if encoding != "jpeg":
+            what = "latency" if bitrate is None or encoding == VIDEO else "bitrate"
+            raise ConfigurationError(
+                f"{who}: {what}: {encoding!r:.40} cannot hold one; jpeg can"
+                + (f", and {VIDEO}" if what == "bitrate" else "")
+            )
+        if quality is not None:
+            raise ConfigurationError(
+                f"{who}: quality: expected none beside a bit rate or a latency, which set it, got "
+                f"{quality!r:.40}"
+            )
+        return cls(FrameForm("jpeg"), RateControl(bitrate, latency), decode)
+
+    def pixels(self, given: str) -> str:
+        """Return the format in which frames come from a camera whose format is given."""
+        if self.form.name != VIDEO or not self.decode:
+            return FORMATS.get(self.form.name, given)
+        from smartcam.frames._inside import colour_properties, format_of
+
+        if given in _ENCODED_AS_LIMITED:
+            return "I420"
+        return format_of("yuv420p", *colour_properties(find_format(given))).name
+
+
+_ENCODED_AS_LIMITED = {"MJPEG", "RGB8", "BGR8"}

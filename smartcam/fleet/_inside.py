@@ -1,0 +1,76 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.fleet._bus.address import FleetAddress
+    from smartcam.fleet._bus.bus import Bus
+    from smartcam.fleet._bus.keys import Keys, meets
+    from smartcam.fleet._bus.zenoh import ZenohEnd
+    from smartcam.fleet._file.operations import OperationsSection
+    from smartcam.fleet._file.recording import RecordSection
+    from smartcam.fleet._file.ros import RosSection
+    from smartcam.fleet._opening import fleet_camera
+    from smartcam.fleet._operations.metric_families import exposition, require_client
+    from smartcam.fleet._operations.metrics import read_numbers
+    from smartcam.fleet._outlets import FleetOutlets
+    from smartcam.fleet._ros import RosFleet, ros_of
+    from smartcam.fleet._security.authority import MadeCertificate, make_certificates
+    from smartcam.fleet._security.certificates import (
+        ends_soon,
+        may_command,
+        read_identity,
+        shake_hands,
+    )
+    from smartcam.fleet._security.door import raise_descriptor_limit
+
+__all__ = [
+    "Bus",
+    "FleetAddress",
+    "FleetOutlets",
+    "Keys",
+    "MadeCertificate",
+    "OperationsSection",
+    "RecordSection",
+    "RosFleet",
+    "RosSection",
+    "ZenohEnd",
+    "ends_soon",
+    "exposition",
+    "fleet_camera",
+    "make_certificates",
+    "may_command",
+    "meets",
+    "raise_descriptor_limit",
+    "read_identity",
+    "read_numbers",
+    "require_client",
+    "ros_of",
+    "shake_hands",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_bus.address": "FleetAddress",
+            "_bus.bus": "Bus",
+            "_bus.keys": "Keys meets",
+            "_bus.zenoh": "ZenohEnd",
+            "_file.operations": "OperationsSection",
+            "_file.recording": "RecordSection",
+            "_file.ros": "RosSection",
+            "_opening": "fleet_camera",
+            "_operations.metric_families": "exposition require_client",
+            "_operations.metrics": "read_numbers",
+            "_outlets": "FleetOutlets",
+            "_ros": "RosFleet ros_of",
+            "_security.authority": "MadeCertificate make_certificates",
+            "_security.certificates": "ends_soon may_command read_identity shake_hands",
+            "_security.door": "raise_descriptor_limit",
+        },
+    )

@@ -1,0 +1,1 @@
+"""Serve programs that do not use smartcam: services and topics in JSON."""

@@ -1,0 +1,137 @@
+"""The thesis' five calibration services in JSON: a face of them on the fleet's bus."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+from pydantic import create_model
+
+from smartcam._extras import from_part
+from smartcam._json import plain
+from smartcam._thesis_calibration import (
+    CALIBRATION,
+    CalibrationCall,
+    checked_localizations,
+    own_localizations,
+)
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import UnsupportedError
+from smartcam.fleet._frames.stream import FrameOrder
+from smartcam.fleet._frames.wire import FrameForm
+from smartcam.fleet._json.services import Service, triggered
+from smartcam.fleet._json.thesis import BusFields
+from smartcam.fleet._program.reading import interpreted
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam._thesis_calibration import WizardService
+    from smartcam.calibration._inside import ThesisCalibration
+    from smartcam.fleet._json.services import Work
+    from smartcam.models import Localization
+
+GATE_TIMEOUT = 10.0
+"""Seconds for a program that has the camera reserved to give it back."""
+
+PICTURE_TIMEOUT = 20.0
+"""Seconds for a picture of the camera itself."""
+
+
+class JsonCalibrationCamera:
+    """A camera of an agent as it is calibrated.
+
+    Args:
+        work: the service under way.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work, self._host, self._topics = work, work.host, work.topics
+        self.name: str = work.host.name
+        self.y_down: bool = work.host.settings.y_down
+        self.unit: str
+        active = self._host.camera.active_application
+        self._spec, self.unit = own_localizations(self._topics.interpretation, active)
+
+    async def localize(self) -> list[Localization]:
+        """Trigger; return the localizations in the camera's own frame."""
+        reading = self._topics.reading(self._spec)
+        async with self._allowed():
+            (run,) = await triggered(self._within(DEFAULT_TRIGGER_TIMEOUT), reading, None)
+        return checked_localizations(interpreted(run, reading, self.name).value, self.name)
+
+    async def take_picture(self) -> Any:
+        """Return the grey levels of a picture of the camera."""
+        host = self._host
+        if host.frames.make is not None:
+            timeout = min(self._work.timeout, PICTURE_TIMEOUT)
+            order = FrameOrder("", self._work.owner.call, FrameForm(), timeout)
+            frame, _ = await host.frames.get(order, max_age=None, after=None, fresh=True)
+            return await asyncio.to_thread(frame.grey)
+        if not host.camera.capabilities.read_image:
+            raise UnsupportedError(
+                f"{self.name}: its protocol sends no pictures; expected frames: in the fleet file, "
+                "or a topic with pictures"
+            )
+        with from_part("calibration", "the calibration services need"):
+            from smartcam.calibration._inside import decode_picture
+        async with self._allowed():
+            await triggered(self._within(DEFAULT_TRIGGER_TIMEOUT), None, None)
+            data = await host.require().read_image(timeout=PICTURE_TIMEOUT)
+        return await asyncio.to_thread(decode_picture, data, self.name)
+
+    @contextlib.asynccontextmanager
+    async def _allowed(self) -> AsyncIterator[None]:
+        """Have no other program the camera for itself meanwhile."""
+        program = f"{self._work.request.program or 'a program'} without smartcam"
+        await self._host.enter(program, "a calibration", GATE_TIMEOUT)
+        try:
+            yield
+        finally:
+            self._host.gate.leave(program)
+
+    def _within(self, seconds: float) -> Work:
+        """Return the work with so many seconds at most."""
+        return self._work._replace(timeout=min(self._work.timeout, seconds))
+
+
+class JsonCalibrationFace:
+    """A camera of an agent as the five services see it.
+
+    Args:
+        work: the service under way.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work = work
+        self.name: str = work.host.name
+
+    @property
+    def calibrations(self) -> ThesisCalibration | None:
+        """The calibrations of the camera; None where there is no folder for them."""
+        desks = self._work.calibrations
+        return None if desks is None else desks.of(self.name)
+
+    def camera(self, timeout: float) -> JsonCalibrationCamera:
+        """Return the camera, for one call."""
+        return JsonCalibrationCamera(self._work)
+
+
+def _on_bus(name: str) -> Service:
+    """Return one of the five as a service of the bus."""
+    five: WizardService = CALIBRATION[name]
+    request: Any = create_model(five.request.__name__, __base__=(five.request, BusFields))
+
+    async def do(work: Work) -> dict[str, Any]:
+        call = CalibrationCall(JsonCalibrationFace(work), work.request, work.timeout)
+        found = {key: plain(value) for key, value in (await five.do(call)).items()}
+        return {**found, "kind": "CalibrationError"} if found.get("error") else found
+
+    nothing: dict[str, Any] = {"pose": None} if name == "TransformPixelPose" else {}
+    # what triggers the camera waits by itself for who has it reserved: abort does not
+    return Service(request, do, command=False, timeout=five.timeout, nothing=nothing)
+
+
+CALIBRATIONS: dict[str, Service] = {name: _on_bus(name) for name in CALIBRATION}
+"""The five services by name."""

@@ -1,0 +1,336 @@
+"""Services for programs without smartcam: JSON in, JSON out. ``docs/bus.md`` describes them."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+from datetime import UTC, datetime
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator
+
+from smartcam._client._inside import TriggerRequest
+from smartcam._thesis import DEFAULT_TIMEOUT, MAX_TIMEOUT
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import FrameFormatError, UnsupportedError
+from smartcam.fleet._agent.calls import ACTIONS, MAX_REPLY_BYTES, ProgramCall, outcomes
+from smartcam.fleet._agent.shared import Carrier
+from smartcam.fleet._bus.keys import COMMANDS
+from smartcam.fleet._bus.wire import decode_runs, encode_runs
+from smartcam.fleet._frames.stream import FrameOrder
+from smartcam.fleet._frames.wire import FrameForm, to_fields
+from smartcam.fleet._program.reading import result_fields, singles
+from smartcam.models import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from smartcam._client._inside import Interpretation
+    from smartcam.calibration._inside import CalibrationDesks
+    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.shared import Owner
+    from smartcam.fleet._bus.wire import ResultRun
+    from smartcam.fleet._json.topics import CameraTopics
+    from smartcam.frames import Frame
+
+MAX_RESULTS = 1000
+"""Results that one answer brings at most."""
+
+MAX_INPUT_BYTES = 1 << 16
+MAX_PICTURE_BYTES = 1 << 20
+"""Bytes of a frame in an answer at most."""
+
+MAX_ID_CHARACTERS = 200
+
+
+def _hex(text: str) -> str:
+    try:
+        bytes.fromhex(text)
+    except ValueError as exc:
+        raise ValueError("expected bytes as hex, such as 0aff") from exc
+    return text
+
+
+def _id(value: object) -> str | int:
+    if (
+        isinstance(value, int)
+        and not isinstance(value, bool)
+        and abs(value) < 10**MAX_ID_CHARACTERS
+    ):
+        return value
+    if isinstance(value, str) and 1 <= len(value.encode(errors="replace")) <= MAX_ID_CHARACTERS:
+        return value
+    raise ValueError(
+        f"expected a text of 1 to {MAX_ID_CHARACTERS} bytes, or an integer of so many digits"
+    )
+
+
+def _time(text: str) -> str:
+    try:
+        datetime.fromisoformat(text)
+    except ValueError as exc:
+        raise ValueError("expected a time such as 2030-01-31T12:00:00") from exc
+    return text
+
+
+Hex = Annotated[str, Field(max_length=2 * MAX_INPUT_BYTES), AfterValidator(_hex)]
+Number = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+Text = Annotated[str, Field(max_length=200)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Id = Annotated[str | int, PlainValidator(_id)]
+Deadline = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Interpret = Annotated[str, Field(max_length=10_000)]
+
+
+class PlainRequest(BaseModel):
+    """The fields that every request may have."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    timeout: Annotated[float, Field(gt=0, le=MAX_TIMEOUT, allow_inf_nan=False)] | None = None
+    id: Id | None = None
+    program: Text = ""
+    epoch: Text | None = None
+    deadline: Deadline | None = None
+
+
+class _PlainTrigger(PlainRequest):
+    application: Number | None = None
+    input: Hex | None = None
+    results_per_trigger: Annotated[int, Field(ge=1, le=MAX_RESULTS)] | None = None
+    when_busy: Literal["wait", "refuse"] = "wait"
+    interpret_as: Interpret | None = None
+
+
+class _PlainSwitch(PlainRequest):
+    application: Number | Text
+
+
+class _PlainInput(PlainRequest):
+    input: Hex
+
+
+class _PlainNumber(PlainRequest):
+    number: Number
+
+
+class _PlainClock(PlainRequest):
+    when: Annotated[Text, AfterValidator(_time)]
+
+
+class _PlainResults(PlainRequest):
+    first: Annotated[int, Field(ge=1)] | None = None
+    most: Annotated[int, Field(ge=1, le=MAX_RESULTS)] = 100
+
+
+class _PlainFrame(PlainRequest):
+    encoding: Literal["jpeg", "png", "jpegxl"] = "jpeg"
+    quality: Annotated[int, Field(ge=1, le=100)] | None = None
+    max_age: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 1.0
+    fresh: bool = False
+
+
+class _PlainTriggerFrame(PlainRequest):
+    encoding: Literal["jpeg", "png", "jpegxl"] = "jpeg"
+    quality: Annotated[int, Field(ge=1, le=100)] | None = None
+    when_busy: Literal["wait", "refuse"] = "wait"
+
+
+class _PlainFeatures(PlainRequest):
+    name: Name | None = None
+
+
+class _PlainFeature(PlainRequest):
+    name: Name
+
+
+class _PlainSetFeature(PlainRequest):
+    name: Name
+    value: bool | int | Annotated[float, Field(allow_inf_nan=False)] | Interpret
+
+
+class Work(NamedTuple):
+    """A service under way.
+
+    Attributes:
+        host: the camera.
+        topics: topics of the camera in JSON.
+        request: the request, of the service's own kind.
+        timeout: seconds that the service may take.
+        owner: owner of the results that the service's trigger brings.
+        calibrations: calibrations of the agent's cameras; None where there is no folder for them.
+    """
+
+    host: Host
+    topics: CameraTopics
+    request: Any
+    timeout: float
+    owner: Owner
+    calibrations: CalibrationDesks | None = None
+
+
+class Service(NamedTuple):
+    """A service.
+
+    Attributes:
+        request: kind of the requests.
+        do: function that does the service and returns the fields of its answer, but ``error``.
+        command: whether the service waits while another program has the camera reserved.
+        timeout: seconds, where the request says none.
+        nothing: fields of the answer beside an error.
+    """
+
+    request: type[PlainRequest]
+    do: Callable[[Work], Awaitable[dict[str, Any]]]
+    command: bool = True
+    timeout: float = DEFAULT_TIMEOUT
+    nothing: Mapping[str, Any] = MappingProxyType({})
+
+
+async def triggered(
+    work: Work,
+    interpretation: Interpretation | None,
+    application: int | None,
+    *,
+    data: bytes | None = None,
+    wanted: int = 1,
+    wait: bool = True,
+) -> list[ResultRun]:
+    """Trigger; return its containers, each a run of its own.
+
+    Raises:
+        SmartCamError: as :meth:`smartcam.Camera.trigger`.
+    """
+    layouts = interpretation.numbered_layouts() if interpretation is not None else None
+    request = TriggerRequest(Carrier(work.owner, layouts), data, wanted, wait)
+    runs = await outcomes(work.host, work.owner, request, application, work.timeout)
+    batch = decode_runs(encode_runs(0, 0, runs), "results")
+    return [one for run in batch.runs for one in singles(run)]
+
+
+async def _trigger(work: Work) -> dict[str, Any]:
+    request, topics = work.request, work.topics
+    interpretation = topics.interpretation
+    if request.interpret_as is not None:
+        interpretation = topics.reading(request.interpret_as)
+    runs = await triggered(
+        work,
+        interpretation,
+        request.application,
+        data=None if request.input is None else bytes.fromhex(request.input),
+        wanted=request.results_per_trigger or 1,
+        wait=request.when_busy == "wait",
+    )
+    results = [result_fields(run, interpretation, work.host.name) for run in runs]
+    answer: dict[str, Any] = {"result": results[0]}
+    if request.results_per_trigger is not None:
+        answer = {"results": results}
+    for one in results:
+        if one["error"]:
+            return {**answer, "error": one["error"], "kind": one["kind"]}
+    return answer
+
+
+async def _status(work: Work) -> dict[str, Any]:
+    topics = work.topics
+    return {**topics.state(), "number": topics.statuses - 1, "at": datetime.now(UTC).isoformat()}
+
+
+def _same(do: str) -> Callable[[Work], Awaitable[dict[str, Any]]]:
+    """Return the function of a service that does the same as a call of smartcam's programs."""
+
+    async def service(work: Work) -> dict[str, Any]:
+        arguments: dict[str, Any] = work.request.model_dump(exclude=_OF_ALL)
+        blobs = [bytes.fromhex(arguments.pop(one)) for one in ("input",) if one in arguments]
+        call = ProgramCall(work.host, "", work.owner, arguments, blobs, work.timeout, {})
+        fields, found = await ACTIONS[do](call)
+        if "status" in fields:
+            fields["status_names"] = Status(fields["status"]).names
+        return {**fields, "image": base64.b64encode(found[0]).decode()} if found else fields
+
+    return service
+
+
+async def _results(work: Work) -> dict[str, Any]:
+    kept, most = work.host.results, work.request.most
+    first = max(1, kept.following - most) if work.request.first is None else work.request.first
+    part = kept.part(first, MAX_REPLY_BYTES)
+    batch = decode_runs(encode_runs(0, 0, part.data), "results that are kept")
+    found = (one for run in batch.runs for one in singles(run) if one.number >= part.first)
+    results = [work.topics.result(one) for one in itertools.islice(found, most)]
+    return {"first": part.first, "next_result": part.following, "results": results}
+
+
+async def _frame(work: Work) -> dict[str, Any]:
+    request, host = work.request, work.host
+    encoding = FrameForm.checked(request.encoding, request.quality, host.name)
+    order = FrameOrder("", work.owner.call, encoding, work.timeout)
+    frame, took = await host.frames.get(
+        order, max_age=request.max_age, after=None, fresh=request.fresh
+    )
+    return _picture(host, encoding, frame, took)
+
+
+async def _trigger_frame(work: Work) -> dict[str, Any]:
+    request, host = work.request, work.host
+    encoding = FrameForm.checked(request.encoding, request.quality, host.name)
+    order = FrameOrder("", work.owner.call, encoding, work.timeout)
+    frame, took = await host.frames.triggered(order, wait=request.when_busy == "wait")
+    return _picture(host, encoding, frame, took)
+
+
+def _picture(host: Host, encoding: FrameForm, frame: Frame, took: float) -> dict[str, Any]:
+    """Return the fields of an answer that has a frame."""
+    if len(frame.data) > MAX_PICTURE_BYTES:
+        raise FrameFormatError(
+            f"{host.name}: the frame has {len(frame.data)} bytes as {encoding.name}, expected "
+            f"{MAX_PICTURE_BYTES} at most",
+            source=host.name,
+        )
+    said = to_fields(frame, 0.0, took, 0)
+    own = {name: value for name, value in said.items() if name not in {"captured", "lens"}}
+    if "trigger" in own:  # the time of it is by a clock of the agent's own
+        own["trigger"] = {name: own["trigger"][name] for name in ("number", "evidence")}
+    return {"frame": {**own, "data": base64.b64encode(frame.data).decode()}}
+
+
+async def _unknown(work: Work) -> dict[str, Any]:
+    raise UnsupportedError(f"{work.host.name}: there is no such service")
+
+
+UNKNOWN = Service(PlainRequest, _unknown)
+"""Service that answers in place of one that is not there."""
+
+_OF_ALL = {*PlainRequest.model_fields}
+
+_REQUESTS: dict[str, type[PlainRequest]] = {
+    "switch_application": _PlainSwitch,
+    "start": PlainRequest,
+    "stop": PlainRequest,
+    "reset_errors": PlainRequest,
+    "set_input": _PlainInput,
+    "set_sequence_number": _PlainNumber,
+    "set_clock": _PlainClock,
+    "reboot": PlainRequest,
+    "take_back": PlainRequest,
+    "query_status": PlainRequest,
+    "query_application": PlainRequest,
+    "wait_ready": PlainRequest,
+    "get_clock": PlainRequest,
+    "read_image": PlainRequest,
+    "features": _PlainFeatures,
+    "set_feature": _PlainSetFeature,
+    "execute_feature": _PlainFeature,
+}
+"""Requests of the services that do the same as a call of smartcam's own programs."""
+
+SERVICES: dict[str, Service] = {
+    "trigger": Service(_PlainTrigger, _trigger, timeout=DEFAULT_TRIGGER_TIMEOUT),
+    "status": Service(PlainRequest, _status, command=False),
+    "results": Service(_PlainResults, _results, command=False),
+    "frame": Service(_PlainFrame, _frame, command=False),
+    "trigger_frame": Service(_PlainTriggerFrame, _trigger_frame),
+    **{do: Service(kind, _same(do), do in COMMANDS) for do, kind in _REQUESTS.items()},
+}
+"""The plain services by name."""

@@ -1,0 +1,178 @@
+"""The thesis' six services in JSON: a face of them on the fleet's bus."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator, Field, create_model
+
+from smartcam._thesis import THESIS as SIX
+from smartcam._thesis import SetupRequest, ThesisCall
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._agent.calls import ACTIONS, ProgramCall
+from smartcam.fleet._json.services import (
+    Deadline,
+    Id,
+    PlainRequest,
+    Service,
+    Text,
+    Work,
+    triggered,
+)
+from smartcam.fleet._program.reading import interpreted
+from smartcam.settings import CameraSettings
+
+if TYPE_CHECKING:
+    from smartcam._client._inside import Interpretation
+    from smartcam._thesis import ThesisService
+    from smartcam.settings import Address
+
+_TOPIC = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+){0,7}")
+
+
+def _said(value: object) -> object:
+    nothing = value == "" or (type(value) in {int, float} and value == 0)
+    return None if nothing else value
+
+
+class BusFields(PlainRequest):
+    """The fields that a request on the bus may have beside those over ROS."""
+
+    camera_name: Annotated[str, Field(min_length=1, max_length=200)]
+    id: Annotated[Id | None, BeforeValidator(_said)] = None
+    epoch: Annotated[Text | None, BeforeValidator(_said)] = None
+    deadline: Annotated[Deadline | None, BeforeValidator(_said)] = None
+
+
+def new_camera(request: SetupRequest) -> CameraSettings:
+    """Return the settings of a camera that Setup adds.
+
+    Raises:
+        ConfigurationError: it cannot work.
+    """
+    if not request.con_address:
+        raise ConfigurationError(
+            f"Setup: the fleet has no camera {request.camera_name!r}: expected con_address, where "
+            "it is, to add it"
+        )
+    options: dict[str, Any] = {"name": request.camera_name}
+    if request.timeout:
+        options["connect_timeout"] = request.timeout
+    return CameraSettings.of(request.address(), options)
+
+
+class JsonThesisFace:
+    """A camera of an agent as the thesis' services see it.
+
+    Args:
+        work: the service under way.
+    """
+
+    def __init__(self, work: Work) -> None:
+        self._work, self._host, self._topics = work, work.host, work.topics
+        self.name: str = work.host.name
+        self.address: Address = work.host.settings.address
+
+    @property
+    def stopped(self) -> bool:
+        """True if SmartcameraStop has closed the camera for these services."""
+        return self._topics.stopped
+
+    @stopped.setter
+    def stopped(self, stopped: bool) -> None:
+        self._topics.stopped = stopped
+
+    @property
+    def application(self) -> int | None:
+        """The id of the active application; None where that is not known."""
+        return self._host.camera.active_application
+
+    @property
+    def reading(self) -> Interpretation | None:
+        """Interpretation by which results become JSON."""
+        return self._topics.interpretation
+
+    def check_reading(self, spec: str) -> None:
+        """Raise ConfigurationError where results cannot be read by ``spec``."""
+        self._topics.reading(spec)
+
+    def read_as(self, spec: str | None) -> None:
+        """Have results become JSON by ``spec`` from now on; None: as the settings say."""
+        self._topics.interpret(self._host.settings.interpret_as if spec is None else spec)
+
+    def is_calibrated(self, application: int) -> bool:
+        """Return False: what is said in JSON is in the camera's frame."""
+        return False
+
+    def check_status_topic(self, topic: str) -> None:
+        """Raise ConfigurationError where there can be no such topic."""
+        _topic(topic)
+
+    def publish_status(self, topic: str) -> dict[str, Any]:
+        """Publish the status on this topic; return its key."""
+        return {"topic": self._topics.publish_status(_topic(topic))}
+
+    async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
+        """Publish results on this topic; return its key."""
+        return {"topic": self._topics.publish_results(_topic(topic), min_delay, queue)}
+
+    async def end_publishing(self) -> None:
+        """Publish neither on topics that a request has named."""
+        self._topics.end_publishing()
+
+    async def have_session(self) -> None:
+        """Raise the error that says why there is no session, if there is none."""
+        self._host.require()
+
+    async def ensure(self, application: int, timeout: float) -> None:
+        """Have an application running and ready."""
+        await self._host.require().ensure(application, timeout)
+
+    async def switch(self, application: int, timeout: float) -> None:
+        """Load an application."""
+        arguments = {"application": application}
+        await ACTIONS["switch_application"](
+            ProgramCall(self._host, "", self._work.owner, arguments, [], timeout, {})
+        )
+
+    async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
+        """Trigger; return the result's application, and its value as ``spec`` reads it."""
+        reading = self._topics.reading(spec)
+        (run,) = await triggered(self._work, reading, application)
+        return run.application, interpreted(run, reading, self.name).value
+
+
+def _topic(text: str) -> str:
+    """Return a topic without slashes around it.
+
+    Raises:
+        ConfigurationError: there can be no such topic.
+    """
+    name = text.strip("/")
+    if name and not _TOPIC.fullmatch(name):
+        raise ConfigurationError(
+            f"{text!r:.80}: expected a topic such as line1/outputs: up to 8 parts of letters, "
+            "digits, _ . and -"
+        )
+    return name
+
+
+def _on_bus(name: str) -> Service:
+    """Return one of the six as a service of the bus."""
+    six: ThesisService = SIX[name]
+    request: Any = create_model(six.request.__name__, __base__=(six.request, BusFields))
+
+    async def do(work: Work) -> dict[str, Any]:
+        return await six.answer(ThesisCall(JsonThesisFace(work), work.request, work.timeout))
+
+    nothing: dict[str, Any] = {} if six.nothing is None else {six.nothing: []}
+    gated = name != "EnablePublishing"
+    return Service(request, do, command=gated, timeout=six.timeout, nothing=nothing)
+
+
+_ON_BUS = {name: _on_bus(name) for name in SIX}
+SETUP, STOP = _ON_BUS["SmartcameraSetup"], _ON_BUS["SmartcameraStop"]
+
+THESIS: dict[str, Service] = {**_ON_BUS, "Setup": SETUP, "Stop": STOP}
+"""The services of the thesis' interface by name."""

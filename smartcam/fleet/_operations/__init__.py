@@ -1,0 +1,1 @@
+"""An agent's metrics, in Prometheus' format, and the trigger counts behind them."""

@@ -1,0 +1,331 @@
+"""An agent's numbers as Prometheus has them: families, and the text of them.
+
+The text of a thousand cameras takes a tenth of a second, and a thread that makes it would keep the
+event loop waiting for 5 ms at a time. So it is made in the event loop, half a millisecond at a
+time: a family of a few cameras after the other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._extras import load
+from smartcam.fleet._operations.metrics import FATES
+from smartcam.fleet._operations.trigger_counts import RESULT, SUMS, cumulative
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from smartcam.fleet._operations.metrics import AgentNumbers, CameraNumbers
+
+MAX_LINES_PER_TURN = 80
+"""Lines that are made at a time."""
+
+_SUMS = {
+    "bytes_received": ("smartcam_received_bytes", "Bytes from cameras"),
+    "bytes_sent": ("smartcam_sent_bytes", "Bytes to cameras"),
+    "frames_received": ("smartcam_received_messages", "Whole messages from cameras"),
+    "frames_sent": ("smartcam_sent_messages", "Messages to cameras"),
+    "overtriggers": ("smartcam_overtriggers", "Times that a camera reported Overtriggered"),
+    "empty_slots": ("smartcam_empty_slots", "All-zero records that were skipped"),
+    "extra_results": ("smartcam_extra_results", "Results beyond those that a trigger expected"),
+    "inspections_by_others": (
+        "smartcam_inspections_by_others",
+        "Inspections that something else than the agent triggered",
+    ),
+    "ignored_datagrams": ("smartcam_ignored_datagrams", "Datagrams that were dropped"),
+    "unknown_ids": ("smartcam_unknown_messages", "Messages of an unknown kind"),
+    "unexpected_messages": ("smartcam_unexpected_messages", "Answers nobody waited for"),
+    "long_bodies": ("smartcam_long_messages", "Messages longer than documented"),
+}
+
+_GAUGES = (
+    ("smartcam_agent_programs", "programs", "Programs that use its cameras"),
+    ("smartcam_agent_calls_in_progress", "calls", "Calls of programs under way"),
+    ("smartcam_agent_commands_waiting", "waiting_commands", "Commands that wait for a reservation"),
+    ("smartcam_agent_reserved_cameras", "reserved", "Cameras that a program has reserved"),
+    ("smartcam_agent_kept_results", "kept_results", "Results kept for programs that were cut off"),
+    ("smartcam_agent_kept_results_bytes", "kept_bytes", "Their bytes"),
+    ("smartcam_agent_bus_queue_bytes", "bus_bytes", "Bytes that wait to be said on the bus"),
+)
+
+
+async def exposition(numbers: AgentNumbers | None, *, each: bool) -> tuple[bytes, str]:
+    """Return the text of an agent's numbers, and its content type.
+
+    Args:
+        numbers: numbers that were read; None: the agent does not run.
+        each: whether there is a histogram for each camera.
+
+    Raises:
+        MissingExtraError: prometheus-client is not installed.
+    """
+    client = require_client()
+    parts: list[bytes] = [await asyncio.to_thread(_of_process, client)]
+    if numbers is not None:
+        for family in _of_agent(client.core, numbers):
+            parts.append(_text(client, family))
+            await asyncio.sleep(0)
+        for kind in _KINDS if each else (*_KINDS[:-1], _SUMMARY):
+            chosen = [one for one in numbers.cameras if kind.chosen(one)]
+            size = max(1, MAX_LINES_PER_TURN // kind.lines)
+            for begin in range(0, len(chosen), size):
+                family = kind.make(client.core, numbers.agent, chosen[begin : begin + size])
+                text = _text(client, family)
+                # what it means stands in front of the first ones
+                parts.append(text.split(b"\n", 2)[2] if begin else text)
+                await asyncio.sleep(0)
+    return b"".join(parts), client.CONTENT_TYPE_LATEST
+
+
+def require_client() -> Any:
+    """Return prometheus-client.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    load("prometheus_client.core")
+    return load("prometheus_client")
+
+
+class _One(NamedTuple):
+    """A family, as what prometheus-client makes a text of."""
+
+    family: Any
+
+    def collect(self) -> list[Any]:
+        return [self.family]
+
+
+def _text(client: Any, family: Any) -> bytes:
+    made: bytes = client.generate_latest(_One(family))
+    return made
+
+
+def _of_process(client: Any) -> bytes:
+    """Return the text of the process' families; blocks, since it asks the system for them."""
+    registry = client.CollectorRegistry(auto_describe=False)
+    client.ProcessCollector(registry=registry)
+    client.GCCollector(registry=registry)
+    made: bytes = client.generate_latest(registry)
+    return made
+
+
+# ---------------------------------------------------------------------- of the agent
+
+
+def _of_agent(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
+    own = [numbers.agent]
+    family = core.InfoMetricFamily("smartcam_agent", "The agent of a fleet", labels=["agent"])
+    family.add_metric(own, {"fleet": numbers.fleet, "version": _version()})
+    yield family
+    gauges = [(name, text, numbers.gauges[key]) for name, key, text in _GAUGES]
+    gauges += [
+        ("smartcam_agent_start_time_seconds", "When it began", numbers.began),
+        (
+            "smartcam_last_reload_successful",
+            "Whether the last reading of the fleet file was taken",
+            float(numbers.reloaded),
+        ),
+    ]
+    for name, text, value in gauges:
+        family = core.GaugeMetricFamily(name, text, labels=["agent"])
+        family.add_metric(own, value)
+        yield family
+    labels = ["agent", "state"]
+    family = core.GaugeMetricFamily("smartcam_agent_cameras", "Cameras", labels=labels)
+    there = sum(one.connected for one in numbers.cameras)
+    family.add_metric([*own, "connected"], there)
+    family.add_metric([*own, "not_connected"], len(numbers.cameras) - there)
+    yield family
+    labels = ["agent", "outcome"]
+    family = core.CounterMetricFamily("smartcam_reloads", "Readings of the file", labels=labels)
+    for outcome, count in numbers.reloads.items():
+        family.add_metric([*own, outcome], count)
+    yield family
+    yield from _of_outlets(core, numbers)
+    for key in SUMS:
+        name, text = _SUMS[key]
+        family = core.CounterMetricFamily(name, text, labels=["agent"])
+        family.add_metric(own, numbers.totals.counts[key])
+        yield family
+    for name, text, histogram in (
+        (
+            "smartcam_request_latency_seconds",
+            "From a request to a camera to its answer",
+            numbers.totals.round_trip,
+        ),
+        (
+            "smartcam_trigger_latency_seconds",
+            "From a trigger to its result",
+            numbers.totals.processing,
+        ),
+    ):
+        family = core.HistogramMetricFamily(name, text, labels=["agent"])
+        family.add_metric(own, cumulative(histogram), histogram.total)
+        yield family
+
+
+def _of_outlets(core: Any, numbers: AgentNumbers) -> Iterator[Any]:
+    """Give the accounts of outlets: what came is what was delivered, waits, or was dropped."""
+    if not numbers.outlets:
+        return
+    labels = ["agent", "outlet"]
+    came = core.CounterMetricFamily("smartcam_outlet_results", "Results that came", labels=labels)
+    delivered = core.CounterMetricFamily(
+        "smartcam_outlet_delivered", "Results that the far end took", labels=labels
+    )
+    spooled = core.GaugeMetricFamily(
+        "smartcam_outlet_spooled", "Results that wait for the far end", labels=labels
+    )
+    well = core.GaugeMetricFamily(
+        "smartcam_outlet_well", "Whether nothing keeps results from the far end", labels=labels
+    )
+    dropped = core.CounterMetricFamily(
+        "smartcam_outlet_dropped", "Results that were given up", labels=[*labels, "reason"]
+    )
+    for name, state in numbers.outlets.items():
+        own, account = [numbers.agent, name], state.account
+        came.add_metric(own, account.results)
+        delivered.add_metric(own, account.delivered)
+        spooled.add_metric(own, account.spooled)
+        well.add_metric(own, float(not state.trouble))
+        for reason, count in account.dropped.items():
+            dropped.add_metric([*own, reason], count)
+    yield from (came, delivered, spooled, well, dropped)
+
+
+# ---------------------------------------------------------------------- of its cameras
+
+
+class _MetricKind(NamedTuple):
+    """A family of numbers that each camera has.
+
+    Attributes:
+        type: type of the family, as prometheus-client's classes are called.
+        name: name of the family.
+        text: help text of the family, for people.
+        labels: names of the labels beside ``agent`` and ``camera``.
+        values: function for a camera's values: the labels, and the arguments of a number.
+        lines: about, of one camera.
+        chosen: whether a camera has it.
+    """
+
+    type: str
+    name: str
+    text: str
+    labels: tuple[str, ...]
+    values: Callable[[CameraNumbers], list[tuple[tuple[str, ...], tuple[Any, ...]]]]
+    lines: int
+    chosen: Callable[[CameraNumbers], bool] = lambda _: True
+
+    def make(self, core: Any, agent: str, cameras: Sequence[CameraNumbers]) -> Any:
+        """Return the family of some cameras."""
+        kind = getattr(core, f"{self.type}MetricFamily")
+        family = kind(self.name, self.text, labels=["agent", "camera", *self.labels])
+        for one in cameras:
+            for labels, number in self.values(one):
+                family.add_metric([agent, one.name, *labels], *number)
+        return family
+
+
+def _has_frames(one: CameraNumbers) -> bool:
+    return one.frames is not None
+
+
+_LATENCY = ("smartcam_camera_trigger_latency_seconds", "From a trigger to its result, by camera")
+
+_SUMMARY = _MetricKind(
+    "Summary",
+    *_LATENCY,
+    (),
+    lambda one: [((), (one.account.processing.count, one.account.processing.total))],
+    2,
+)
+
+_KINDS = (
+    _MetricKind(
+        "Gauge",
+        "smartcam_connected",
+        "Whether there is a session",
+        (),
+        lambda one: [((), (float(one.connected),))],
+        1,
+    ),
+    _MetricKind(
+        "Gauge",
+        "smartcam_taken",
+        "Whether another client has the camera",
+        (),
+        lambda one: [((), (float(one.taken),))],
+        1,
+    ),
+    _MetricKind(
+        "Counter",
+        "smartcam_sessions",
+        "Sessions that were made",
+        (),
+        lambda one: [((), (one.account.sessions,))],
+        1,
+    ),
+    _MetricKind(
+        "Counter",
+        "smartcam_results",
+        "Results by fate",
+        ("fate",),
+        lambda one: [((fate,), (getattr(one.account, fate),)) for fate in FATES],
+        6,
+    ),
+    _MetricKind(
+        "Counter",
+        "smartcam_triggers",
+        "Triggers of programs by outcome",
+        ("outcome",),
+        lambda one: [((word,), (n,)) for word, n in {RESULT: 0, **one.triggers}.items()],
+        3,
+    ),
+    _MetricKind(
+        "Gauge",
+        "smartcam_frame_viewers",
+        "Streams of frames",
+        (),
+        lambda one: [((), (one.viewers,))],
+        1,
+        _has_frames,
+    ),
+    _MetricKind(
+        "Counter",
+        "smartcam_frames",
+        "Frames that came",
+        (),
+        lambda one: [((), (one.frames.frames if one.frames else 0,))],
+        1,
+        _has_frames,
+    ),
+    _MetricKind(
+        "Counter",
+        "smartcam_frames_lost",
+        "Frames that never came",
+        (),
+        lambda one: [((), (one.frames.lost if one.frames else 0,))],
+        1,
+        _has_frames,
+    ),
+    _MetricKind(
+        "Histogram",
+        *_LATENCY,
+        (),
+        lambda one: [((), (cumulative(one.account.processing), one.account.processing.total))],
+        20,
+    ),
+)
+"""Families of each camera's numbers; without ``each`` a summary takes the last one's place."""
+
+
+def _version() -> str:
+    try:
+        return version("smartcam")
+    except PackageNotFoundError:
+        return "unknown"

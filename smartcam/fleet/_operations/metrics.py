@@ -1,0 +1,111 @@
+"""Collect an agent's numbers. Nothing is counted for them: existing counts are read.
+
+The agent belongs to its event loop, so it is read there, a few cameras at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.fleet._operations.trigger_counts import Totals
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.server import FleetServer
+    from smartcam.frames import SourceStatistics
+    from smartcam.models import Statistics
+    from smartcam.outlets import OutletState
+
+SLICE = 24
+"""Cameras that are read at a time: half a millisecond, as a hundred of them added up."""
+
+FATES = ("triggered", "streamed", "late", "wrong_application", "uninterpretable", "unclaimed")
+
+
+class CameraNumbers(NamedTuple):
+    """The numbers of one camera."""
+
+    name: str
+    connected: bool
+    taken: bool
+    account: Statistics
+    triggers: dict[str, int]
+    viewers: int
+    frames: SourceStatistics | None
+
+
+class AgentNumbers(NamedTuple):
+    """The numbers of an agent; ``gauges`` are of the moment."""
+
+    agent: str
+    fleet: str
+    began: float
+    gauges: dict[str, float]
+    reloads: dict[str, int]
+    reloaded: bool
+    totals: Totals
+    cameras: list[CameraNumbers]
+    outlets: Mapping[str, OutletState]
+
+
+async def read_numbers(server: FleetServer) -> AgentNumbers | None:
+    """Read an agent in its event loop, a few cameras at a time; None where it does not run."""
+    agent = server.agent
+    if agent is None:
+        return None
+    hosts = [*agent.hosts.values()]
+    read: list[tuple[Host, CameraNumbers]] = []
+    kept = kept_bytes = waiting = reserved = 0
+    for begin in range(0, len(hosts), SLICE):
+        for host in hosts[begin : begin + SLICE]:
+            if agent.hosts.get(host.name) is host:  # it may be gone meanwhile
+                read.append((host, _camera(host)))
+                kept += host.results.kept
+                kept_bytes += host.results.kept_bytes
+                waiting += host.gate.waiting
+                reserved += host.gate.holder is not None
+        await asyncio.sleep(0)
+    gauges: dict[str, float] = {
+        "programs": agent.programs,
+        "calls": agent.calls,
+        "kept_results": kept,
+        "kept_bytes": kept_bytes,
+        "waiting_commands": waiting,
+        "reserved": reserved,
+        "bus_bytes": server.bus_bytes,
+    }
+    reloads = server.reloads
+    # of one moment: each camera is counted once, here or among those that are gone
+    cameras = [one for host, one in read if agent.hosts.get(host.name) is host]
+    totals = Totals(agent.past)
+    totals.add(host.camera.statistics() for host in agent.leaving)
+    for begin in range(0, len(cameras), 4 * SLICE):
+        totals.add(one.account for one in cameras[begin : begin + 4 * SLICE])
+        await asyncio.sleep(0)
+    return AgentNumbers(
+        agent.name,
+        server.file.fleet,
+        agent.epoch / 1e9,
+        gauges,
+        dict(reloads.outcomes),
+        not isinstance(reloads.last, Exception),
+        totals,
+        cameras,
+        server.outlet_states(),
+    )
+
+
+def _camera(host: Host) -> CameraNumbers:
+    frames = host.frames
+    return CameraNumbers(
+        host.name,
+        host.connected,
+        host.camera.taken,
+        host.camera.statistics(),
+        dict(host.triggers),
+        frames.viewers,
+        frames.statistics,
+    )

@@ -1,0 +1,97 @@
+"""Count how triggers at an agent ended, in few words; and sum what cameras counted."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import (
+    CameraBusyError,
+    CameraFaultError,
+    CommandRejectedError,
+    ConfigurationError,
+    InputContainerError,
+    InterpretationError,
+    LinkError,
+    LocalProtocolError,
+    NotRunningError,
+    OvertriggeredError,
+    UnsupportedError,
+)
+from smartcam.models import HISTOGRAM_BOUNDS, Histogram
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from smartcam.models import Statistics
+
+RESULT: Final = "result"
+
+_OUTCOMES: Final[tuple[tuple[type[BaseException], str], ...]] = (
+    (asyncio.CancelledError, "cancelled"),
+    (TimeoutError, "timeout"),
+    (NotRunningError, "not_running"),
+    (CameraBusyError, "busy"),
+    (OvertriggeredError, "overtriggered"),
+    (InputContainerError, "input"),
+    (InterpretationError, "uninterpretable"),
+    (CommandRejectedError, "rejected"),
+    (CameraFaultError, "fault"),
+    (LinkError, "no_session"),
+    (LocalProtocolError, "refused"),
+    (ConfigurationError, "refused"),
+    (UnsupportedError, "refused"),
+)
+"""Words for how a trigger failed, by the error's class; the first match decides."""
+
+OUTCOMES: Final = (RESULT, *dict.fromkeys(word for _, word in _OUTCOMES), "other")
+"""All words for how a trigger ended."""
+
+
+def outcome_of(error: BaseException) -> str:
+    """Return the word for how a trigger failed."""
+    return next((word for kind, word in _OUTCOMES if isinstance(error, kind)), "other")
+
+
+SUMS: Final = (
+    *("bytes_received", "bytes_sent", "frames_received", "frames_sent", "overtriggers"),
+    *("empty_slots", "extra_results", "inspections_by_others", "ignored_datagrams"),
+    *("unknown_ids", "unexpected_messages", "long_bodies"),
+)
+"""Counters that are told of all cameras together."""
+
+
+class Totals:
+    """Sums over cameras, those that were given up among them: so they never go down.
+
+    Attributes:
+        counts: sums of the counters in :data:`SUMS`.
+    """
+
+    def __init__(self, before: Totals | None = None) -> None:
+        self.counts: dict[str, int] = (
+            dict.fromkeys(SUMS, 0) if before is None else {**before.counts}
+        )
+        empty = Histogram(HISTOGRAM_BOUNDS, (0,) * (len(HISTOGRAM_BOUNDS) + 1))
+        self.processing: Histogram = empty if before is None else before.processing
+        self.round_trip: Histogram = empty if before is None else before.round_trip
+
+    def add(self, accounts: Iterable[Statistics]) -> None:
+        """Add the counts of cameras."""
+        given = [*accounts]
+        for name in SUMS:
+            self.counts[name] += sum(getattr(one, name) for one in given)
+        self.processing = _sum([self.processing, *(one.processing for one in given)])
+        self.round_trip = _sum([self.round_trip, *(one.round_trip for one in given)])
+
+
+def _sum(histograms: list[Histogram]) -> Histogram:
+    counts = tuple(map(sum, zip(*(one.counts for one in histograms), strict=True)))
+    return Histogram(HISTOGRAM_BOUNDS, counts, sum(one.total for one in histograms))
+
+
+def cumulative(histogram: Histogram) -> list[tuple[str, float]]:
+    """Return the bins as Prometheus has them: each has everything up to its bound."""
+    bounds = [*map(str, histogram.bounds), "+Inf"]
+    return list(zip(bounds, map(float, itertools.accumulate(histogram.counts)), strict=True))

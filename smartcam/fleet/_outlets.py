@@ -1,0 +1,184 @@
+"""Outlets beside an agent: what its sessions bring goes where the fleet file says."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client._inside import Interpretation
+from smartcam._extras import from_part
+from smartcam._server import Server
+from smartcam.backoff import Backoff
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.fleet._opening import fleet_camera
+from smartcam.models import ApplicationChanged, Connected, Disconnected, Reconnected
+from smartcam.observers import Observer
+from smartcam.protocols.messages import ResultContainer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from smartcam.fleet._agent.server import FleetServer
+    from smartcam.fleet._file.fleet_file import CameraEntry
+    from smartcam.fleet._program.camera import FleetCamera
+    from smartcam.models import CameraEvent, Result
+    from smartcam.outlets import Outlets
+
+COMMAND_CONNECT_TIMEOUT = 5.0
+"""Seconds until a camera is reached for an outlet's command."""
+
+
+class FleetOutlets(Server):
+    """The outlets of an agent, as ``outlets:`` in a fleet file says.
+
+    It is started before the server, and stopped behind it. What a far end does never holds up the
+    agent.
+
+    Args:
+        server: server whose cameras are meant; not started yet.
+        tell: called with an outlet's name and its trouble, and with "" when that is over.
+
+    Attributes:
+        outlets: the outlets.
+
+    Raises:
+        ConfigurationError: the file says nothing of outlets, or something wrong.
+    """
+
+    def __init__(
+        self, server: FleetServer, tell: Callable[[str, str], None] = lambda _name, _why: None
+    ) -> None:
+        with from_part("mqtt", '"outlets:" in a fleet file needs'):
+            from smartcam.outlets import Outlets
+            from smartcam.outlets._inside import columns_of, do_command
+        if server.file.outlets is None:
+            raise ConfigurationError(f"fleet {server.file.fleet}: outlets: is not in its file")
+        self._server, self._do, self._columns_of = server, do_command, columns_of
+        self.outlets: Outlets = Outlets(
+            server.file.outlets,
+            server.folder,
+            columns=self._columns,
+            command=self._command,
+            tell=tell,
+        )
+        self._observer = _OutletObserver(self)
+        self._readings: dict[str, tuple[CameraEntry, Interpretation]] = {}
+        self._programs: dict[str, FleetCamera[Any]] = {}
+        self._opening = asyncio.Lock()
+
+    async def start(self) -> None:
+        """Open the spools and begin to deliver.
+
+        Raises:
+            ConfigurationError: a spool cannot be opened, or the server was started.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._server.hosts:
+            raise ConfigurationError("outlets: start them before the server")
+        await self.outlets.start()
+        if self._observer not in self._server.observers:
+            self._server.observers.append(self._observer)
+        self._server.outlet_states = lambda: self.outlets.states
+
+    async def stop(self) -> None:
+        """End; what is not delivered stays in the spools."""
+        if self._observer in self._server.observers:
+            self._server.observers.remove(self._observer)
+        programs, self._programs = [*self._programs.values()], {}
+        for program in programs:
+            await program.close()
+        await self.outlets.stop()
+
+    def reading(self, camera: str) -> Interpretation | None:
+        """Return the interpretation of a camera's results; None for a camera that is not known."""
+        planned = self._server.reloads.now.plan.get(camera)
+        if planned is None:
+            return None
+        known = self._readings.get(camera)
+        if known is None or known[0] is not planned.entry:
+            entry = planned.entry
+            spec = "raw" if entry.interpret_as is None else entry.interpret_as
+            read = Interpretation(spec, lenient=entry.lenient, y_down=entry.y_down)
+            known = self._readings[camera] = entry, read
+        return known[1]
+
+    def endian(self, camera: str) -> int:
+        """Return the byte order that a camera's last status told."""
+        host = self._server.hosts.get(camera)
+        return 0 if host is None else host.camera.endian
+
+    def _columns(self, camera: str, application: int) -> Any:
+        read = self.reading(camera)
+        return self._columns_of(None if read is None else read.interpreter(application))
+
+    async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Do a command as any program of the fleet does it."""
+        if name not in self._server.hosts:
+            raise ConfigurationError(f"there is no camera {name!r:.120} here")
+        async with self._opening:
+            camera = self._programs.get(name)
+            if camera is None:
+                options = {"connect_timeout": COMMAND_CONNECT_TIMEOUT, "reconnect": Backoff()}
+                camera = fleet_camera(self._server.address.of(name).url, options, ())
+                await camera.open()
+                self._programs[name] = camera
+        return await self._do(camera, verb, given)
+
+
+class _OutletObserver(Observer):
+    """Hands what an agent's sessions see to its outlets."""
+
+    def __init__(self, owner: FleetOutlets) -> None:
+        self._owner = owner
+        self._states: dict[str, dict[str, Any]] = {}
+
+    def on_state(self, event: CameraEvent) -> None:
+        """Tell of a camera that comes and goes, and of its application."""
+        name = event.camera
+        state = self._states.setdefault(
+            name, {"connected": False, "application": None, "reason": None}
+        )
+        if isinstance(event, (Connected, Reconnected)):
+            state |= {"connected": True, "reason": None}
+        elif isinstance(event, Disconnected):
+            state |= {"connected": False, "reason": event.reason}
+            if not event.expected:
+                self._owner.outlets.offer_error(name, event.at, event.reason, "Disconnected")
+        elif isinstance(event, ApplicationChanged):
+            state |= {"application": event.application}
+        else:
+            return
+        self._owner.outlets.state_changed(name, {**state, "at": event.at})
+
+    def on_result(self, result: Result) -> None:
+        """Hand on a result."""
+        owner, read = self._owner, self._owner.reading(result.camera)
+        endian = owner.endian(result.camera)
+        cells = result.value.cells
+
+        def value() -> tuple[Any, int | None]:
+            if read is None:
+                return None, None
+            said: dict[str, Any] = json.loads(cells) if cells else {}
+            texts = said.get("cells")
+            container = ResultContainer(
+                application=result.application,
+                data=result.raw,
+                cells=None if texts is None else tuple(texts),
+                fault=said.get("fault"),
+            )
+            at = result.received_at
+            camera, number = result.camera, result.number
+            done = read(container, endian, camera=camera, number=number, at=at)
+            return done.value, done.sequence
+
+        owner.outlets.offer_result(result, value)
+
+    def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
+        """Hand on how a trigger ended that has no result."""
+        if triggered_at is not None:
+            at, kind = datetime.now(UTC), type(error).__name__
+            self._owner.outlets.offer_error(camera, at, str(error), kind, triggered_at)

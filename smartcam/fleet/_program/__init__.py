@@ -1,0 +1,1 @@
+"""The program's side of a fleet: cameras, calls and subscriptions."""

@@ -1,0 +1,682 @@
+"""Call the agent of a fleet's camera: which one it is, its presence, its clock."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam.exceptions import (
+    ConnectionClosedError,
+    ConnectionLostError,
+    LinkError,
+    NotAllowedError,
+    RemoteProtocolError,
+    ReservationLostError,
+    ResponseTimeoutError,
+    SmartCamError,
+    TriggerTimeoutError,
+)
+from smartcam.fleet._bus.errors import from_fields
+from smartcam.fleet._bus.keys import COMMANDS, FENCED
+from smartcam.fleet._bus.wire import (
+    BusMessage,
+    TriggerOrder,
+    TriggerReply,
+    encode,
+    encode_order,
+    grace,
+)
+from smartcam.fleet._security.certificates import may_command
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from smartcam._client._inside import TriggerRequest
+    from smartcam.fleet._bus.bus import Handle
+    from smartcam.fleet._program.program import Program, Reply
+    from smartcam.protocols import Counters
+
+DRIFT = 1e-4
+"""Seconds in a second by which two clocks go apart at most."""
+
+HELLO_TIMEOUT = 2.0
+"""Seconds for the answer to a hello; then it is said again, as long as the agent is there."""
+
+
+SWITCHES = {"ensure": "switch_application", "enter": "switch_application"}
+"""Names of calls, where a user knows them by another one."""
+LOOK_ELSEWHERE = 0.25
+"""Seconds between two looks whether another agent has a session, where the one that was met has
+none."""
+
+ASK_ANEW = 5.0
+"""Seconds until the one that was met is asked whether it has one by now: that it said so may be
+lost, and a camera that nobody triggers says nothing more."""
+
+MAX_AGENTS_REMEMBERED = 16
+"""Agents of a camera that are remembered."""
+
+INSIST_AFTER = 1.0
+"""Seconds until something is said again that the agent has to know: it may have been lost."""
+
+
+class Met:
+    """An agent that has answered.
+
+    Attributes:
+        agent: name of the agent.
+        epoch: number of the agent's start.
+        hello: fields that the agent answered on the camera.
+    """
+
+    def __init__(self, agent: str, epoch: int, hello: dict[str, Any]) -> None:
+        self.agent: str = agent
+        self.epoch: int = epoch
+        self.hello: dict[str, Any] = hello
+
+
+class Lease:
+    """A reservation whose block has not ended.
+
+    Attributes:
+        epoch: number of the start of the agent that made the reservation.
+        lost: why the reservation is lost; empty as long as nobody has said so.
+        told: whether there was an event for the loss.
+    """
+
+    __slots__ = ("epoch", "lost", "told")
+
+    def __init__(self, epoch: int) -> None:
+        self.epoch: int = epoch
+        self.lost: str = ""
+        self.told: bool = False
+
+
+class _HelloHeard(NamedTuple):
+    """An agent's answer to a hello, with the loop times around its clock."""
+
+    agent: str
+    epoch: int
+    hello: dict[str, Any]
+    clock: float
+    begun: float
+    at: float
+
+
+class Caller:
+    """Calls one camera's agent.
+
+    Args:
+        name: the camera's, for texts.
+        camera: the camera's name in the fleet.
+        program: program that makes the calls.
+        counters: counters of the messages.
+        on_met: callback for an agent that has answered, before anything else is called.
+        on_lost: callback for the error by which the agent is gone.
+        on_lease_lost: callback for the loss of this program's reservations, once for each loss.
+
+    Attributes:
+        met: the agent; None while there is none.
+        trouble: why there is no agent.
+        end: why there will be no agent any more.
+        linked: whether the agent has a session with the camera, as far as it has said.
+        leases: the reservations whose blocks run, oldest first, by the calls that made them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        camera: str,
+        program: Program,
+        counters: Counters,
+        on_met: Callable[[Met], None],
+        on_lost: Callable[[LinkError], None],
+        on_lease_lost: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._on_lease_lost = on_lease_lost
+        self.name: str = name
+        self.camera: str = camera
+        self.program: Program = program
+        self.counters: Counters = counters
+        self.met: Met | None = None
+        self.trouble: LinkError | None = None
+        self.end: LinkError | None = None
+        self.linked: bool = False
+        self.leases: dict[int, Lease] = {}
+        self._epochs: dict[str, int] = {}  # of agents that were met
+        self._on_met, self._on_lost = on_met, on_lost
+        self._agents: dict[str, None] = {}
+        self._stirred = asyncio.Event()
+        self._watch: Handle | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._ahead = 0.0  # the agent's clock is at least so far ahead of the loop's
+        self._measured = 0.0
+        self._most = math.inf  # and at most so far
+        self._bounded = 0.0
+        self._removed = ""  # why the agent that was met shares the camera no more
+        self._insisting: set[asyncio.Task[None]] = set()
+
+    # ------------------------------------------------------------------ life
+
+    def open(self) -> None:
+        """Look for the agent from now on."""
+        keys, bus = self.program.keys, self.program.bus
+        self._watch = bus.watch(keys.camera("*", self.camera), self._on_presence)
+        self._task = asyncio.get_running_loop().create_task(
+            self._attend(), name=f"smartcam.fleet.{self.camera}"
+        )
+
+    async def close(self, error: LinkError | None = None) -> None:
+        """Look for the agent no more. Idempotent."""
+        self.finish(error or ConnectionClosedError(f"{self.name}: the connection is closed"))
+        if self._watch is not None:
+            self._watch.close()
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait({task})
+        if self._insisting:
+            await asyncio.wait(self._insisting)  # what they wait for has failed
+
+    def finish(self, error: LinkError) -> None:
+        """End for good: there will be no agent any more."""
+        if self.end is None:
+            self.end = error
+        self.met = None
+        self.program.fail(self, lambda: error)
+
+    # ------------------------------------------------------------------ the agent
+
+    def require(self) -> Met:
+        """Return the agent.
+
+        Raises:
+            ConnectionLostError: it is away.
+            ConnectionClosedError: not opened, or closed.
+        """
+        if self.met is not None:
+            return self.met
+        if self.end is not None:
+            raise self.end.with_traceback(None)
+        if self.trouble is not None:
+            identity = self.program.bus.identity
+            if identity is not None and identity.expired:
+                raise ConnectionLostError(f"{self.trouble}; {identity.expired}") from self.trouble
+            raise self.trouble.with_traceback(None)
+        if self._task is not None:
+            raise ConnectionLostError(f"{self.name}: no agent has answered yet")
+        raise ConnectionClosedError(f"{self.name}: not connected: open it first")
+
+    def _on_presence(self, key: str, present: bool) -> None:
+        agent = self.program.keys.tail(key, "presence/camera")[0]
+        if present:
+            self._agents[agent] = None
+            self._stirred.set()
+        else:
+            self.agent_left(agent)
+
+    def agent_left(self, agent: str) -> None:
+        """End the calls of an agent that shares the camera no more. Idempotent."""
+        self._agents.pop(agent, None)
+        if self.met is not None and self.met.agent == agent:
+            why = self._removed
+            gone = f"the agent {agent} is gone, or the way to it"
+            self.lose(f"the agent {agent} shares the camera no more: {why}" if why else gone)
+        self._stirred.set()
+
+    def removed(self, why: str) -> None:
+        """Note why the agent shares the camera no more; the agent's presence ends next."""
+        self._removed = why
+
+    def lose(self, why: str) -> None:
+        """End every call under way, its outcome unknown, since the agent is gone."""
+        if self.met is None:
+            return
+        self.met, self.linked = None, False
+        error = self.trouble = ConnectionLostError(f"{self.name}: {why}")
+        self.program.fail(self, lambda: _unknown(error))
+        self._stirred.set()
+        self._on_lost(error)
+
+    async def _attend(self) -> None:
+        """Meet the agent whenever there is one; of several, the one that has a session."""
+        loop, quiet_since = asyncio.get_running_loop(), 0.0
+        while True:
+            look = None
+            if self.met is not None and not self.linked:
+                look = LOOK_ELSEWHERE if len(self._agents) > 1 else ASK_ANEW
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(look):
+                    await self._stirred.wait()
+                    quiet_since = loop.time()
+            self._stirred.clear()
+            met = self.met
+            if met is not None and self.linked:
+                continue
+            if met is not None and loop.time() - quiet_since >= ASK_ANEW:
+                quiet_since = loop.time()
+                await self._ask_anew(met)
+                continue
+            others = sorted(self._agents.keys() - ({met.agent} if met is not None else set()))
+            if not others:
+                continue
+            try:
+                await self._choose(others, met)
+            except SmartCamError as error:
+                if met is None:
+                    self.trouble = ConnectionLostError(f"{self.name}: {error}")
+                    if self._agents:
+                        await asyncio.sleep(HELLO_TIMEOUT / 10)
+                        self._stirred.set()
+
+    async def _choose(self, agents: list[str], met: Met | None) -> None:
+        """Meet one of the agents: with several, or instead of another, one that has a session."""
+        only_linked = met is not None
+        heard: list[_HelloHeard] = []
+        failed: SmartCamError | None = None
+        for agent in agents:
+            try:
+                heard.append(await self._say_hello(agent))
+            except SmartCamError as error:
+                failed = error
+                continue
+            if heard[-1].hello.get("connected") and not heard[-1].hello.get("trying"):
+                break  # a camera has one session
+        if self.met is not met:
+            return  # it came or went meanwhile
+        if not heard:
+            if failed is not None:
+                raise failed
+            return
+        best = heard[-1] if heard[-1].hello.get("connected") else heard[0]
+        if only_linked and not best.hello.get("connected"):
+            return
+        if met is not None:
+            self.lose(f"the agent {met.agent} has no session with the camera, {best.agent} has one")
+        self._meet(best)
+
+    async def _ask_anew(self, met: Met) -> None:
+        """Meet the agent again if it has a session by now."""
+        with contextlib.suppress(SmartCamError):
+            heard = await self._say_hello(met.agent)
+            if self.met is met and not self.linked and heard.hello.get("connected"):
+                self._meet(heard)
+
+    async def _say_hello(self, agent: str) -> _HelloHeard:
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        reply = await self._exchange("hello", begun + HELLO_TIMEOUT, agent)
+        fields = reply.fields
+        try:
+            epoch, clock = int(fields["epoch"]), float(fields["clock"])
+            hello = dict(fields["answer"])
+        except (KeyError, TypeError, ValueError) as exc:
+            raise RemoteProtocolError(f"the agent {agent} says no proper hello: {exc}") from exc
+        return _HelloHeard(agent, epoch, hello, clock, begun, loop.time())
+
+    def _meet(self, heard: _HelloHeard) -> None:
+        self._ahead, self._measured = heard.clock - heard.at, heard.at
+        self._most = math.inf
+        self.bound(heard.clock, heard.begun)
+        if heard.agent in self._agents:
+            self._epochs[heard.agent] = heard.epoch
+            if len(self._epochs) > MAX_AGENTS_REMEMBERED:
+                del self._epochs[next(iter(self._epochs))]
+            self.met = Met(heard.agent, heard.epoch, heard.hello)
+            self._removed = ""
+            self.trouble = None
+            self._on_met(self.met)
+
+    def restarted(self, epoch: int) -> bool:
+        """Return True if an epoch is that of a newer start of the agent that was met."""
+        met = self.met
+        if met is None or epoch <= met.epoch or len(self._agents) > 1:
+            return False
+        return all(one != epoch for agent, one in self._epochs.items() if agent != met.agent)
+
+    def unlink(self) -> None:
+        """Leave an agent without a session: another one may have it, or this one will again."""
+        self.linked = False
+        self._stirred.set()
+
+    # ------------------------------------------------------------------ the clock
+
+    def sample(self, clock: float) -> None:
+        """Take the time of the agent's clock that a message just now told."""
+        now = asyncio.get_running_loop().time()
+        least = self._ahead - DRIFT * (now - self._measured)
+        self._ahead, self._measured = max(least, clock - now), now
+
+    def bound(self, clock: float, said: float) -> None:
+        """Bound the agent's clock, which showed ``clock`` after it heard a message of ours."""
+        now = asyncio.get_running_loop().time()
+        most = self._most + DRIFT * (now - self._bounded)
+        self._most, self._bounded = min(most, clock - said), now
+
+    def here(self, clock: float) -> tuple[float, float]:
+        """Return between which times of the loop's it was when the agent's clock said ``clock``."""
+        if self.program.bus.local:
+            return clock, clock
+        now = asyncio.get_running_loop().time()
+        least = self._ahead - DRIFT * max(0.0, now - self._measured)
+        most = max(least, self._most + DRIFT * max(0.0, now - self._bounded))
+        return clock - most, clock - least
+
+    def clock_at_most(self, at: float) -> float:
+        """Return the agent's time at a time of the loop's clock, or one a little later."""
+        self.require()
+        earliest, _ = self.here(0.0)
+        return at - earliest
+
+    def clock(self, at: float) -> float:
+        """Return the agent's time at a time of the loop's clock, or one a little earlier."""
+        return at + self._ahead - DRIFT * max(0.0, at - self._measured)
+
+    # ------------------------------------------------------------------ reservations
+
+    def lease(self, number: int) -> Lease:
+        """Return a reservation of ours whose block runs.
+
+        Raises:
+            ReservationLostError: it is lost, as far as is known here.
+        """
+        lease, met = self.leases[number], self.met
+        if not lease.lost and met is not None and met.epoch != lease.epoch:
+            why = f"the agent {met.agent} has the camera now, which was started since"
+            self.lose_lease(number, why)
+        if lease.lost:
+            raise ReservationLostError(
+                f"{self.name}: the reservation was lost: {lease.lost}; commands of others may have "
+                "come between"
+            )
+        return lease
+
+    def lose_lease(self, number: int, why: str) -> None:
+        """Know that a reservation of ours is lost: no command of its block is sent any more."""
+        self.leases[number].lost = why
+        self.tell_leases_lost()
+
+    def tell_leases_lost(self) -> None:
+        """Tell that what this program has reserved is lost, unless that was told before."""
+        untold = [one for one in self.leases.values() if not one.told]
+        for one in untold:
+            one.told = True
+        if untold:
+            self._on_lease_lost()
+
+    def look_at_leases(self) -> None:
+        """Look whether reservations of ours are lost, now that an agent has answered."""
+        for number in self.leases:
+            with contextlib.suppress(ReservationLostError):
+                self.lease(number)
+
+    def _fence(self, do: str) -> int | None:
+        """Return the reservation in whose block a call is, the oldest; None where there is none.
+
+        Raises:
+            ReservationLostError: one of them is lost; nothing was sent.
+        """
+        if not self.leases or do not in FENCED:
+            return None
+        for number in self.leases:
+            self.lease(number)
+        return next(iter(self.leases))
+
+    # ------------------------------------------------------------------ calls
+
+    async def call(
+        self,
+        do: str,
+        deadline: float,
+        arguments: dict[str, Any] | None = None,
+        blobs: Sequence[bytes] = (),
+        number: int | None = None,
+        timeout: float | None = None,
+    ) -> BusMessage:
+        """Have something done by the agent; return its reply.
+
+        Args:
+            do: name of the call.
+            deadline: loop time.
+            arguments: arguments of the call, by name.
+            blobs: byte strings that belong to the call.
+            number: number of the call; the next one by default.
+            timeout: seconds that the user gave; what there is until ``deadline`` by default.
+
+        Raises:
+            SmartCamError: as the agent says; or the agent is gone, or silent.
+
+        Cancellation: the agent is told.
+        """
+        met = self.require()
+        reply = await self._exchange(
+            do, deadline, met.agent, met, arguments, blobs, number, timeout
+        )
+        self.sample(float(reply.fields.get("clock", -1e300)))
+        return reply
+
+    async def _exchange(
+        self,
+        do: str,
+        deadline: float,
+        agent: str,
+        met: Met | None = None,
+        arguments: dict[str, Any] | None = None,
+        blobs: Sequence[bytes] = (),
+        number: int | None = None,
+        timeout: float | None = None,
+    ) -> BusMessage:
+        begun = asyncio.get_running_loop().time()
+        number = number or self.program.next_call()
+        fields: dict[str, Any] = {
+            "program": self.program.token,
+            "call": number,
+            "do": do,
+            "arguments": arguments or {},
+        }
+        if met is not None:
+            timeout = deadline - begun if timeout is None else timeout
+            fields |= {"epoch": met.epoch, "deadline": self.clock(deadline), "timeout": timeout}
+            if (reservation := self._fence(do)) is not None:
+                fields["reservation"] = reservation
+            deadline += grace(timeout)
+        reply = await self._ask(do, number, encode(fields, blobs), begun, deadline, agent, met)
+        if not isinstance(reply, BusMessage):
+            raise RemoteProtocolError(f"{self.name}: the agent {agent} answers {do} as a trigger")
+        return reply
+
+    async def trigger(
+        self,
+        request: TriggerRequest,
+        application: int | None,
+        expected: int | None,
+        number: int,
+        timeout: float,
+    ) -> TriggerReply:
+        """Have the agent trigger; return its reply.
+
+        Args:
+            request: work that the trigger is to do.
+            application: application to have running for the trigger; None for any.
+            expected: application that the results are to be of; None for any.
+            number: number of the call.
+            timeout: seconds.
+
+        Raises:
+            SmartCamError: as :meth:`call`.
+
+        Cancellation: the agent is told.
+        """
+        met = self.require()
+        begun = asyncio.get_running_loop().time()
+        deadline = begun + timeout
+        interpretation = request.interpretation
+        order = TriggerOrder(
+            number,
+            met.epoch,
+            self.clock(deadline),
+            timeout,
+            application,
+            expected,
+            request.results,
+            request.wait,
+            interpretation.by_application,
+            request.input_data,
+            interpretation.numbered_layouts(),
+            self._fence("trigger"),
+        )
+        payload = encode_order(self.program.token, order)
+        reply = await self._ask(
+            "trigger", number, payload, begun, deadline + grace(timeout), met.agent, met
+        )
+        if not isinstance(reply, TriggerReply):
+            raise RemoteProtocolError(f"{self.name}: the agent's reply has no results")
+        self.sample(reply.clock)
+        return reply
+
+    async def _ask(
+        self,
+        do: str,
+        number: int,
+        payload: bytes,
+        begun: float,
+        deadline: float,
+        agent: str,
+        met: Met | None,
+    ) -> Reply:
+        """Say a call, and return the reply to it; ``deadline`` is this side's."""
+        self._check_allowed(do)
+        program, key = self.program, self._key(agent, do)
+        waiting = program.expect(number, self)
+        timer = asyncio.get_running_loop().call_at(deadline, _expire, waiting)
+        try:
+            self.counters.bytes_sent += program.put(key, payload)
+            self.counters.frames_sent += 1
+            reply = await waiting
+        except TimeoutError as exc:
+            self._cancel(key, number)
+            raise self._silence(do, deadline - begun) from exc
+        except asyncio.CancelledError:
+            self._cancel(key, number)
+            raise
+        finally:
+            timer.cancel()
+            program.forget(number)
+        self.counters.frames_received += 1
+        if isinstance(reply, TriggerReply):
+            return reply
+        if reply.fields.get("stranger") and self.met is met and met is not None:
+            self.lose(f"the agent {met.agent} was restarted, or took this program for gone")
+        if "error" in reply.fields:
+            error = from_fields(reply.fields["error"])
+            if isinstance(error, ReservationLostError) and self.leases:
+                self.lose_lease(next(iter(self.leases)), "its agent has said so")
+            raise error
+        return reply
+
+    def tell(self, do: str, arguments: dict[str, Any]) -> None:
+        """Have something done without waiting for it, if there is an agent."""
+        if self.met is not None and self._allowed(do):
+            fields = {"do": do, "arguments": arguments, "epoch": self.met.epoch}
+            self._insist(self._key(self.met.agent, do), fields)
+
+    def come(self, number: int, offset: int | None) -> None:
+        """Say up to where the frame of a call has come; None: no more of it is wanted."""
+        if self.met is not None:
+            fields = {"call": number, "come": offset}
+            self.program.send(self._key(self.met.agent, "frame"), fields)
+
+    def _cancel(self, key: str, number: int) -> None:
+        self._insist(key, {"cancel": number})
+
+    def _insist(self, key: str, fields: dict[str, Any]) -> None:
+        """Send a message that may come twice, now and again until the agent confirms it.
+
+        An agent that is gone, or was gone for a time, has nothing any more that has to end.
+        """
+        program, met = self.program, self.met
+
+        def say() -> tuple[int, asyncio.Future[Reply]]:
+            number = program.next_call()
+            program.send(key, {"call": number, **fields})
+            return number, program.expect(number, self)
+
+        async def repeat(number: int, answer: asyncio.Future[Reply]) -> None:
+            while True:
+                try:
+                    async with asyncio.timeout(INSIST_AFTER):
+                        await answer
+                except TimeoutError:
+                    if self.met is not met or met is None:
+                        return
+                except SmartCamError:
+                    return
+                else:
+                    return
+                finally:
+                    program.forget(number)
+                number, answer = say()
+
+        task = asyncio.get_running_loop().create_task(
+            repeat(*say()), name=f"smartcam.fleet.{self.camera}.insist"
+        )
+        self._insisting.add(task)
+        task.add_done_callback(self._insisting.discard)
+
+    def _allowed(self, do: str) -> bool:
+        identity = self.program.bus.identity
+        return do not in COMMANDS or identity is None or may_command(identity.role)
+
+    def _check_allowed(self, do: str) -> None:
+        """Refuse what the bus would swallow.
+
+        Raises:
+            NotAllowedError: the role of this program's certificate forbids it.
+        """
+        identity = self.program.bus.identity
+        if identity is not None and not self._allowed(do):
+            what = SWITCHES.get(do, do)
+            raise NotAllowedError(
+                f"{self.name}: {what} is a command, and this program's certificate is that of "
+                f"{identity}, who may look; nothing was sent",
+                role=identity.role,
+                certificate=identity.name,
+            )
+
+    def _perhaps(self, do: str) -> str:
+        """Return a text on another reason for silence; empty where there is none."""
+        identity = self.program.bus.identity
+        if identity is None:
+            return ""
+        return f"; nobody is there, or {do} is not allowed for {identity}"
+
+    def _key(self, agent: str, do: str) -> str:
+        program, camera = self.program, self.camera
+        if do in COMMANDS:
+            return program.keys.command(agent, camera)
+        return program.keys.ask(program.role, agent, camera)
+
+    def _silence(self, do: str, waited: float) -> SmartCamError:
+        agent = self.met.agent if self.met is not None else "agent"
+        if do == "trigger":
+            return TriggerTimeoutError(
+                f"{self.name}: the {agent} said nothing within {waited:.3g} s; whether the camera "
+                f"was triggered is unknown{self._perhaps(do)}",
+                waited=waited,
+            )
+        return ResponseTimeoutError(
+            f"{self.name}: the {agent} said nothing to {do} within {waited:.3g} s; whether it was "
+            f"done is unknown{self._perhaps(do)}",
+            waited=waited,
+        )
+
+
+def _expire(waiting: asyncio.Future[Reply]) -> None:
+    if not waiting.done():
+        waiting.set_exception(TimeoutError())
+
+
+def _unknown(error: LinkError) -> LinkError:
+    return ConnectionLostError(f"{error}; whether what was under way was done is unknown")

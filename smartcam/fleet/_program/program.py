@@ -1,0 +1,204 @@
+"""A program on the bus: its calls, and the replies to them."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectFailedError,
+    ConnectionClosedError,
+    ProtocolError,
+)
+from smartcam.fleet._bus.keys import ANYONE, Keys
+from smartcam.fleet._bus.wire import BusMessage, TriggerReply, decode, decode_outcome, encode
+from smartcam.fleet._frames.collector import FrameCollector
+from smartcam.fleet._program.program_name import ProgramName
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from typing import Self
+
+    from smartcam.exceptions import SmartCamError
+    from smartcam.fleet._bus.bus import Bus, Handle
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+
+LOOK_AGAIN = 0.1
+"""Seconds between two looks whether an agent has come."""
+
+LAST_LOOK = 1.0
+"""Seconds that a look may take at what is there instead."""
+
+
+Reply = BusMessage | TriggerReply
+
+
+class Pending(NamedTuple):
+    """A call whose reply has not come."""
+
+    camera: object
+    reply: asyncio.Future[Reply]
+
+
+class Program:
+    """One program's end of the bus.
+
+    Args:
+        bus: the program's own end of the bus.
+        fleet: name of the fleet; None for the only one that has the camera.
+        camera: camera to look for: a name, or a pattern.
+        guest: whether the end is another's, which opens and closes it.
+        called: what people call the program; None: its script.
+
+    Attributes:
+        keys: keys of the fleet, once it is open.
+        frames: collector of the bytes of frames.
+    """
+
+    keys: Keys
+
+    def __init__(
+        self,
+        bus: Bus,
+        fleet: str | None,
+        camera: str = "**",
+        *,
+        guest: bool = False,
+        called: str | None = None,
+    ) -> None:
+        self.bus: Bus = bus
+        self._guest = guest
+        self._fleet, self._camera = fleet, camera
+        self._called = called
+        self._name = ProgramName.new(ANYONE, called)
+        self._calls = 0
+        self._pending: dict[int, Pending] = {}
+        self._declared: list[Handle] = []
+        self.frames: FrameCollector = FrameCollector(self)
+
+    async def open(self, timeout: float) -> Self:
+        """Come to the bus.
+
+        Raises:
+            ConnectFailedError: there is none within ``timeout`` seconds, or no fleet there.
+            ConfigurationError: there are several.
+        """
+        deadline = asyncio.get_running_loop().time() + timeout
+        if not self._guest:
+            await self.bus.open(timeout)
+        self.keys = Keys(self._fleet or await self._find(deadline, timeout))
+        if self.bus.identity is not None:
+            called = self._called or self.bus.identity.name or None
+            self._name = ProgramName.new(self.bus.identity.role, called)
+        self._declared = [
+            self.bus.subscribe(self.keys.reply(self.name), self._on_reply),
+            self.bus.be_present(self.keys.program(self.token)),
+        ]
+        return self
+
+    @property
+    def name(self) -> str:
+        """Its name, which no other program has: its role, and what a person would call it."""
+        return self._name.name
+
+    @property
+    def token(self) -> str:
+        """Its name and its secret, as it says them to agents."""
+        return self._name.token
+
+    @property
+    def role(self) -> str:
+        """The role that its name begins with."""
+        return self._name.role
+
+    async def _find(self, deadline: float, timeout: float) -> str:
+        """Return the name of the only fleet that has what is looked for."""
+        loop = asyncio.get_running_loop()
+        # of all cameras there may be thousands, of agents a few
+        keys_of = Keys("*")
+        pattern = keys_of.camera("*", self._camera)
+        if self._camera == "**":
+            pattern = keys_of.agent("*")
+        while (left := deadline - loop.time()) > 0:
+            keys = await self.bus.present(pattern, left)
+            found = sorted({key.split("/")[1] for key in keys})
+            if len(found) == 1:
+                return found[0]
+            if found:
+                raise ConfigurationError(
+                    f"{self._camera}: there are several fleets: {', '.join(found)}; say which one "
+                    f"is meant: ?fleet={found[0]}"
+                )
+            await asyncio.sleep(min(LOOK_AGAIN, left))
+        what, meant = "camera", ""
+        if "*" not in self._camera:
+            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK)
+            meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
+            what = f"camera {self._camera}"
+        whose = self.bus.identity
+        seen = "" if whose is None else f"; or {whose} may not see it"
+        why = f"no agent there has a {what}: none came within {timeout:g} s{meant}{seen}"
+        raise ConnectFailedError(why, attempts=(why,))
+
+    async def close(self) -> None:
+        """Leave the bus; calls under way end. Idempotent."""
+        for _, reply in [*self._pending.values()]:
+            if not reply.done():
+                reply.set_exception(ConnectionClosedError("closed"))
+        declared, self._declared = self._declared, []
+        self.frames.close()
+        for handle in declared:
+            handle.close()
+        if not self._guest:
+            await self.bus.close()
+
+    def next_call(self) -> int:
+        """Return the number of the next call; each is given once."""
+        self._calls += 1
+        return self._calls
+
+    def send(self, key: str, fields: dict[str, Any], blobs: Sequence[bytes] = ()) -> int:
+        """Say something to an agent; return how many bytes."""
+        return self.put(key, encode({"program": self.token, **fields}, blobs))
+
+    def put(self, key: str, payload: bytes) -> int:
+        """Say something that is bytes already, as :meth:`send` does."""
+        self.bus.put(key, payload)
+        return len(payload)
+
+    def expect(self, number: int, camera: object) -> asyncio.Future[Reply]:
+        """Return the future of the reply to a call; :meth:`forget` the call in the end."""
+        reply: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        self._pending[number] = Pending(camera, reply)
+        return reply
+
+    def forget(self, number: int) -> None:
+        """Drop a call for whose reply nobody waits any more."""
+        self._pending.pop(number, None)
+
+    def fail(self, camera: object, error: Callable[[], SmartCamError]) -> None:
+        """End all calls to a camera: there will be no replies."""
+        for owner, reply in self._pending.values():
+            if owner is camera and not reply.done():
+                reply.set_exception(error())
+
+    def _on_reply(self, key: str, payload: bytes) -> None:
+        try:
+            outcome = decode_outcome(payload, "a reply")
+            if outcome is not None:
+                message: Reply = outcome
+                number = outcome.call
+            else:
+                message = said = decode(payload, "a reply")
+                number = said.fields["call"]
+            pending = self._pending.get(number)
+        except (ProtocolError, KeyError, TypeError) as exc:
+            logger.warning("%s ! a reply that cannot be read: %s", self.name, exc)
+            return
+        if pending is not None and not pending.reply.done():
+            pending.reply.set_result(message)

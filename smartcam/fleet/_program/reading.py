@@ -1,0 +1,93 @@
+"""Read an agent's message about a result: its value, and all of it as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client._inside import localizations_of
+from smartcam._json import plain
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam.exceptions import InterpretationError
+from smartcam.fleet._bus.errors import to_fields
+from smartcam.models import Result
+from smartcam.protocols.messages import ResultContainer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam._client._inside import Interpretation, Interpreted
+    from smartcam.fleet._bus.wire import ResultRun
+
+
+def singles(run: ResultRun) -> Iterator[ResultRun]:
+    """Give each container of a run as a run of its own."""
+    for place in range(len(run.payloads)):
+        yield run._replace(number=run.number + place, payloads=run.payloads[place : place + 1])
+
+
+def interpreted(run: ResultRun, interpretation: Interpretation, camera: str) -> Interpreted:
+    """Return the contents of the one container of ``run``.
+
+    Raises:
+        InterpretationError: the container does not fit the interpretation.
+    """
+    cells = fault = None
+    if run.cells:
+        said: dict[str, Any] = json.loads(run.cells)
+        fault, given = said.get("fault"), said.get("cells")
+        cells = None if given is None else tuple(given)
+    (data,) = run.payloads
+    container = ResultContainer(application=run.application, data=data, cells=cells, fault=fault)
+    return interpretation(
+        container, run.endian, camera=camera, number=run.number, at=run.received_at
+    )
+
+
+def as_result(run: ResultRun, camera: str, value: Any, sequence: int | None) -> Result[Any]:
+    """Return the one container of ``run`` as a result with this value."""
+    latency = None if math.isnan(run.latency) else run.latency
+    return Result(
+        camera,
+        run.application,
+        sequence,
+        run.number,
+        run.trigger_time,
+        run.received_at,
+        latency,
+        run.payloads[0],
+        value,
+    )
+
+
+def result_fields(
+    run: ResultRun, interpretation: Interpretation | None, camera: str
+) -> dict[str, Any]:
+    """Return the JSON fields of the one container of ``run``, with ``error`` if it cannot be read.
+
+    The value is None then, and without an interpretation.
+    """
+    value = sequence = None
+    said: dict[str, Any] = {"error": ""}
+    if interpretation is not None:
+        try:
+            value, sequence, _ = interpreted(run, interpretation, camera)
+            if localizations_of(value) is None:  # of which the text is made faster
+                value = plain(value)
+        except InterpretationError as error:
+            value, said = None, failure(error)
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:  # noqa: BLE001 - a plug-in's value that is no JSON
+            value, said = None, failure(InterpretationError(f"the value is no JSON: {exc!r:.200}"))
+    return {**as_result(run, camera, value, sequence)._asdict(), **said}
+
+
+def failure(error: BaseException) -> dict[str, Any]:
+    """Return an error as answers and results in JSON have it: ``error`` is never empty."""
+    said = to_fields(error, 0)
+    fields: dict[str, Any] = {"error": said["text"] or said["kind"], "kind": said["kind"]}
+    if "attributes" in said:
+        fields["attributes"] = said["attributes"]
+    return fields

@@ -1,0 +1,1 @@
+"""Security of a fleet: rights, certificates, their authority, and the agent's access check."""

@@ -1,0 +1,168 @@
+"""The rights of each role, and the rules that an engine makes of them.
+
+A program's role is its certificate's common name. Nothing is allowed but what stands in
+:data:`RIGHTS`; ``docs/access.md`` is made from it.
+"""
+
+from __future__ import annotations
+
+import collections
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from smartcam.fleet._bus.keys import Keys
+from smartcam.fleet._json.services import SERVICES
+from smartcam.fleet._program.program_name import names_of
+from smartcam.fleet._security.certificates import AGENT, OPERATOR, ROLES, ROUTER, VIEWER
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Does = Literal["say", "hear", "ask", "answer", "appear", "watch"]
+Flow = Literal["ingress", "egress"]
+
+MESSAGES: dict[Does, tuple[tuple[str, Flow], ...]] = {
+    "say": (("put", "ingress"), ("declare_subscriber", "egress")),
+    "hear": (("declare_subscriber", "ingress"), ("put", "egress")),
+    "ask": (("query", "ingress"), ("reply", "egress"), ("declare_queryable", "egress")),
+    "answer": (("declare_queryable", "ingress"), ("query", "egress"), ("reply", "ingress")),
+    "appear": (("liveliness_token", "ingress"),),
+    "watch": (
+        ("liveliness_query", "ingress"),
+        ("declare_liveliness_subscriber", "ingress"),
+        ("liveliness_token", "egress"),
+    ),
+}
+"""The engine's messages of each thing that an end does, and whether they come from it."""
+
+
+class Right(NamedTuple):
+    """A right, and the roles that have it.
+
+    Attributes:
+        what: the right in words.
+        does: kind of use that the right allows.
+        keys: patterns of the keys that may be used.
+        roles: roles that have the right.
+    """
+
+    what: str
+    does: Does
+    keys: tuple[str, ...]
+    roles: tuple[str, ...]
+
+
+_ANY = Keys("*")  # of whichever fleet: one authority is one plant
+_LOOKING = tuple(name for name, one in SERVICES.items() if not one.command)
+_LOOKS, _ACTS, _SHARES = (VIEWER, OPERATOR, AGENT), (OPERATOR,), (AGENT,)
+
+RIGHTS: tuple[Right, ...] = (
+    Right(
+        "see which agents and cameras are there",
+        "watch",
+        (_ANY.agent("*"), _ANY.camera("*", "**")),
+        _LOOKS,
+    ),
+    *(
+        Right(
+            "be there under a name of its role", "appear", (_ANY.program(names_of(role)),), (role,)
+        )
+        for role in _LOOKS
+    ),
+    Right("hear results and states", "hear", (_ANY.results("**"), _ANY.states("**")), _LOOKS),
+    *(
+        Right("ask what changes nothing, as its role", "say", (_ANY.ask(role, "*", "**"),), (role,))
+        for role in _LOOKS
+    ),
+    Right("get answers and frames", "hear", (_ANY.reply("*"), _ANY.frames("*")), _LOOKS),
+    Right("hear results in bundles", "hear", (_ANY.bundle("*"),), _LOOKS),
+    Right("ask what agents know of all cameras", "ask", (_ANY.summary("*"),), _LOOKS),
+    Right("JSON: list the cameras", "ask", (_ANY.listing("**"),), _LOOKS),
+    Right("JSON: hear topics", "hear", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS),
+    Right(
+        "JSON: services that change nothing",
+        "ask",
+        tuple(_ANY.service("**", name) for name in _LOOKING),
+        _LOOKS,
+    ),
+    Right("command", "say", (_ANY.command("*", "**"),), _ACTS),
+    Right("JSON: all services", "ask", (f"{_ANY.root}/service/**", _ANY.thesis("*")), _ACTS),
+    Right("have an agent read its file again", "ask", (_ANY.reload("*"),), _ACTS),
+    Right("read its file again", "answer", (_ANY.reload("*"),), _SHARES),
+    Right("share cameras", "appear", (_ANY.agent("*"), _ANY.camera("*", "**")), _SHARES),
+    Right("have a name of its own", "appear", (_ANY.start("*", "*"),), _SHARES),
+    Right("see who has its name", "watch", (_ANY.start("*", "*"),), _SHARES),
+    Right("see which programs are there", "watch", (_ANY.program("*"),), _SHARES),
+    Right(
+        "take calls",
+        "hear",
+        (_ANY.command("*", "**"), _ANY.ask("*", "*", "**")),
+        _SHARES,
+    ),
+    Right("answer calls", "say", (_ANY.reply("*"), _ANY.frames("*")), _SHARES),
+    Right("tell results and states", "say", (_ANY.results("**"), _ANY.states("**")), _SHARES),
+    Right("tell results in bundles", "say", (_ANY.bundle("*"),), _SHARES),
+    Right("say what it knows of all cameras", "answer", (_ANY.summary("*"),), _SHARES),
+    Right("JSON: tell topics", "say", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES),
+    Right(
+        "JSON: list, serve",
+        "answer",
+        (_ANY.listing("**"), f"{_ANY.root}/service/**", _ANY.thesis("*")),
+        _SHARES,
+    ),
+)
+"""Rights of the roles, for every fleet of the bus."""
+
+
+def ros_rights(domain: int) -> tuple[Right, ...]:
+    """Return the rights of ROS 2 in a domain: everything, for roles that may command.
+
+    A topic's name does not tell looking from acting: a viewer's node could call any service.
+    """
+    keys = (f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**")
+    return tuple(Right("ROS 2", does, keys, (OPERATOR, AGENT)) for does in MESSAGES)
+
+
+_EVERYTHING = ("**", "**/@adv/**", "@ros2_lv/**")
+_ALL = tuple(Right("pass on", does, _EVERYTHING, (ROUTER,)) for does in MESSAGES)
+
+
+def access_control(domain: int | None = None) -> dict[str, Any]:
+    """Return the rules as the engine's ``access_control`` has them.
+
+    Args:
+        domain: domain of ROS 2 that the bus carries, too; None for none.
+    """
+    rights = RIGHTS + _ALL + (() if domain is None else ros_rights(domain))
+    keys: dict[tuple[str, str, Flow], dict[str, None]] = collections.defaultdict(dict)
+    for right in rights:
+        for role, message, flow in _each(right):
+            keys[role, message, flow] |= dict.fromkeys(right.keys)
+    rules = {
+        (role, message, flow): {
+            "id": f"{role} {message} {flow}",
+            "messages": [message],
+            "flows": [flow],
+            "permission": "allow",
+            "key_exprs": [*found],
+        }
+        for (role, message, flow), found in keys.items()
+    }
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [*rules.values()],
+        "subjects": [{"id": role, "cert_common_names": [role]} for role in ROLES],
+        "policies": [
+            {
+                "subjects": [role],
+                "rules": [rule["id"] for (whose, *_), rule in rules.items() if whose == role],
+            }
+            for role in ROLES
+        ],
+    }
+
+
+def _each(right: Right) -> Iterator[tuple[str, str, Flow]]:
+    for role in right.roles:
+        for message, flow in MESSAGES[right.does]:
+            yield role, message, flow

@@ -1,0 +1,250 @@
+"""Certificates: whose one is, its role, when it ends; why a handshake with it came to nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+import ssl
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._extras import load
+from smartcam.exceptions import ConfigurationError
+from smartcam.fleet._bus.address import CERTIFICATE_FILES
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from cryptography import x509
+
+VIEWER, OPERATOR, AGENT, ROUTER = ROLES = ("viewer", "operator", "agent", "router")
+"""Roles that a certificate's common name may be."""
+
+MAX_BYTES = 1 << 20
+"""Bytes of a file with certificates or a key; each certificate has about 1 kB."""
+
+WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
+"""Times before its end at which a certificate is warned of."""
+
+DAY = timedelta(days=1)
+
+LOOK = 1.0
+"""Seconds for finding out why a handshake failed."""
+
+RENEW = "smartcam fleet certificates DIR makes a new one"
+
+VERIFY: dict[int, str] = {
+    9: "its certificate counts from a later time than now: look at the clocks",
+    10: "its certificate has expired",
+    18: "its certificate is of another authority than ca.pem",
+    19: "its certificate is of another authority than ca.pem",
+    20: "its certificate is of another authority than ca.pem",
+    21: "its certificate is of another authority than ca.pem",
+    62: "its certificate is for other hosts than {host}; smartcam fleet certificates takes --host",
+    64: "its certificate is for other hosts than {host}; smartcam fleet certificates takes --host",
+}
+"""Meanings of OpenSSL's verdicts (X509_V_ERR_...)."""
+
+ALERTS: dict[str, str] = {
+    "CERTIFICATE_REQUIRED": "it wants a certificate of this program",
+    "HANDSHAKE_FAILURE": "it wants a certificate of this program",
+    "UNKNOWN_CA": "the certificate of this program is of an authority that it does not know",
+    "DECRYPT_ERROR": "the certificate of this program is of an authority that it does not know",
+    "CERTIFICATE_EXPIRED": "the certificate of this program has expired, by its clock",
+    "BAD_CERTIFICATE": "it does not take the certificate of this program",
+    "WRONG_VERSION_NUMBER": "nothing there speaks TLS: is it fleet://, without +tls?",
+    "RECORD_LAYER_FAILURE": "nothing there speaks TLS: is it fleet://, without +tls?",
+}
+"""Meanings of the endings of OpenSSL's reasons."""
+
+
+SILENT = "nothing there answers a TLS handshake: is it fleet://, without +tls?"
+
+
+class Identity(NamedTuple):
+    """The owner of a certificate.
+
+    Attributes:
+        folder: folder of the certificate.
+        role: common name in the certificate.
+        name: organisational unit in the certificate; empty where there is none.
+        ends: when the certificate ends, UTC.
+        authority_ends: when the certificate of its authority ends, UTC.
+        digest: digest of all three files.
+    """
+
+    folder: Path
+    role: str
+    name: str
+    ends: datetime
+    authority_ends: datetime
+    digest: bytes
+
+    def __str__(self) -> str:
+        return f"{self.role} {self.name}".strip()
+
+    @property
+    def expired(self) -> str:
+        """Say that it has expired; empty where it has not."""
+        now = datetime.now(UTC)
+        for what, ends in self._endings:
+            if now >= ends:
+                return f"{what} has expired on {_day(ends)}; {RENEW}"
+        return ""
+
+    @property
+    def warning(self) -> str:
+        """Say that it ends soon, or has; empty where it does not."""
+        return self.expired or ends_soon(*min(self._endings, key=lambda one: one[1]))
+
+    @property
+    def urgency(self) -> int:
+        """Number of warning times that are over; one more when the certificate has expired."""
+        return sum(self._left <= one for one in (*WARN_BEFORE, timedelta()))
+
+    @property
+    def look_after(self) -> float:
+        """Seconds until the next time to warn, a day at most: it may be another one by then."""
+        times = [self._left - one for one in (*WARN_BEFORE, timedelta()) if self._left > one]
+        return min([DAY, *times]).total_seconds() + 0.1
+
+    @property
+    def _left(self) -> timedelta:
+        return min(self.ends, self.authority_ends) - datetime.now(UTC)
+
+    @property
+    def _endings(self) -> tuple[tuple[str, datetime], ...]:
+        mine = f"the certificate of {self} ({self.folder / CERTIFICATE_FILES[1]})"
+        theirs = f"that of its authority ({self.folder / CERTIFICATE_FILES[0]})"
+        return (mine, self.ends), (theirs, self.authority_ends)
+
+
+def ends_soon(what: str, ends: datetime | None) -> str:
+    """Say that something ends soon; empty where it does not."""
+    if ends is None or (left := ends - datetime.now(UTC)) > WARN_BEFORE[0]:
+        return ""
+    return f"{what} ends on {_day(ends)}, in {_span(left)}; {RENEW}"
+
+
+def may_command(role: str) -> bool:
+    """Return True if a role may command; a role that is not smartcam's counts as allowed."""
+    return role not in ROLES or role == OPERATOR
+
+
+def _day(when: datetime) -> str:
+    return f"{when:%Y-%m-%d %H:%M} UTC"
+
+
+def _span(left: timedelta) -> str:
+    return f"{left.days} days" if left.days > 1 else f"{left.total_seconds() / 3600:.2g} hours"
+
+
+def x509_module() -> Any:
+    """Return the module that reads certificates.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    return load("cryptography.x509")
+
+
+def read_identity(folder: Path) -> Identity:
+    """Read whose the certificate of a folder is; blocks for some milliseconds.
+
+    Raises:
+        ConfigurationError: the files are none, or do not belong together.
+        MissingExtraError: cryptography is not installed.
+    """
+    x509 = x509_module()
+    bodies: list[bytes] = []
+    for name in CERTIFICATE_FILES:
+        try:
+            with (folder / name).open("rb") as stream:
+                bodies.append(stream.read(MAX_BYTES + 1))
+        except OSError as exc:
+            raise ConfigurationError(f"certificates: {folder / name}: {exc.strerror}") from exc
+        if len(bodies[-1]) > MAX_BYTES:
+            raise ConfigurationError(
+                f"certificates: {folder / name}: expected {MAX_BYTES} bytes at most, got more"
+            )
+    try:
+        own = x509.load_pem_x509_certificate(bodies[1])
+        authorities = x509.load_pem_x509_certificates(bodies[0])
+    except ValueError as exc:
+        raise ConfigurationError(f"certificates: {folder}: no certificate: {exc}") from exc
+    try:  # whether they belong together
+        context(folder)
+    except (ssl.SSLError, OSError) as exc:
+        raise ConfigurationError(
+            f"certificates: {folder}: cert.pem and key.pem do not go together: {exc}"
+        ) from exc
+    oid = x509.NameOID
+    return Identity(
+        folder,
+        _named(own, oid.COMMON_NAME),
+        _named(own, oid.ORGANIZATIONAL_UNIT_NAME),
+        own.not_valid_after_utc,
+        max(one.not_valid_after_utc for one in authorities),
+        hashlib.sha256(b"\0".join(bodies)).digest(),
+    )
+
+
+def _named(own: x509.Certificate, oid: Any) -> str:
+    found = own.subject.get_attributes_for_oid(oid)
+    return str(found[0].value) if found else ""
+
+
+def context(folder: Path) -> ssl.SSLContext:
+    """Return the TLS context for a handshake with the certificates of a folder; blocks.
+
+    Raises:
+        ssl.SSLError: the files are no certificates.
+    """
+    ca, cert, key = (folder / name for name in CERTIFICATE_FILES)
+    made = ssl.create_default_context(cafile=str(ca))
+    made.verify_flags &= ~ssl.VERIFY_X509_STRICT  # the engine asks for no more either
+    made.load_cert_chain(cert, key, password="")  # else one with a password asks the terminal
+    return made
+
+
+class Handshake(NamedTuple):
+    """The outcome of a handshake.
+
+    Attributes:
+        trouble: why it failed; empty where it did not.
+        ends: when the other side's certificate ends, UTC; None where it showed none.
+    """
+
+    trouble: str
+    ends: datetime | None
+
+
+async def shake_hands(host: str, port: int, folder: Path, within: float = LOOK) -> Handshake:
+    """Try a handshake, and say what came of it ``within`` seconds."""
+    loop = asyncio.get_running_loop()
+    writer: asyncio.StreamWriter | None = None
+    ends: datetime | None = None
+    try:
+        async with asyncio.timeout(within):
+            made = await loop.run_in_executor(None, context, folder)
+            reader, writer = await asyncio.open_connection(host, port, ssl=made)
+            found: Any = writer.get_extra_info("peercert") or {}
+            if "notAfter" in found:
+                ends = datetime.fromtimestamp(ssl.cert_time_to_seconds(found["notAfter"]), UTC)
+            await reader.read(1)  # who does not take our certificate says so now
+    except TimeoutError:  # who waits for what we say next has taken it
+        return Handshake(SILENT if writer is None else "", ends)
+    except ssl.SSLCertVerificationError as exc:
+        why = VERIFY.get(exc.verify_code, f"its certificate is not good: {exc.verify_message}")
+        return Handshake(why.format(host=host), ends)
+    except ssl.SSLError as exc:
+        reason = exc.reason or str(exc)
+        known = (text for end, text in ALERTS.items() if reason.endswith(end))
+        return Handshake(next(known, f"TLS: {reason}"), ends)
+    except OSError as exc:
+        return Handshake(os.strerror(exc.errno) if exc.errno else str(exc), ends)
+    finally:
+        if writer is not None:
+            writer.transport.abort()
+    return Handshake("", ends)

@@ -1,0 +1,392 @@
+"""The door of an agent's port: who may reach the engine, which takes every connection.
+
+The engine bounds nothing: a connection that says nothing has its place for 10 s, and after each one
+whose handshake fails nobody is taken in for 0.1 s. So the system drops what asks for one more, by a
+filter on the listening socket:
+
+- from an address that has many connections which have not come in;
+- from everybody while few file descriptors are left: cameras come back and health answers.
+
+Who is connected notices nothing; who asks, asks again by itself, as TCP does. The filter cannot
+look at what is said: connections inherit it from the socket that they came by.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import ctypes
+import errno
+import ipaddress
+import logging
+import os
+import select
+import socket
+import struct
+import sys
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+if sys.platform != "win32":
+    import resource
+
+Place = tuple[str, int]
+"""An address and a port."""
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+LOOK_EVERY, LOOK_EVERY_IF_CALM = 0.01, 0.05
+"""Seconds between two looks at how many descriptors are left, and where there are hardly fewer than
+at the last one. When somebody connects there is a look at once."""
+
+LOOK_WHO_COMES_EVERY = 0.25
+"""Seconds between two looks at connections while some are on their way in and no other comes."""
+
+REST = 4.0
+"""Rest after a look at connections, in multiples of what it took, however many come: it looks at
+every descriptor, and an agent may have thousands of cameras."""
+
+CALM_GROWTH = 8
+"""Descriptors more than at the last look that are taken for calm."""
+
+CHECK_AFTER = 50
+"""Looks until the engine's sockets are looked at, which it opens anew with renewed certificates."""
+
+RESERVED: Final = 256
+"""Descriptors that the port leaves to cameras and health; a quarter of all where those are few."""
+
+MAX_HALF_OPEN_CONNECTIONS: Final = 16
+"""Connections of one address that may be on their way in; it gets no further one meanwhile."""
+
+FEW_HALF_OPEN: Final = 4
+"""Half-open connections at which an address gets a further one again."""
+
+MAX_BLOCKED_ADDRESSES: Final = 256
+"""Addresses that a filter can name; those with most connections are."""
+
+BACKLOG: Final = 64
+"""Connections that the system keeps for the engine to take: these come in when the door is shut."""
+
+MAX_WANTED: Final = 65_536
+"""Descriptors that an agent asks the system for, as far as it may."""
+
+ATTACH_FILTER, DETACH_FILTER = 26, 27
+"""Linux' SO_ATTACH_FILTER and SO_DETACH_FILTER."""
+
+LOAD_WORD, LOAD_BYTE, SHIFT_RIGHT, IF_EQUAL, RETURN = 0x20, 0x30, 0x74, 0x15, 0x06
+"""Instructions of the classic packet filter."""
+
+IP_HEADER: Final = 0xFFF00000
+"""The offset of a packet's IP header."""
+
+
+class _Instruction(NamedTuple):
+    """One instruction of a filter.
+
+    Attributes:
+        code: operation of the instruction.
+        value: operand of the instruction.
+        yes, no: instructions skipped where a condition holds, and where it does not.
+    """
+
+    code: int
+    value: int = 0
+    yes: int = 0
+    no: int = 0
+
+
+_DROP, _PASS = _Instruction(RETURN, 0), _Instruction(RETURN, 0xFFFFFFFF)
+
+
+def packet_filter(*, shut: bool, blocked: Iterable[str]) -> list[_Instruction]:
+    """Return the filter of a listening socket.
+
+    Args:
+        shut: whether nobody is taken in.
+        blocked: addresses that are not.
+    """
+    if shut:
+        return [_DROP]
+    steps: list[_Instruction] = []
+    for one in blocked:
+        address = ipaddress.ip_address(one)
+        offset, words = (12, 1) if address.version == 4 else (8, 4)
+        steps += [
+            _Instruction(LOAD_BYTE, IP_HEADER),
+            _Instruction(SHIFT_RIGHT, 4),
+            _Instruction(IF_EQUAL, address.version, 0, 2 * words + 1),
+        ]
+        for number, (word,) in enumerate(struct.iter_unpack("!I", address.packed)):
+            left = words - number - 1
+            steps += [
+                _Instruction(LOAD_WORD, IP_HEADER + offset + 4 * number),
+                _Instruction(IF_EQUAL, word, 0, 2 * left + 1),
+            ]
+        steps.append(_DROP)
+    return [*steps, _PASS]
+
+
+def raise_descriptor_limit() -> None:
+    """Have as many file descriptors as the system lets this process have, up to a bound."""
+    if sys.platform == "win32":
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_WANTED if hard == resource.RLIM_INFINITY else min(MAX_WANTED, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+class Door:
+    """Decides who reaches the ports of this process' engine; on Linux, elsewhere everybody does.
+
+    Args:
+        ports: ports at which the engine listens.
+        links: gives the places of who has come in, such as ``("10.1.0.5", 40123)``; None where
+            that is not known.
+
+    Attributes:
+        shut: whether the door takes nobody in.
+        blocked: addresses that get no further connections.
+    """
+
+    def __init__(
+        self, ports: frozenset[int], links: Callable[[], set[Place] | None] = lambda: None
+    ) -> None:
+        self._ports, self._links = ports, links
+        self.shut = False
+        self.blocked: frozenset[str] = frozenset()
+        self._listeners: list[int] = []  # descriptors, which may be others' by now
+        self._timer: asyncio.TimerHandle | None = None
+        self._looks = self._lowest = 0
+        self._coming: asyncio.TimerHandle | None = None
+        self._rested = 0.0
+        self._knocks: select.epoll | None = None
+
+    def open(self) -> None:
+        """Look from now on."""
+        if sys.platform == "linux" and self._ports:
+            self._find_again()
+            self._look()
+
+    def close(self) -> None:
+        """Look no more, and leave the door open. Idempotent."""
+        if self._timer is None:
+            return
+        self._timer.cancel()
+        self._timer = None
+        self._expect_look(None)
+        self._forget_knocks()
+        if self.shut or self.blocked:
+            self.shut, self.blocked = False, frozenset()
+            self._set()
+
+    def _look(self) -> None:
+        most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        lowest, before = _lowest_free(most), self._lowest
+        self._lowest = lowest
+        calm = not self.shut and lowest <= before + CALM_GROWTH
+        delay = LOOK_EVERY_IF_CALM if calm else LOOK_EVERY
+        self._timer = asyncio.get_running_loop().call_later(delay, self._look)
+        self._looks += 1
+        if self._looks % CHECK_AFTER == 0 and not self._all_ours():
+            self._find_again()  # the engine has listened anew
+        if most == resource.RLIM_INFINITY:
+            return
+        left = most - lowest
+        reserve = min(RESERVED, most // 4)
+        if not self.shut and left <= reserve:
+            self.shut = True
+            self._set()
+            logger.warning(
+                "! the port of the fleet takes nobody in: %d file descriptors are left, and %d are "
+                "for cameras and health",
+                left,
+                reserve,
+            )
+        elif self.shut and left > reserve + reserve // 4:
+            self.shut = False
+            self._set()
+            logger.warning("= the port of the fleet takes programs in again")
+
+    # ------------------------------------------------------------------ who comes
+
+    def _hear_knocks(self) -> None:
+        """Have a look whenever somebody connects; the engine takes them in its own threads."""
+        self._forget_knocks()
+        self._knocks = select.epoll()
+        for number in self._listeners:
+            with contextlib.suppress(OSError):  # it is somebody else's, or closed
+                self._knocks.register(number, select.EPOLLIN | select.EPOLLET)
+        asyncio.get_running_loop().add_reader(self._knocks.fileno(), self._on_knock)
+
+    def _forget_knocks(self) -> None:
+        knocks, self._knocks = self._knocks, None
+        if knocks is not None:
+            asyncio.get_running_loop().remove_reader(knocks.fileno())
+            knocks.close()
+
+    def _on_knock(self) -> None:
+        if self._knocks is not None:
+            self._knocks.poll(0)
+        self._expect_look(max(0.0, self._rested - asyncio.get_running_loop().time()))
+
+    def _expect_look(self, delay: float | None) -> None:
+        """Look who comes in ``delay`` seconds, or not; what was expected before is forgotten."""
+        if self._coming is not None:
+            self._coming.cancel()
+            self._coming = None
+        if delay is not None:
+            loop = asyncio.get_running_loop()
+            self._coming = loop.call_later(delay, self._look_who_comes)
+
+    def _look_who_comes(self) -> None:
+        """Block addresses that have too many connections on their way in."""
+        loop, links = asyncio.get_running_loop(), self._links()
+        self._expect_look(None)
+        if links is None:
+            return
+        begun = loop.time()
+        coming = collections.Counter(host for host, _ in self._connected() - links)
+        self._rested = loop.time() + REST * (loop.time() - begun)
+        if coming:
+            self._expect_look(LOOK_WHO_COMES_EVERY)
+        many = [
+            host
+            for host, count in coming.most_common(MAX_BLOCKED_ADDRESSES)
+            if count >= MAX_HALF_OPEN_CONNECTIONS
+            or (host in self.blocked and count > FEW_HALF_OPEN)
+        ]
+        if self.blocked == {*many}:
+            return
+        for host in sorted({*many} - self.blocked):
+            logger.warning(
+                "! the port of the fleet takes nobody more in from %s: %d connections from there "
+                "have not come in yet",
+                host,
+                coming[host],
+            )
+        self.blocked = frozenset(many)
+        self._set()
+
+    def _connected(self) -> set[Place]:
+        """Return the other ends of all connections of the ports."""
+        found: set[Place] = set()
+        for one in _sockets():
+            with contextlib.suppress(OSError, IndexError):  # it is no such one, or has ended
+                if one.getsockname()[1] in self._ports and not _listens(one):
+                    host, port, *_ = one.getpeername()
+                    found.add((plain_host(host), port))
+        return found
+
+    # ------------------------------------------------------------------ filters
+
+    def _set(self) -> None:
+        done = [self._filter(number) for number in self._listeners]
+        if not all(done):
+            self._find_again()
+
+    def _find_again(self) -> None:
+        with contextlib.suppress(OSError):  # no descriptor is left to look with
+            self._listeners = self._find()
+            self._hear_knocks()
+        for number in self._listeners:
+            self._filter(number)
+
+    def _all_ours(self) -> bool:
+        """Return True if all listening sockets are still the same."""
+        for number in self._listeners:
+            try:
+                found = socket.socket(fileno=number)
+            except OSError:
+                return False
+            try:
+                if not self._is_ours(found):
+                    return False
+            finally:
+                found.detach()
+        return bool(self._listeners)
+
+    def _filter(self, number: int) -> bool:
+        """Give one listening socket its filter; return whether it is one of ours."""
+        try:
+            found = socket.socket(fileno=number)
+        except OSError:
+            return False
+        try:
+            if not self._is_ours(found):
+                return False
+            steps = packet_filter(shut=self.shut, blocked=sorted(self.blocked))
+            if steps == [_PASS]:
+                with contextlib.suppress(FileNotFoundError):  # it has none
+                    found.setsockopt(socket.SOL_SOCKET, DETACH_FILTER, 0)
+            else:
+                attach(found, steps)
+        except OSError:
+            return False
+        else:
+            return True
+        finally:
+            found.detach()
+
+    def _find(self) -> list[int]:
+        """Return the descriptors of the engine's listening sockets."""
+        numbers: list[int] = []
+        for found in _sockets():
+            with contextlib.suppress(OSError):
+                if self._is_ours(found):
+                    found.listen(BACKLOG)
+                    numbers.append(found.fileno())
+        return numbers
+
+    def _is_ours(self, found: socket.socket) -> bool:
+        return _listens(found) and found.getsockname()[1] in self._ports
+
+
+def attach(found: socket.socket, steps: list[_Instruction]) -> None:
+    """Have the system filter what comes for a socket.
+
+    Raises:
+        OSError: it refuses the filter.
+    """
+    packed = b"".join(struct.pack("HBBI", one.code, one.yes, one.no, one.value) for one in steps)
+    kept = ctypes.create_string_buffer(packed, len(packed))
+    program = struct.pack("HP", len(steps), ctypes.addressof(kept))
+    found.setsockopt(socket.SOL_SOCKET, ATTACH_FILTER, program)  # the system has a copy
+
+
+def plain_host(text: str) -> str:
+    """Return an address as it is compared: without a scope, IPv4 within IPv6 as IPv4."""
+    address = ipaddress.ip_address(text.strip("[]").partition("%")[0])
+    return str(getattr(address, "ipv4_mapped", None) or address)
+
+
+def _listens(found: socket.socket) -> bool:
+    internet = found.family in {socket.AF_INET, socket.AF_INET6}
+    return internet and bool(found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
+
+
+def _sockets() -> Iterator[socket.socket]:
+    """Give this process' sockets in turn; whose they are, they stay."""
+    for name in os.listdir("/dev/fd"):  # noqa: PTH208 - names are enough
+        try:
+            found = socket.socket(fileno=int(name))
+        except OSError:
+            continue
+        try:
+            yield found
+        finally:
+            found.detach()
+
+
+def _lowest_free(most: int) -> int:
+    """Return the lowest descriptor that is free: all below are in use."""
+    try:
+        number = os.dup(0)
+    except OSError as exc:
+        return most if exc.errno == errno.EMFILE else 0
+    os.close(number)
+    return number

@@ -1,0 +1,102 @@
+"""Renewed certificates: an agent takes them while it runs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import ConnectFailedError, SmartCamError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from smartcam.fleet._bus.zenoh import ZenohEnd
+    from smartcam.fleet._security.certificates import Identity
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+LOOK_EVERY = 10.0
+"""Seconds between two looks at the files."""
+
+MAX_WAIT = 600.0
+"""Seconds that a moment is waited for in which nobody commands: a renewal is in no hurry."""
+
+LOOK_AGAIN = 0.05
+
+REOPEN_TIMEOUT = 10.0
+
+RETRY_AFTER = 1.0
+
+
+class CertificateWatch:
+    """Has an agent's end of the bus opened again when its certificates are others.
+
+    Those that only connect need nothing: the engine reads the files at each connection. Who listens
+    has read them when it began to.
+
+    Args:
+        end: the agent's end of the bus, open.
+        listens: whether the end listens.
+        busy: whether there is something that should not be cut off.
+        away: context around a new session: on entry all that cannot stay is closed.
+    """
+
+    def __init__(
+        self,
+        end: ZenohEnd,
+        *,
+        listens: bool,
+        busy: Callable[[], bool],
+        away: Callable[[], AbstractAsyncContextManager[None]] = contextlib.nullcontext,
+    ) -> None:
+        self._end, self._listens, self._busy, self._away = end, listens, busy, away
+        self._trouble = ""
+
+    async def run(self) -> None:
+        """Look at the files now and then, for ever."""
+        seen = self._end.identity
+        while True:
+            await asyncio.sleep(LOOK_EVERY)
+            try:
+                seen = await self._follow(seen)
+            except Exception:
+                logger.exception("certificates ! looking at them failed; it is tried again")
+
+    async def _follow(self, seen: Identity | None) -> Identity | None:
+        """Take the certificates that are there now; return whose they are."""
+        found = await self._look()
+        if found is not None and seen is not None and found.digest != seen.digest:
+            if self._listens:
+                await self._reopen()
+            logger.info("certificates ! those of %s were renewed: until %s", found, found.ends)
+        return found or seen
+
+    async def _look(self) -> Identity | None:
+        """Return the identity in the certificates; None, logged once, where they cannot work."""
+        try:
+            found = await self._end.look_at_certificates()
+        except SmartCamError as exc:
+            if str(exc) != self._trouble:
+                logger.error("certificates ! not taken; all goes on as it was: %s", exc)  # noqa: TRY400 - the text says it
+            self._trouble = str(exc)
+            return None
+        self._trouble = ""
+        return found
+
+    async def _reopen(self) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(MAX_WAIT):
+                while self._busy():  # noqa: ASYNC110 - many things end it
+                    await asyncio.sleep(LOOK_AGAIN)
+        async with self._away():
+            while True:
+                try:
+                    await self._end.reopen(REOPEN_TIMEOUT)
+                except ConnectFailedError as exc:
+                    logger.error("certificates ! %s; it is tried again", exc)  # noqa: TRY400
+                    await asyncio.sleep(RETRY_AFTER)
+                else:
+                    return

@@ -1,0 +1,119 @@
+"""An agent that was stopped knows that what comes may have waited, and does nothing too late."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from typing import Any
+
+import pytest
+
+from smartcam.fleet._agent import pulse as _pulse
+from smartcam.fleet._agent.pulse import Pulse
+from smartcam.fleet._inside import Keys
+from tests.fleet.fleetkit import FLEET, NAME, PATIENCE, NumberedCamera, until
+from tests.fleet.partner import partner
+from tests.fleet.plainkit import NAME as PLAIN_NAME
+from tests.fleet.plainkit import plant, zenoh_session
+from tests.processes import free_place
+
+STOPPED = 3.0
+
+
+def hold_up(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the clock go on without a look at it, as it does for a process that is stopped."""
+    loop = asyncio.get_running_loop()
+    time = loop.time
+    monkeypatch.setattr(loop, "time", lambda: time() + seconds)
+
+
+async def test_what_comes_behind_a_stop_may_have_waited_as_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pulse = Pulse()
+    pulse.open()
+    try:
+        await asyncio.sleep(10.0)
+        assert pulse.waited() == 0.0
+        hold_up(STOPPED, monkeypatch)
+        first = pulse.waited()
+        assert STOPPED <= first <= STOPPED + _pulse.BEAT
+        await asyncio.sleep(_pulse.SETTLE / 2)  # it comes out of the system's buffers yet
+        assert pulse.waited() == pytest.approx(first + _pulse.SETTLE / 2, abs=0.01)
+        await asyncio.sleep(_pulse.SETTLE)
+        assert pulse.waited() == 0.0
+    finally:
+        pulse.close()
+        pulse.close()
+
+
+async def test_second_stop_counts_from_the_first_while_that_is_not_settled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pulse = Pulse()
+    pulse.open()
+    try:
+        hold_up(STOPPED, monkeypatch)
+        pulse.waited()
+        await asyncio.sleep(_pulse.SETTLE / 2)
+        hold_up(STOPPED, monkeypatch)
+        assert pulse.waited() >= 2 * STOPPED + _pulse.SETTLE / 2
+    finally:
+        pulse.close()
+
+
+async def test_command_that_waited_longer_than_its_timeout_is_not_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with plant() as place:
+        pulse = place.server._agent._plain._pulse  # type: ignore[union-attr]
+        monkeypatch.setattr(pulse, "waited", lambda: STOPPED)
+        for answer in (
+            await place.client.call("trigger", timeout=0.5),
+            await place.client.call("stop", timeout=STOPPED),
+        ):
+            assert answer["kind"].endswith("TimeoutError")
+            assert "was stopped for 3.0 s" in answer["error"]
+            assert "was not done" in answer["error"]
+        late = await place.client.thesis("TriggerLocalization", timeout=0.5)
+        assert "was not done" in late["error"]
+        assert (await place.client.ask("cameras/**"))[0][1]["next_result"] == 1
+        # there is time left
+        assert (await place.client.call("trigger", timeout=PATIENCE))["error"] == ""
+        assert place.server.hosts[PLAIN_NAME].results.following == 2
+
+
+@pytest.mark.real_time
+@pytest.mark.long
+async def test_command_behind_a_stopped_agent_is_not_done_when_it_goes_on() -> None:
+    pytest.importorskip("zenoh")
+    place = free_place()
+    key = Keys(FLEET).service(NAME, "trigger")
+    async with NumberedCamera() as box, partner("agent", place, box.url) as agent:
+        session = await asyncio.to_thread(zenoh_session, int(place.rpartition(":")[2]))
+
+        def ask(timeout: float) -> list[dict[str, Any]]:
+            payload = json.dumps({"timeout": timeout})
+            replies = session.get(key, payload=payload, timeout=PATIENCE)
+            return [json.loads(one.ok.payload.to_bytes()) for one in replies]
+
+        try:
+            await until(lambda: box.sessions)
+            assert (await asyncio.to_thread(ask, PATIENCE))[0]["error"] == ""
+            runs = box.runs
+            agent.signal(signal.SIGSTOP)
+            waiting = [asyncio.create_task(asyncio.to_thread(ask, 0.5)) for _ in range(5)]
+            patient = asyncio.create_task(asyncio.to_thread(ask, PATIENCE))
+            await asyncio.sleep(STOPPED)
+            agent.signal(signal.SIGCONT)
+            for (answer,) in await asyncio.gather(*waiting):
+                assert answer["kind"] == "TriggerTimeoutError"
+                assert "was stopped" in answer["error"]
+            ((answer,),) = await asyncio.gather(patient)
+            assert answer["error"] == ""
+            assert box.runs == runs + 1
+            await asyncio.sleep(_pulse.SETTLE + _pulse.GAP)
+            assert (await asyncio.to_thread(ask, 5.0))[0]["error"] == ""
+        finally:
+            await asyncio.to_thread(session.close)
