@@ -10,24 +10,27 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 
+from smartcam._argument_checks import a_number, an_integer, as_array, takes
+from smartcam._arguments import check_text, shown
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HoleFill: TypeAlias = Literal["left", "nearest", "farthest"]
-"""Which neighbour a hole takes its depth from."""
+"""The neighbour that a hole takes its depth from."""
 
 MILLIMETRE: Final = 1e-3
-"""Metres of a step of a depth map of 16 bits, unless another scale is said."""
+"""Metres for one step of a depth map of 16 bits, by default."""
 
-MOST_PASSES: Final = 16
+MAX_PASSES: Final = 16
 """Iterations, and pixels that holes are filled over: 8 times as many are still a few seconds."""
 
 SCENE: Final = 0.5
-"""Part of the pixels that change by more than an edge where the scene is another one."""
+"""Share of the pixels that must change by more than an edge for a new scene."""
 
 
+@takes(scale=a_number)
 def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.float32]:
     """Return a depth map as float32 metres, 0 where there is none.
 
@@ -44,8 +47,10 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
         FrameFormatError: another shape or type.
     """
     if not (scale > 0 and math.isfinite(scale)):
-        raise ConfigurationError(f"depth: scale: expected metres a step above 0, got {scale!r}")
-    given = np.asarray(depth)
+        raise ConfigurationError(
+            f"depth: scale: expected metres a step above 0, got {shown(scale)}"
+        )
+    given: NDArray[Any] = as_array(depth, "depth")
     if (
         given.ndim != 2
         or not given.size
@@ -79,11 +84,12 @@ class SpatialFilter:
         ConfigurationError: a number out of its range.
     """
 
+    @takes(alpha=a_number, delta=a_number, iterations=an_integer)
     def __init__(self, alpha: float = 0.5, delta: float = 0.02, iterations: int = 2) -> None:
         _check_average("SpatialFilter", alpha, delta)
-        if not 1 <= iterations <= MOST_PASSES:
+        if not 1 <= iterations <= MAX_PASSES:
             raise ConfigurationError(
-                f"SpatialFilter: iterations: expected 1 to {MOST_PASSES}, got {iterations!r}"
+                f"SpatialFilter: iterations: expected 1 to {MAX_PASSES}, got {shown(iterations)}"
             )
         self.alpha: float = alpha
         self.delta: float = delta
@@ -151,11 +157,12 @@ class TemporalFilter:
         ConfigurationError: a number out of its range.
     """
 
+    @takes(alpha=a_number, delta=a_number, persistence=an_integer)
     def __init__(self, alpha: float = 0.4, delta: float = 0.02, persistence: int = 3) -> None:
         _check_average("TemporalFilter", alpha, delta)
         if not 0 <= persistence < 255:
             raise ConfigurationError(
-                f"TemporalFilter: persistence: expected 0 to 254 maps, got {persistence!r}"
+                f"TemporalFilter: persistence: expected 0 to 254 maps, got {shown(persistence)}"
             )
         self.alpha: float = alpha
         self.delta: float = delta
@@ -198,6 +205,7 @@ class TemporalFilter:
         return new
 
 
+@takes(how=check_text, reach=an_integer, scale=a_number)
 def fill_holes(
     depth: NDArray[Any],
     how: HoleFill = "farthest",
@@ -223,10 +231,12 @@ def fill_holes(
     """
     if how not in get_args(HoleFill):
         raise ConfigurationError(
-            f"fill_holes: how: expected one of {get_args(HoleFill)}, got {how!r}"
+            f"fill_holes: how: expected one of {get_args(HoleFill)}, got {shown(how)}"
         )
-    if not 1 <= reach <= MOST_PASSES:
-        raise ConfigurationError(f"fill_holes: reach: expected 1 to {MOST_PASSES}, got {reach!r}")
+    if not 1 <= reach <= MAX_PASSES:
+        raise ConfigurationError(
+            f"fill_holes: reach: expected 1 to {MAX_PASSES}, got {shown(reach)}"
+        )
     filled = as_metres(depth, scale)
     for _ in range(reach):
         holes = filled == 0
@@ -265,6 +275,6 @@ def _widened(values: NDArray[Any], join: np.ufunc) -> NDArray[Any]:
 
 def _check_average(who: str, alpha: float, delta: float) -> None:
     if not 0 < alpha <= 1:
-        raise ConfigurationError(f"{who}: alpha: expected above 0, up to 1, got {alpha!r}")
+        raise ConfigurationError(f"{who}: alpha: expected above 0, up to 1, got {shown(alpha)}")
     if not (delta > 0 and math.isfinite(delta)):
-        raise ConfigurationError(f"{who}: delta: expected a step above 0, got {delta!r}")
+        raise ConfigurationError(f"{who}: delta: expected a step above 0, got {shown(delta)}")

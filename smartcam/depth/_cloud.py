@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-    from smartcam.calibration import Transform
+    from smartcam.geometry import Transform
 
 _NUMBERS = "fiu"
 """Kinds of numpy's numbers."""
@@ -60,11 +60,11 @@ class Cloud:
         return type(self), (self.points, self.colours, self.sigma)
 
     def __len__(self) -> int:
-        """How many points there are."""
+        """Return the number of points."""
         return len(self.points)
 
     def __repr__(self) -> str:
-        """Say how many there are, and with what."""
+        """Return the number of points as a text, with the names of their other values."""
         more = [name for name in ("colours", "sigma") if getattr(self, name) is not None]
         return f"<Cloud of {len(self):,} points{''.join(f', {name}' for name in more)}>"
 
@@ -132,7 +132,7 @@ class Cloud:
         return cls(np.concatenate(points), **columns)
 
     def transformed(self, pose: Transform) -> Self:
-        """Return it in the frame that a rigid motion leads to.
+        """Return the cloud in the frame that a rigid motion leads to.
 
         ``pose`` is a :class:`~smartcam.calibration.Transform`: ``T_robot_camera`` takes a cloud of
         the camera to the robot. Sigma stays: the points lie along other axes, as far off as before.
@@ -202,7 +202,7 @@ def _bytes(given: ArrayLike, what: str, shape: tuple[int | None, ...]) -> NDArra
 def _array(given: ArrayLike, what: str) -> NDArray[Any]:
     try:
         return np.asarray(given)
-    except (TypeError, ValueError) as exc:
+    except (TypeError, ValueError, ArithmeticError) as exc:
         raise ConfigurationError(f"{what}: expected an array, got {type(given).__name__}") from exc
 
 
@@ -216,7 +216,7 @@ def _picture(given: ArrayLike, size: tuple[int, ...]) -> NDArray[np.uint8]:
 
 
 def _inverse(given: ArrayLike) -> NDArray[np.float64]:
-    """Return what makes rays with z = 1 of pixels."""
+    """Return the inverse of a camera matrix, which turns pixels into rays with z = 1."""
     matrix = _array(given, "matrix")
     _shape(matrix, "matrix", (3, 3))
     if matrix.dtype.kind not in _NUMBERS or not np.isfinite(matrix).all():

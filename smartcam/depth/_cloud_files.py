@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
+import re
+import stat
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._files.store import replace_file
+from smartcam._argument_checks import of_class, or_none, takes
+from smartcam._arguments import check_flag, check_path, check_text, shown
+from smartcam._whole_files import replace_file
+from smartcam.calibration._inside import METRES
 from smartcam.depth import _pcd, _ply
 from smartcam.depth._cloud import Cloud
 from smartcam.depth._tables import BadTableError
 from smartcam.exceptions import (
-    CalibrationError,
     ConfigurationError,
     FrameFormatError,
     FrameSourceError,
 )
 
 if TYPE_CHECKING:
-    import os
     from collections.abc import Callable, Mapping
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
-MAX_BYTES: Final = 1 << 30
-"""Of a file that is read."""
+    from smartcam.calibration.formats import LengthUnit
+
+MAX_FILE_BYTES: Final = 1 << 30
+"""Bytes of a file that is read, at most."""
+
+MAX_HEAD: Final = 1 << 12
+"""Bytes of a file in which a comment says the unit."""
+
+UNIT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
+"""The comment with which :func:`save_cloud` says the unit."""
 
 COARSE: Final = 1e-3
-"""Metres that float32 may take from a coordinate that was written as a double."""
+"""Metres by which float32 may round a coordinate that was written as a double."""
 
 
 class _CloudFormat(NamedTuple):
@@ -40,40 +52,62 @@ FORMATS: Final = {
     ".ply": _CloudFormat(_ply.read, _ply.write),
     ".pcd": _CloudFormat(_pcd.read, _pcd.write),
 }
-"""By suffix, in lower case."""
+"""The file formats by suffix, in lower case."""
 
 
-def load_cloud(path: str | os.PathLike[str]) -> Cloud:
+@takes(unit=or_none(check_text))
+def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) -> Cloud:
     """Return the cloud of a ``.ply`` or a ``.pcd`` file, up to 1 GiB.
+
+    Neither format has a unit of length, and programs write metres and millimetres. A file of
+    :func:`save_cloud` says in a comment that it is in metres; of any other file ``unit`` has to
+    tell it: ``m``, ``cm``, ``mm`` or ``inch``.
 
     PLY is read as text and as bytes of either order, PCD as text, as bytes and compressed. Points
     with a coordinate that is not finite are no points, as in organised files, and are left out.
-    Colours are ``red``, ``green``, ``blue`` or PCL's ``rgb``; ``sigma`` is metres. Properties of
-    other names are skipped, and so is a PCD's viewpoint. It takes its time: beside an event loop
-    it belongs into a thread.
+    Colours are ``red``, ``green``, ``blue`` or PCL's ``rgb``; ``sigma`` is in the same unit.
+    Properties of other names are skipped, and so is a PCD's viewpoint. It takes its time: beside an
+    event loop it belongs into a thread.
 
     Raises:
-        ConfigurationError: another suffix.
+        ConfigurationError: another suffix, or no such unit.
         FrameSourceError: it cannot be read.
-        FrameFormatError: its bytes are no such file, or it has no x, y and z, or its coordinates
-            are so large that float32 would take a millimetre from them.
+        FrameFormatError: nothing says the unit, or its bytes are no such file, or it has no x, y
+            and z, or its coordinates are so large that float32 would take a millimetre from them.
     """
-    path = Path(path)
+    path = check_path(path, "path", "cloud")
     form = _format(path)
+    if unit is not None and unit not in METRES:
+        raise ConfigurationError(f"unit: expected one of {', '.join(METRES)}, got {shown(unit)}")
     try:
         with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
+            told = os.fstat(stream.fileno())  # what is asked for is reserved at once
+            regular = stat.S_ISREG(told.st_mode) and told.st_size <= MAX_FILE_BYTES
+            data = stream.read(told.st_size if regular else MAX_FILE_BYTES + 1)
     except OSError as exc:
         reason = exc.strerror or exc
         raise FrameSourceError(f"{path}: cannot be read: {reason}", source=str(path)) from exc
     try:
-        if len(data) > MAX_BYTES:
-            raise BadTableError(f"a file of {MAX_BYTES:,} bytes at most", "more")
-        return _cloud(form.read(data))
+        if len(data) > MAX_FILE_BYTES:
+            raise BadTableError(f"a file of {MAX_FILE_BYTES:,} bytes at most", "more")
+        return _cloud(form.read(data), METRES[unit or _said_unit(data)])
     except BadTableError as exc:
         raise FrameFormatError(f"{path}: {exc}", source=str(path)) from exc
 
 
+def _said_unit(data: bytes) -> str:
+    """Return the unit that a comment of the header says; else BadTableError."""
+    found = UNIT.search(data[:MAX_HEAD])
+    if found is None:
+        raise BadTableError(
+            'a unit, which neither the file nor its format says: give unit="m" or unit="mm", or '
+            "--unit on the command line",
+            "none",
+        )
+    return found[1].decode()
+
+
+@takes(cloud=of_class("Cloud"), text=check_flag)
 def save_cloud(path: str | os.PathLike[str], cloud: Cloud, *, text: bool = False) -> None:
     """Write a cloud as ``.ply`` or ``.pcd``, in bytes (little endian) or as text.
 
@@ -82,12 +116,12 @@ def save_cloud(path: str | os.PathLike[str], cloud: Cloud, *, text: bool = False
     Raises:
         ConfigurationError: another suffix, or it cannot be written.
     """
-    path = Path(path)
+    path = check_path(path, "path", "cloud")
     data = _format(path).write(cloud, text)
     try:
         replace_file(path, data)
-    except CalibrationError as exc:  # the text says which file, and why
-        raise ConfigurationError(str(exc)) from exc
+    except OSError as exc:
+        raise ConfigurationError(f"{path}: cannot be written: {exc.strerror or exc}") from exc
 
 
 def _format(path: Path) -> _CloudFormat:
@@ -99,8 +133,11 @@ def _format(path: Path) -> _CloudFormat:
         ) from None
 
 
-def _cloud(columns: Mapping[str, NDArray[Any]]) -> Cloud:
-    """Return a cloud of a file's columns; else BadTableError."""
+def _cloud(columns: Mapping[str, NDArray[Any]], metre: float) -> Cloud:
+    """Return a cloud of a file's columns; else BadTableError.
+
+    ``metre``: metres of the file's unit.
+    """
     missing = [name for name in "xyz" if name not in columns]
     if missing:
         raise BadTableError("x, y and z", f"no {', '.join(missing)}, but {', '.join(columns)}")
@@ -110,7 +147,7 @@ def _cloud(columns: Mapping[str, NDArray[Any]]) -> Cloud:
         there = there & np.isfinite(column)
     points = np.empty((int(there.sum()), 3), np.float32)
     for place, column in enumerate(coordinates):
-        found = column[there]
+        found = column[there] if metre == 1.0 else column[there] * metre
         with np.errstate(over="ignore"):
             points[:, place] = found
         if found.dtype == np.float64 and found.size and _loses(found, points[:, place]):
@@ -119,7 +156,9 @@ def _cloud(columns: Mapping[str, NDArray[Any]]) -> Cloud:
                 f"{'xyz'[place]} up to {np.abs(found).max():g} m: move the origin",
             )
     try:
-        return Cloud(points, _colours(columns, there), _sigma(columns, there))
+        sigma = _sigma(columns, there)
+        scaled = sigma if sigma is None or metre == 1.0 else (metre * sigma).astype(sigma.dtype)
+        return Cloud(points, _colours(columns, there), scaled)
     except ConfigurationError as exc:
         raise BadTableError("a cloud", str(exc)) from exc
 

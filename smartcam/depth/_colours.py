@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._argument_checks import a_number, an_integer, as_array, each, takes
+from smartcam._arguments import check_flag, shown
+from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError, FrameFormatError
-from smartcam.frames._frame import Frame
-from smartcam.frames._pictures import converted
+from smartcam.frames import Frame
+from smartcam.frames._inside import converted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,8 +22,8 @@ if TYPE_CHECKING:
 MOST: Final = {"hue": 179, "saturation": 255, "value": 255}
 """Largest number of each channel."""
 
-HUES: Final = 180
-"""Of the circle."""
+HUE_UNITS: Final = 180
+"""Hues on the circle of colours in OpenCV's units, two degrees each."""
 
 DULL: Final = 40
 """Saturation or value below which a hue is nothing but noise."""
@@ -53,17 +55,17 @@ class ColourRange:
             try:
                 low, high = given
                 fits = all(type(one) is int and 0 <= one <= most for one in (low, high))
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, ArithmeticError):
                 low, high, fits = 0, 0, False
             if not fits or (low > high and name != "hue"):
                 raise ConfigurationError(
                     f"ColourRange: {name}: expected (from, to) of whole numbers 0 to {most}, "
-                    f"got {given!r}"
+                    f"got {shown(given)}"
                 )
             object.__setattr__(self, name, (low, high))  # of JSON it is a list
 
     def mask(self, picture: Frame | NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which pixels have such a colour, (H, W).
+        """Return the mask of the pixels with a colour in the range, (H, W).
 
         Args:
             picture: a frame with colours (of more than 8 bits the upper 8 count), or (H, W, 3) of
@@ -76,7 +78,7 @@ class ColourRange:
         return self.mask_hsv(hsv(picture))
 
     def mask_hsv(self, picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return which pixels of an HSV picture, (H, W, 3) of uint8, have such a colour, (H, W)."""
+        """Return the mask (H, W) of the pixels in the range, from HSV (H, W, 3) of uint8."""
         low, high = self.hue
         if low <= high:
             found = self._between(picture, low, high)
@@ -97,11 +99,11 @@ class ColourRange:
         Args:
             picture: as :meth:`mask` takes it.
             x: column of the pixel.
-            y: its row.
+            y: row of the pixel.
             radius: pixels to each side that are looked at.
-            margin: by how much the range is wider to each side, hue by half of it. The tenth of
-                the pixels that is farthest out does not count. Of greys and blacks every hue is
-                taken, since they have none, and of blacks every saturation.
+            margin: units by which the range is made wider to each side, by half of them for the
+                hue. The tenth of the pixels that is farthest out does not count. Of greys and
+                blacks every hue is taken, since they have none, and of blacks every saturation.
 
         Raises:
             ConfigurationError: a pixel outside of the picture, or a number out of its range.
@@ -111,7 +113,7 @@ class ColourRange:
         if not (0 <= radius <= 1000 and 0 <= margin <= 255):
             raise ConfigurationError(
                 f"ColourRange: expected a radius of 0 to 1000 and a margin of 0 to 255, got "
-                f"{radius!r} and {margin!r}"
+                f"{shown(radius)} and {shown(margin)}"
             )
         return around_hsv(hsv(picture), x, y, radius, margin)
 
@@ -151,13 +153,13 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
     if np.median(saturations) < DULL:
         return ColourRange(saturation=(0, saturation[1]), value=value)
     # the hues as seen from their middle, so that red is no two colours
-    middle = round(np.angle(np.exp(2j * np.pi * hues / HUES).sum()) * HUES / (2 * np.pi))
-    off = (hues - middle + HUES // 2) % HUES - HUES // 2
+    middle = round(np.angle(np.exp(2j * np.pi * hues / HUE_UNITS).sum()) * HUE_UNITS / (2 * np.pi))
+    off = (hues - middle + HUE_UNITS // 2) % HUE_UNITS - HUE_UNITS // 2
     low, high = (round(float(one)) for one in np.percentile(off, (5, 95)))
     low, high = low - (margin + 1) // 2, high + (margin + 1) // 2
     hue = (0, MOST["hue"])
-    if high - low < HUES - 1:
-        hue = ((middle + low) % HUES, (middle + high) % HUES)
+    if high - low < HUE_UNITS - 1:
+        hue = ((middle + low) % HUE_UNITS, (middle + high) % HUE_UNITS)
     return ColourRange(hue=hue, saturation=saturation, value=value)
 
 
@@ -174,11 +176,12 @@ class ColourRegion:
         centre: x, y of the middle of its pixels.
         area: pixels.
         sides: the longer and the shorter side of the smallest rectangle around it, pixels.
-        corners: of this rectangle, (4, 2).
-        orientation: angle of its longer axis, radians, above -pi/2 up to pi/2, from x (right)
-            towards y (down): that about which its pixels lie closest, which noise at the rim
-            changes less than the rectangle. Of squares and circles it means nothing.
-        mask: its pixels, (H, W) of bool.
+        corners: corners of this rectangle, (4, 2).
+        orientation: angle of the region's longer axis, radians, above -pi/2 up to pi/2, from x
+            (right) towards y (down). It is the axis about which the pixels lie closest, which
+            noise at the rim changes less than the rectangle. For squares and circles it means
+            nothing.
+        mask: pixels of the region, (H, W) of bool.
     """
 
     centre: tuple[float, float]
@@ -199,6 +202,13 @@ class ColourRegion:
         return self.area / (self.sides[0] * self.sides[1])
 
 
+@takes(
+    area=each(a_number, 2),
+    ratio=each(a_number, 2),
+    fullness=a_number,
+    whole=check_flag,
+    most=an_integer,
+)
 def find_regions(
     mask: NDArray[np.bool_],
     *,
@@ -228,7 +238,7 @@ def find_regions(
             raise ConfigurationError(
                 f"find_regions: {name}: expected (from, to), got {low}, {high}"
             )
-    given = np.asarray(mask)
+    given = as_array(mask, "mask")
     if given.dtype != bool or given.ndim != 2 or not given.size:
         raise FrameFormatError(
             f"find_regions: expected a mask (H, W) of bool, got {given.shape} of {given.dtype}"

@@ -1,4 +1,4 @@
-"""What is left of a cloud: by place, by how many neighbours, by one point a voxel."""
+"""Filter clouds: by place, by number of neighbours, by one point a voxel."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._argument_checks import a_number, numbers, of_class, takes
+from smartcam._arguments import check_text, shown
+from smartcam._extras import load
 from smartcam.depth._cloud import Cloud
 from smartcam.exceptions import ConfigurationError
 
@@ -21,9 +23,10 @@ AXES: Final = "xyz"
 ROWS: Final = 1 << 17
 """Points whose neighbours are looked for at a time: what they need is memory."""
 
-MOST_NEIGHBOURS: Final = 1000
+MAX_NEIGHBOURS: Final = 1000
 
 
+@takes(cloud=of_class("Cloud"), axis=check_text, low=a_number, high=a_number)
 def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = math.inf) -> Cloud:
     """Return the points with ``low <= coordinate <= high``, in metres.
 
@@ -31,14 +34,17 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
         ConfigurationError: the axis is none of x, y, z, or the range is none.
     """
     if axis not in AXES or len(axis) != 1:
-        raise ConfigurationError(f"pass_through: expected x, y or z, got {axis!r}")
+        raise ConfigurationError(f"pass_through: expected x, y or z, got {shown(axis)}")
     if not low <= high:
-        raise ConfigurationError(f"pass_through: expected low <= high, got {low!r} and {high!r}")
+        raise ConfigurationError(
+            f"pass_through: expected low <= high, got {shown(low)} and {shown(high)}"
+        )
     along = cloud.points[:, AXES.index(axis)]
     ends = _as_points_are((low, high))
     return cloud.taken((along >= ends[0]) & (along <= ends[1]))
 
 
+@takes(cloud=of_class("Cloud"), low=numbers, high=numbers)
 def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud:
     """Return the points in a box along the axes between two corners (3,), metres, both included.
 
@@ -59,6 +65,7 @@ def _as_points_are(ends: ArrayLike) -> NDArray[np.float32]:
         return np.asarray(ends, np.float64).astype(np.float32)
 
 
+@takes(cloud=of_class("Cloud"), ratio=a_number)
 def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float = 2.0) -> Cloud:
     """Return the points that are about as near to others as most are.
 
@@ -73,7 +80,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
     _check_count(neighbours, "remove_statistical_outliers")
     if not ratio >= 0:
         raise ConfigurationError(
-            f"remove_statistical_outliers: ratio: expected 0 or more, got {ratio!r}"
+            f"remove_statistical_outliers: ratio: expected 0 or more, got {shown(ratio)}"
         )
     if not len(cloud):
         return cloud
@@ -90,6 +97,7 @@ def remove_statistical_outliers(cloud: Cloud, neighbours: int = 20, ratio: float
     return cloud.taken(means <= means.mean() + ratio * means.std(ddof=1 if len(means) > 1 else 0))
 
 
+@takes(cloud=of_class("Cloud"), radius=a_number)
 def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> Cloud:
     """Return the points with so many others, or more, within a radius in metres.
 
@@ -110,6 +118,7 @@ def remove_radius_outliers(cloud: Cloud, radius: float, neighbours: int = 5) -> 
     return cloud.taken(kept)
 
 
+@takes(cloud=of_class("Cloud"), size=a_number)
 def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     """Return one point a voxel: the mean of the points in it, with their mean colour.
 
@@ -171,12 +180,12 @@ def _parts(count: int) -> Iterator[slice]:
 
 
 def _check_count(value: int, what: str) -> None:
-    if not isinstance(value, int) or not 1 <= value <= MOST_NEIGHBOURS:
+    if not isinstance(value, int) or not 1 <= value <= MAX_NEIGHBOURS:
         raise ConfigurationError(
-            f"{what}: neighbours: expected 1 to {MOST_NEIGHBOURS}, got {value!r}"
+            f"{what}: neighbours: expected 1 to {MAX_NEIGHBOURS}, got {shown(value)}"
         )
 
 
 def _check_length(value: float, what: str) -> None:
     if not 0 < value < math.inf:
-        raise ConfigurationError(f"{what}: expected metres above 0, got {value!r}")
+        raise ConfigurationError(f"{what}: expected metres above 0, got {shown(value)}")

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from smartcam._argument_checks import a_number, an_integer, or_none, takes
+from smartcam._arguments import check_text, shown
+from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
-from smartcam.calibration._optional_imports import load
 from smartcam.depth._subpixel import refined
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
@@ -22,17 +24,17 @@ if TYPE_CHECKING:
     Value = int | str
 
 SUBPIXELS: Final = 16
-"""OpenCV's steps of a disparity in a pixel."""
+"""Steps in which OpenCV counts a disparity of one pixel."""
 
 WINDOWS: Final = (0, 5, 7, 9, 11, 13, 15)
-"""Sides of the window that a disparity is refined in, pixels; 0: none is."""
+"""Sides of the window in which disparities are refined, pixels; 0: no refinement."""
 
 MOST: Final = 4096
-"""Disparities that are searched, at most."""
+"""Disparities that are searched at most, pixels."""
 
 
 class Disparity(NamedTuple):
-    """What a :class:`StereoMatcher` finds.
+    """The disparities that a :class:`StereoMatcher` finds.
 
     Attributes:
         pixels: (H, W), float32: a point of the left picture is so far further left in the right
@@ -96,7 +98,7 @@ _BOTH: Final[dict[str, _WholeParameter | _WordParameter]] = {
 _PARAMETERS: Final[dict[str, dict[str, _WholeParameter | _WordParameter]]] = {
     "sgbm": {
         **_BOTH,
-        "block_size": _WholeParameter(5, 1, 51, 2),
+        "block_size": _WholeParameter(3, 1, 51, 2),
         "P1": _WholeParameter(0, 0, 1_000_000),
         "P2": _WholeParameter(0, 0, 1_000_000),
         "uniqueness_ratio": _WholeParameter(5, 0, 100),
@@ -147,6 +149,7 @@ class StereoMatcher:
         MissingExtraError: OpenCV (extra ``depth``) is not installed.
     """
 
+    @takes(algorithm=check_text, left_right=or_none(a_number), refine=an_integer)
     def __init__(
         self,
         algorithm: Literal["sgbm", "bm"] = "sgbm",
@@ -158,7 +161,7 @@ class StereoMatcher:
     ) -> None:
         if algorithm not in _PARAMETERS:
             raise ConfigurationError(
-                f"StereoMatcher: expected {' or '.join(_PARAMETERS)}, got {algorithm!r}"
+                f"StereoMatcher: expected {' or '.join(_PARAMETERS)}, got {shown(algorithm)}"
             )
         self.algorithm = algorithm
         self.parameters: Mapping[str, Value] = _merged(algorithm, parameters)
@@ -190,7 +193,7 @@ class StereoMatcher:
 
         Args:
             left: (H, W) or, red first, (H, W, 3); uint8.
-            right: the same size.
+            right: picture of the same shape and type as ``left``.
 
         Raises:
             FrameFormatError: other shapes or types, or the pictures are too small.
@@ -250,7 +253,7 @@ def _merged(algorithm: str, said: Mapping[str, Value]) -> dict[str, Value]:
     for name, value in said.items():
         if name not in known:
             raise ConfigurationError(
-                f"StereoMatcher {algorithm}: no parameter {name!r}; there are "
+                f"StereoMatcher {algorithm}: no parameter {shown(name)}; there are "
                 f"{', '.join(known)}{did_you_mean(name, known)}"
             )
         if known[name].check(value) is None:
@@ -266,7 +269,7 @@ def _merged(algorithm: str, said: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def _wrong(what: str, expected: str, got: object) -> ConfigurationError:
-    return ConfigurationError(f"StereoMatcher: {what}: expected {expected}, got {got!r}")
+    return ConfigurationError(f"StereoMatcher: {what}: expected {expected}, got {shown(got)}")
 
 
 def _grey(picture: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
@@ -307,7 +310,7 @@ def _wls(wls: tuple[float, float]) -> Callable[..., Any]:
         )
     try:
         smoothness, edges = (float(one) for one in wls)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, ArithmeticError):
         smoothness = edges = -1.0
     if not (0 < smoothness < 1e9 and 0 < edges < 1e3):
         raise _wrong("wls", "lambda and sigma above 0, such as (8000, 1.5)", wls)

@@ -7,28 +7,28 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam.calibration._codes import Code
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._stereo.rectification import rectify
-from smartcam.calibration.formats._cameras import MAX_FILE, CameraChain, parse_camera_info
+from smartcam._argument_checks import takes
+from smartcam._arguments import check_path
+from smartcam._extras import load
+from smartcam.calibration._inside import MAX_FILE, parse_camera_info, rectify
+from smartcam.calibration.formats import CameraChain
 from smartcam.exceptions import CalibrationError, ConfigurationError, FrameFormatError
+from smartcam.geometry import CameraModel, Code, Transform
 
 if TYPE_CHECKING:
     import os
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._stereo.calibration import StereoCalibration
+    from smartcam.calibration import StereoCalibration
 
 SIDES: Final = ("left", "right")
 
 SAME_SHAPE: Final = 0.01
-"""Part by which a picture's width to height may differ from the calibrated one's."""
+"""Share by which a picture's ratio of width to height may differ from the calibrated one."""
 
-ROUNDED: Final = 1e-3
-"""By which an element of a rotation may be off: ROS writes five digits."""
+MAX_ROTATION_ERROR: Final = 1e-3
+"""Largest error of an element of a rotation: ROS writes five digits."""
 
 REMAPPED: Final = (1 / 32) ** 2 / 12
 """Variance of a disparity, pixels^2: OpenCV's remap goes in steps of 1/32.
@@ -37,9 +37,10 @@ It does so in both pictures, of which a window averages about a half.
 """
 
 SMALLER: Final = 1.25
-"""A picture that is made smaller by more is averaged first: remap looks at four pixels."""
+"""Factor of shrinking above which a picture is averaged first: remap reads four pixels only."""
 
 
+@takes(left=check_path, right=check_path)
 def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str]) -> CameraChain:
     """Return the pair of two ``camera_info`` files, as ROS' ``camera_calibration`` writes them.
 
@@ -77,7 +78,7 @@ def _rotation(matrix: NDArray[np.float64], path: str | os.PathLike[str]) -> NDAr
     """Return the rotation that a matrix of five digits was."""
     u, _, v = np.linalg.svd(matrix)
     turn = np.asarray(u @ v)
-    if np.linalg.det(turn) < 0 or np.abs(turn - matrix).max() > ROUNDED:
+    if np.linalg.det(turn) < 0 or np.abs(turn - matrix).max() > MAX_ROTATION_ERROR:
         raise CalibrationError(
             f"{path}: rectification_matrix: expected a rotation, got {matrix.tolist()}",
             code=Code.NOT_RIGID,
@@ -115,7 +116,7 @@ def scaled(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
 
 
 class CalibratedPair:
-    """What a calibration says of a pair, for pictures of one size.
+    """A calibration of a pair, worked out for pictures of one size.
 
     Everything here blocks; a thread does it.
 
@@ -150,6 +151,7 @@ class CalibratedPair:
         self._focal_sigma = focal_sigma * wanted[0] / lenses[0].size[0]
         self._spread = _spread(found.rotations[1], covariance)
         self._maps, self._masks = found.maps, found.masks
+        self.rotation: NDArray[np.float64] = found.rotations[0]
         self._fixed: list[tuple[tuple[int, int], Any]] = [((0, 0), None)] * 2
 
     def rectified(self, picture: NDArray[Any], side: int, source: str) -> NDArray[Any]:

@@ -1,4 +1,4 @@
-"""What two cameras' clocks do against each other."""
+"""Estimate the offset and drift between two cameras' clocks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.frames._clocks import LEAST_SPAN, MOST_DRIFT
+from smartcam.frames._inside import MAX_DRIFT, MIN_DRIFT_DURATION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from smartcam.frames import ClockStatistics, Frame
 
 KEPT: Final = 600
-"""Pairs that are remembered: 20 s of 30 a second."""
+"""Pairs that are remembered: 20 s at 30 pairs a second."""
 
 RECENT: Final = 30
-"""Pairs of which the skew is told."""
+"""Pairs over which the skew is measured."""
 
 LEAST: Final = 30
-"""Pairs that tell a rate."""
+"""Pairs needed to know a rate."""
 
 
 class _SeenPair(NamedTuple):
@@ -65,12 +65,12 @@ class PairClock:
         if rates is None:
             return None, ""
         drift = rates[1] / rates[0] - 1
-        return (drift, "frames") if abs(drift) <= MOST_DRIFT else (None, "")
+        return (drift, "frames") if abs(drift) <= MAX_DRIFT else (None, "")
 
     def _rates(self) -> tuple[float, float] | None:
         """Return both cameras' frames a second of our clock."""
         seen = list(self._seen)
-        if len(seen) < LEAST or seen[-1].captured[0] - seen[0].captured[0] < LEAST_SPAN:
+        if len(seen) < LEAST or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None
         found = []
         for side in (0, 1):

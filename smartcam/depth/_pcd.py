@@ -37,13 +37,16 @@ TYPES: Final = {
     **{("U", size): f"<u{size}" for size in (1, 2, 4, 8)},
     **{("F", size): f"<f{size}" for size in (4, 8)},
 }
-"""numpy's of a TYPE and a SIZE."""
+"""numpy's type for each TYPE and SIZE."""
+
+MAX_UNPACKED: Final = 1 << 30
+"""Bytes that compressed points may unpack to, as many as an uncompressed file has."""
 
 COLOURS: Final = ("rgb", "rgba")
 """Fields of 4 bytes that are a colour, blue in the lowest byte; as a float its bits are meant."""
 
 PADDING: Final = "_"
-"""Name of what nobody reads; it may come more than once."""
+"""Name of fields for padding, which are not read and may come more than once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +142,8 @@ def _binary(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
     """Return columns that come one after the other, and compressed."""
     size = head.points * _row(head).itemsize
+    if size > MAX_UNPACKED:  # LZF's 3 bytes can stand for 264
+        raise BadTableError(f"points that unpack to {MAX_UNPACKED} bytes at most", f"{size}")
     if len(data) < head.start + 8:
         raise BadTableError("two sizes of 4 bytes", f"{len(data) - head.start} bytes")
     packed, whole = struct.unpack_from("<II", data, head.start)
@@ -158,7 +163,7 @@ def _compressed(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 
 
 def unpacked(data: bytes, size: int) -> bytes:
-    """Return what LZF packed, which must be of a size; else BadTableError."""
+    """Return LZF-packed data unpacked; raise BadTableError unless that has the size given."""
     out, place, end = bytearray(), 0, len(data)
     while place < end and len(out) <= size:
         control, place = data[place], place + 1
@@ -194,7 +199,7 @@ def _text(data: bytes, head: _PcdHeader) -> dict[str, NDArray[Any]]:
 
 
 READERS: Final = {"ascii": _text, "binary": _binary, "binary_compressed": _compressed}
-"""By DATA."""
+"""The readers of points by the word behind DATA."""
 
 KNOWN: Final = (
     *("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT"),
@@ -215,6 +220,7 @@ def write(cloud: Cloud, text: bool) -> bytes:
     kinds = ["F" if column.dtype.kind == "f" else "U" for column in columns.values()]
     head = "\n".join(
         [
+            "# unit m",
             "VERSION 0.7",
             f"FIELDS {' '.join(columns)}",
             f"SIZE {' '.join(['4'] * len(columns))}",

@@ -53,11 +53,11 @@ ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": 
 
 @dataclass(slots=True)
 class _PlyElement:
-    """What a header says of rows of one kind."""
+    """A header's description of rows of one kind."""
 
     name: str
     count: int
-    properties: list[tuple[str, str]] = field(default_factory=list)  # name and numpy's type
+    properties: dict[str, str] = field(default_factory=dict)  # numpy's types by name
     lists: bool = False  # whether its rows are of any length
 
     def row(self, order: str) -> np.dtype[Any]:
@@ -66,7 +66,7 @@ class _PlyElement:
             raise BadTableError(
                 f"rows of numbers for {self.name}", "lists" if self.lists else "none"
             )
-        row = np.dtype([(name, (order or "<") + kind) for name, kind in self.properties])
+        row = np.dtype([(name, (order or "<") + kind) for name, kind in self.properties.items()])
         check_row(row)
         return row
 
@@ -80,8 +80,8 @@ def read(data: bytes) -> dict[str, NDArray[Any]]:
         for one in before:
             start += one.count * one.row(order).itemsize if one.count else 0
         rows = from_bytes(data, start, vertex.count, row)
-        return {name: rows[name].astype(kind) for name, kind in vertex.properties}
-    types = [np.dtype(kind) for _, kind in vertex.properties]
+        return {name: rows[name].astype(kind) for name, kind in vertex.properties.items()}
+    types = [np.dtype(kind) for kind in vertex.properties.values()]
     columns = from_text(data, start, sum(one.count for one in before), vertex.count, types)
     return dict(zip(row.names or (), columns, strict=True))
 
@@ -116,14 +116,13 @@ def _header(data: bytes) -> tuple[str, list[_PlyElement], int]:
 
 
 def _add(element: _PlyElement, name: str, kind: str) -> None:
-    names = [one for one, _ in element.properties]
-    if name in names or len(names) >= MAX_FIELDS:
+    if name in element.properties or len(element.properties) >= MAX_FIELDS:
         raise BadTableError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
-    element.properties.append((name, kind))
+    element.properties[name] = kind
 
 
 def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:
-    """Return what comes before the vertices, and them."""
+    """Return the elements before the vertices, and the element of the vertices."""
     for place, one in enumerate(elements):
         if one.name == "vertex":
             return elements[:place], one
@@ -145,6 +144,7 @@ def write(cloud: Cloud, text: bool) -> bytes:
         [
             "ply",
             f"format {'ascii' if text else 'binary_little_endian'} 1.0",
+            "comment unit m",
             f"element vertex {len(cloud)}",
             *(f"property {kind} {name}" for name, kind in names.items()),
             "end_header\n",

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
+from smartcam._argument_checks import a_number, takes
+from smartcam._arguments import shown
 from smartcam.depth._cleaning import MILLIMETRE, as_metres
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
@@ -30,7 +32,7 @@ that each pixel has for itself; smooth noise adds next to nothing to it."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegionDepth:
-    """How far a region is.
+    """The depth of a region, and its errors.
 
     Attributes:
         median: metres.
@@ -48,6 +50,7 @@ class RegionDepth:
     pixels: int
 
 
+@takes(scale=a_number, shared=a_number)
 def region_depth(
     depth: NDArray[Any],
     region: DepthArea | None = None,
@@ -72,7 +75,9 @@ def region_depth(
         FrameFormatError: nothing there has a depth, or it is no map of depth.
     """
     if not (shared >= 1 and math.isfinite(shared)):
-        raise ConfigurationError(f"region_depth: shared: expected 1 or more pixels, got {shared!r}")
+        raise ConfigurationError(
+            f"region_depth: shared: expected 1 or more pixels, got {shown(shared)}"
+        )
     metres = as_metres(depth, scale)
     inside = metres[_mask(region, metres.shape)]
     there = inside[inside > 0].astype(float)
@@ -165,12 +170,12 @@ def _mask(region: DepthArea | None, shape: tuple[int, ...]) -> NDArray[np.bool_]
             return _polygon(given.astype(float), shape)
     raise ConfigurationError(
         "region: expected a box (x, y, width, height) of whole pixels, a polygon (N, 2) or a mask "
-        f"of bool {shape}, got {_shown(region)}"
+        f"of bool {shape}, got {shown(region)}"
     )
 
 
 def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return which pixels' middles lie in a polygon: a ray from there meets its sides odd times."""
+    """Return the mask of the pixels whose middles lie in a polygon, by the even-odd rule."""
     columns = np.arange(shape[1], dtype=float)
     rows = np.arange(shape[0], dtype=float)[:, None]
     inside = np.zeros(shape, bool)
@@ -181,8 +186,3 @@ def _polygon(corners: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np
         met = x0 + (rows - y0) * (x1 - x0) / (y1 - y0)
         inside ^= crossed & (met <= columns)
     return inside
-
-
-def _shown(region: object) -> str:
-    text = repr(region)
-    return text if len(text) <= 80 else f"{text[:80]}..."

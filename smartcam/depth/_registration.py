@@ -1,19 +1,20 @@
-"""Where one cloud lies in another: ICP by small-gicp, with what it is worth."""
+"""Register one cloud in another: ICP by small-gicp, with its uncertainty."""
 
 from __future__ import annotations
 
-import importlib
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration import Transform
-from smartcam.calibration._optional_imports import load
+from smartcam._argument_checks import a_number, of_class, or_none, takes
+from smartcam._arguments import check_text, shown
+from smartcam._extras import load
 from smartcam.depth._filters import voxel_grid
 from smartcam.depth._surface import open_directions, planes_of, slopes
-from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam.exceptions import ConfigurationError
+from smartcam.geometry import Transform
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -23,30 +24,32 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 METHODS: Final = {"gicp": "GICP", "icp": "ICP", "plane": "PLANE_ICP"}
-"""What small-gicp calls each."""
+"""small-gicp's name of each method."""
 
 NEIGHBOURS: Final = 20
 """Points to which the plane about each is fitted."""
 
-MOST_STEPS: Final = 60
+MAX_STEPS: Final = 60
 MORE_STEPS: Final = 10
-"""What they may move a cloud after the others; they may well go to and fro between neighbours."""
+"""Steps in which the cloud still moves, after the others: it may alternate between neighbours."""
 
 TURN_STEP: Final = 1e-5
 SHIFT_STEP: Final = 1e-4
 """Steps that count as none: radians, and of ``max_distance``."""
 
-NEAR: Final = 5.0
-"""Of ``max_distance``: what is farther from the target at the beginning takes no part, since
-small-gicp looks very long for the neighbours of what is far away."""
+MAX_REACH_FACTOR: Final = 5.0
+"""Times ``max_distance`` beyond which points take no part, measured at the beginning.
 
-RESTLESS: Final = 1e-3
-"""Of ``max_distance``: what :data:`MORE_STEPS` move the points by, where the steps do not end."""
+small-gicp takes very long to find the neighbours of points that are far away.
+"""
+
+MAX_REST_SHARE: Final = 1e-3
+"""Share of ``max_distance``: a fit counts as ended if :data:`MORE_STEPS` move it by less."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Registration:
-    """Where the source lies in the target.
+    """The pose of the source in the target.
 
     Look at ``converged`` before the pose is used: ``reason`` says what speaks against it.
 
@@ -81,7 +84,7 @@ class Registration:
 
 
 class _Neighbours(NamedTuple):
-    """What lies beside what, in target coordinates less the target's centre."""
+    """The matched points, in target coordinates less the target's centre."""
 
     moved: Array  # (M, 3) of the source
     nearest: NDArray[np.intp]  # (M,) which one of the target
@@ -89,6 +92,14 @@ class _Neighbours(NamedTuple):
     arms: Array  # (M, 3) of the source, turned, from its origin
 
 
+@takes(
+    source=of_class("Cloud"),
+    target=of_class("Cloud"),
+    method=check_text,
+    voxel=or_none(a_number),
+    max_distance=a_number,
+    min_overlap=a_number,
+)
 def register(
     source: Cloud,
     target: Cloud,
@@ -99,7 +110,7 @@ def register(
     initial: Transform | None = None,
     min_overlap: float = 0.3,
 ) -> Registration:
-    """Return where a cloud lies in another.
+    """Return the pose of a cloud in another cloud.
 
     It finds the pose that is nearest to ``initial``, which should be off by less than
     ``max_distance``; what is off by five times as much takes no part. It holds Python's lock all
@@ -136,7 +147,9 @@ def register(
         clouds.append(thin.points.astype(np.float64))
     points, goals = clouds
     tree = load("scipy.spatial").cKDTree(goals)
-    distances, _ = tree.query(begin.apply(points), distance_upper_bound=NEAR * max_distance)
+    distances, _ = tree.query(
+        begin.apply(points), distance_upper_bound=MAX_REACH_FACTOR * max_distance
+    )
     near = points[np.isfinite(distances)]
     pose, ended = begin, True
     if len(near) >= NEIGHBOURS:
@@ -147,27 +160,22 @@ def register(
 
 def _check(method: str, max_distance: float, min_overlap: float) -> None:
     if method not in METHODS:
-        raise ConfigurationError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+        raise ConfigurationError(
+            f"method: expected one of {', '.join(METHODS)}, got {shown(method)}"
+        )
     if not 0 < max_distance < math.inf:
-        raise ConfigurationError(f"max_distance: expected metres above 0, got {max_distance!r}")
+        raise ConfigurationError(
+            f"max_distance: expected metres above 0, got {shown(max_distance)}"
+        )
     if not 0 <= min_overlap <= 1:
-        raise ConfigurationError(f"min_overlap: expected 0 to 1, got {min_overlap!r}")
-
-
-def _small_gicp() -> Any:
-    try:
-        return importlib.import_module("small_gicp")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'registration needs small-gicp: pip install "smartcam[depth]"', extra="depth"
-        ) from exc
+        raise ConfigurationError(f"min_overlap: expected 0 to 1, got {shown(min_overlap)}")
 
 
 def _aligned(
     points: Array, goals: Array, begin: Transform, kind: str, reach: float
 ) -> tuple[Transform, bool]:
     """Return the pose, and whether the steps ended; each cloud is moved to its centre for it."""
-    gicp = _small_gicp()
+    gicp = load("small_gicp")
     here, there = points.mean(axis=0), goals.mean(axis=0)
     clouds = [gicp.PointCloud(points - here), gicp.PointCloud(goals - there)]
     for cloud in clouds:
@@ -190,13 +198,13 @@ def _aligned(
     motion = np.eye(4)
     motion[:3, :3] = begin.rotation
     motion[:3, 3] = begin.rotation @ here + begin.translation - there
-    found = stepped(motion, MOST_STEPS)
+    found = stepped(motion, MAX_STEPS)
     motion, ended = np.asarray(found.T_target_source, np.float64), bool(found.converged)
     if np.isfinite(motion).all() and not ended:
         before = motion
         motion = np.asarray(stepped(before, MORE_STEPS).T_target_source, np.float64)
         change = (points - here) @ (motion - before)[:3, :3].T + (motion - before)[:3, 3]
-        ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < RESTLESS * reach)
+        ended = bool(np.sqrt((change**2).sum(axis=1).mean()) < MAX_REST_SHARE * reach)
     if not np.isfinite(motion).all():
         return begin, False
     # Many small turns one after the other are no rotation to the last digits.
@@ -228,7 +236,7 @@ def _judged(
     matched = len(match.nearest)
     reasons = []
     if not ended:
-        reasons.append(f"the steps did not end within {MOST_STEPS}")
+        reasons.append(f"the steps did not end within {MAX_STEPS}")
     if matched / count < min_overlap or matched < NEIGHBOURS:
         reasons.append(
             f"{matched} of {count} points of the source lie on the target, "
@@ -282,7 +290,7 @@ def _covariance(rows: Array, across: Array, nearest: NDArray[np.intp]) -> Array:
 
 
 def _in_words(step: Array, arms: Array) -> str:
-    """Return what a step about the centre of the matched points is that is left open."""
+    """Return a text of the motion about the matched points' centre that stays undetermined."""
     turn, shift = step[:3], step[3:]
     reach = float(np.sqrt((arms**2).sum(axis=1).mean())) or 1.0
     size = np.linalg.norm(turn) * reach

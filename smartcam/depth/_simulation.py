@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 BLOCK: Final = (0.075, 0.025, 0.015)
-"""Metres: length, width, height of a block."""
+"""Length, width and height of a block, metres."""
 
 SIZE: Final = (640, 480)
 """Pixels of the camera."""
@@ -31,10 +31,10 @@ DISPARITY_SIGMA: Final = 0.1
 """Pixels: noise of a depth is ``Z^2 / (FOCAL * BASELINE)`` times this."""
 
 CAMERA_SIGMA: Final = 2e-4
-"""Metres on each axis by which the camera's place at the hand is not known."""
+"""Metres on each axis by which the camera's place at the hand is uncertain."""
 
 GRIP: Final = 5e-3
-"""Metres; how far beside a block the gripper still takes it."""
+"""Metres by which the gripper may miss a block and still take it."""
 
 ROOM: Final = 0.01
 """Metres between things on the table at least, for a gripper and for the eye."""
@@ -46,10 +46,10 @@ HOLES: Final = (0.01, 0.4)
 """Part of the pixels without a depth: anywhere, and where it jumps."""
 
 JUMP: Final = 0.004
-"""Metres between two pixels that are a jump."""
+"""Metres of depth between two neighbouring pixels that count as a jump."""
 
 FINE: Final = 2
-"""Rays along each side of a pixel."""
+"""Number of rays along each side of a pixel."""
 
 AXES: Final = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Rotation from the camera's frame into the robot's: its columns are right, down, ahead."""
@@ -59,7 +59,7 @@ COLOURS: Final = {
     "black": (24.0, 23.0, 25.0),
     "table": (158.0, 168.0, 172.0),
 }
-"""Red, green, blue before the light falls on it."""
+"""Red, green and blue of each surface before the light falls on it."""
 
 SHADES: Final = (0.72, 0.84, 1.0)
 """Light on the sides along the width, along the length, and on top."""
@@ -83,7 +83,7 @@ class WoodenBlock:
 
 
 class TableSight(NamedTuple):
-    """What the camera sees from a place."""
+    """The picture and depth that the camera sees from a place."""
 
     camera: tuple[float, float, float]  # where it is, metres
     rgb: NDArray[np.uint8]  # (H, W, 3)
@@ -93,7 +93,7 @@ class TableSight(NamedTuple):
 def to_robot(
     camera: tuple[float, float, float], x: float, y: float, height: float
 ) -> tuple[float, float]:
-    """Return where the ray of a pixel is at a height, x and y in metres in the robot's frame."""
+    """Return the point of a pixel's ray at a height, x and y in metres in the robot's frame."""
     ahead = camera[2] - height
     ray = ((x - SIZE[0] / 2) / FOCAL * ahead, (y - SIZE[1] / 2) / FOCAL * ahead, ahead)
     place = AXES @ ray + camera
@@ -101,7 +101,7 @@ def to_robot(
 
 
 class Grip(NamedTuple):
-    """How well a gripper took a block, or a thing was found."""
+    """The errors with which a gripper took a block, or a thing was found."""
 
     off: float  # metres on the table, between where it was and where it was thought to be
     turned: float  # radians: the same of its angle
@@ -212,7 +212,7 @@ def _pixels(fine: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels have a neighbour beyond an edge."""
+    """Return the mask of the pixels that have a neighbour beyond an edge."""
     found = np.zeros(depth.shape, bool)
     for axis in (0, 1):
         step = np.abs(np.diff(depth, axis=axis)) > JUMP
@@ -223,7 +223,7 @@ def _jumps(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _hidden(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return which pixels the second camera, to the right, does not see."""
+    """Return the mask of the pixels that the second camera, to the right, does not see."""
     there = np.arange(depth.shape[1]) - FOCAL * BASELINE / depth  # its columns
     nearer = np.minimum.accumulate(there[:, ::-1], axis=1)[:, ::-1]
     found = np.zeros(depth.shape, bool)
@@ -246,7 +246,7 @@ class _TableRays:
         self.colour[:] = COLOURS["table"]
 
     def picture(self) -> NDArray[np.float32]:
-        """Return what the light makes of the colours, (H, W, 3)."""
+        """Return the picture of the colours under the light, (H, W, 3)."""
         seen = _pixels(self.colour)
         x, y, z = self._camera
         light = 1.0 + 0.5 * (x - 0.4 - self._down[::FINE] * z)

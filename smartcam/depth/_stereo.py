@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from smartcam._argument_checks import a_list, a_number, or_none, takes
+from smartcam._arguments import check_flag, shown
 from smartcam.depth._from_reader import ReaderDriver
 from smartcam.depth._matcher import MOST, StereoMatcher
 from smartcam.depth._one_thread import OneThread
@@ -16,7 +18,7 @@ from smartcam.depth._pair import CalibratedPair
 from smartcam.depth._pair_clock import PairClock
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
 from smartcam.frames import FrameGroup, FrameSource
-from smartcam.frames._reader import FRAME_TIMEOUT
+from smartcam.frames._inside import FRAME_TIMEOUT
 
 if TYPE_CHECKING:
     from contextlib import AbstractAsyncContextManager
@@ -24,10 +26,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration._stereo.calibration import StereoCalibration
+    from smartcam.calibration import StereoCalibration
     from smartcam.calibration.formats import CameraChain
     from smartcam.frames import Frame, FrameReader, FrameSet, GroupStatistics
+    from smartcam.geometry import CameraModel
 
 SEARCHED: Final = 5
 """Part of the width, one in so many, that disparities are searched in by default."""
@@ -35,7 +37,7 @@ SEARCHED: Final = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthFrame:
-    """What two cameras saw at one moment, as the left one sees it after rectification.
+    """The depth seen by two cameras at one moment, in the rectified left camera's view.
 
     Attributes:
         depth: (H, W), float32, metres along the optical axis; 0: none.
@@ -43,11 +45,11 @@ class DepthFrame:
         disparity: (H, W), float32, pixels; NaN: none.
         left: the rectified left picture, uint8: (H, W), or, red first, (H, W, 3); 0 where it has
             no source.
-        camera_info: its lens, without distortion.
+        camera_info: lens of the rectified left camera, without distortion.
         baseline: metres between the cameras.
-        captured: when the left frame was captured, seconds of ``time.monotonic()``.
-        utc: the same, seconds since 1970.
-        skew: seconds by which the right one was captured later.
+        captured: time of the left frame's capture, seconds of ``time.monotonic()``.
+        utc: time of the left frame's capture, seconds since 1970.
+        skew: seconds by which the right frame was captured later.
         sequences: the numbers that the cameras gave the frames, left and right.
     """
 
@@ -65,7 +67,7 @@ class DepthFrame:
 
 @dataclass(frozen=True, slots=True)
 class StereoStatistics:
-    """What became of the frames of a pair.
+    """The counts of a pair's frames, and the difference of its clocks.
 
     Attributes:
         group: of the frames' pairing; its ``skew`` is the largest.
@@ -117,6 +119,7 @@ class StereoDepth:
         ConfigurationError: a value that is none, or no calibration of two cameras.
     """
 
+    @takes(size=or_none(a_list), alpha=a_number, colour=check_flag, focal_sigma=a_number)
     def __init__(
         self,
         left: FrameSource | AbstractAsyncContextManager[FrameReader],
@@ -132,13 +135,15 @@ class StereoDepth:
         timeout: float | None = FRAME_TIMEOUT,
     ) -> None:
         if not 0 <= alpha <= 1:
-            raise ConfigurationError(f"stereo: alpha: expected 0 to 1, got {alpha!r}")
+            raise ConfigurationError(f"stereo: alpha: expected 0 to 1, got {shown(alpha)}")
         if not 0 <= focal_sigma < math.inf:
-            raise ConfigurationError(f"stereo: focal_sigma: expected pixels, got {focal_sigma!r}")
+            raise ConfigurationError(
+                f"stereo: focal_sigma: expected pixels, got {shown(focal_sigma)}"
+            )
         if size is not None and not (
             len(size) == 2 and all(isinstance(one, int) and one > 0 for one in size)
         ):
-            raise ConfigurationError(f"stereo: size: expected width and height, got {size!r}")
+            raise ConfigurationError(f"stereo: size: expected width and height, got {shown(size)}")
         self._make = partial(
             CalibratedPair, calibration, size=size, alpha=alpha, focal_sigma=focal_sigma
         )
@@ -208,6 +213,11 @@ class StereoDepth:
         return self._opened()[1].camera_info
 
     @property
+    def rotation(self) -> NDArray[np.float64]:
+        """The rotation (3, 3) from the left camera's frame into its rectified one."""
+        return self._opened()[1].rotation
+
+    @property
     def baseline(self) -> float:
         """Metres between the cameras; raises as :attr:`camera_info` does."""
         return self._opened()[1].baseline
@@ -248,7 +258,7 @@ class StereoDepth:
 
     def _opened(self) -> tuple[OneThread, CalibratedPair, StereoMatcher]:
         if self._worker is None or self._pair is None or self._matcher is None:
-            raise LocalProtocolError("the pair of cameras is not open: async with it")
+            raise LocalProtocolError("the pair of cameras is not open: use `async with`")
         return self._worker, self._pair, self._matcher
 
 

@@ -6,45 +6,51 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Field = NDArray[np.floating[Any]]
 
-COARSE: Final = 0.5
+MIN_COARSE_SIGMA_PX: Final = 0.5
 """Least sigma of a disparity that least squares could not refine, pixels."""
 
-STEPS: Final = 3
-"""Of Gauss and Newton."""
+GAUSS_NEWTON_STEPS: Final = 3
+"""Steps of Gauss and Newton that refine the disparities."""
 
-FARTHEST: Final = 0.5
+MAX_SHIFT_PX: Final = 0.5
 """Pixels by which a disparity may be moved: farther off is another point."""
 
-ROUGHEST: Final = 0.5
+MAX_ROUGHNESS_PX: Final = 0.5
 """Pixels, rms, of coarse disparities from a plane; a window with more has an edge in it."""
 
-FILLED: Final = 0.5
-"""Part of a window that has disparities, at least."""
+MIN_FILLED_SHARE: Final = 0.5
+"""Least share of a window's pixels that must have disparities."""
 
-BESIDE: Final = 2
+HOLE_MARGIN_PX: Final = 2
 """Pixels from a hole within which nothing is refined."""
 
-ROUNDED: Final = 1 / 6
-"""Variance of the difference of two pictures of whole grey levels, at least."""
+MIN_VARIANCE: Final = 1 / 6
+"""Least variance of the difference of two pictures, whose grey levels are whole numbers."""
 
-OUTLIER: Final = 4.0
-"""A pixel that differs by more times its noise does not count."""
+OUTLIER_SIGMAS: Final = 4.0
+"""Standard deviations of a pixel's noise above which its difference does not count."""
 
-LEAST_PIXELS: Final = 12
-"""Of a window, whose least squares have two unknowns."""
+MIDDLE_GREY: Final = 128
+"""Grey level that is taken off, so that squares keep their digits."""
 
-LAGS: Final = 2
-"""Pixels over which noise is looked at for correlation."""
+MIN_WINDOW_PIXELS: Final = 12
+"""Pixels of a window at least, whose least squares have two unknowns."""
 
-LEAST: Final = 0.2
-"""Of what is found there."""
+GAIN_SIGMA: Final = 0.3
+"""Standard deviation, about 1, that the gain between the pictures is taken to have beforehand."""
+
+MAX_NOISE_LAG_PX: Final = 2
+"""Largest distance, in pixels, at which the noise is checked for correlation."""
+
+MIN_NOISE_FACTOR: Final = 0.2
+"""Least factor by which correlated noise changes a variance."""
 
 
 def refined(
@@ -52,32 +58,38 @@ def refined(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return disparities and their sigma, both (H, W), NaN where ``coarse`` is.
 
-    In a window the disparity is a plane, and the brightness of the pictures differs by a constant.
+    In a window the disparity is a plane, and the brightness of the pictures differs by a constant
+    and a factor: exposures, gains and the shade of lenses differ.
     Where a window has an edge in it, too little texture, or the least squares lead too far, the
-    coarse value stays: its sigma is ``COARSE``, or how rough the window is where that is more.
+    coarse value stays: its sigma is ``MIN_COARSE_SIGMA_PX``, or the roughness of the window where
+    that is more.
     """
     known = np.isfinite(coarse)
-    sigma = np.where(known, np.float32(COARSE), np.float32(np.nan))
+    sigma = np.where(known, np.float32(MIN_COARSE_SIGMA_PX), np.float32(np.nan))
     if not window or not known.any():
         return coarse, sigma
     sums = _WindowSums(window)
     pictures = left.astype(np.float32), right.astype(np.float32)
     start = np.where(known, coarse, np.float32(0))
     plane = _plane(start, known, sums)
-    smooth = (plane.rough <= ROUGHEST) & (plane.pixels >= FILLED * window**2)
+    smooth = (plane.rough <= MAX_ROUGHNESS_PX) & (plane.pixels >= MIN_FILLED_SHARE * window**2)
     smooth &= _whole_around(known)
     # near an edge of depth a coarse value may be that of its other side
     told = np.fmax(sigma, plane.rough)
     found, usable = start, known
     fit = _fitted(_linearized(pictures, found, known), found, usable, plane, sums)
-    for step in range(STEPS):
+    for step in range(GAUSS_NEWTON_STEPS):
         if step:
             plane = _plane(found, usable if usable.any() else known, sums)
             linear = _without_outliers(_linearized(pictures, found, known), fit)
             fit = _fitted(linear, found, usable, plane, sums)
-        if step == STEPS - 1:
+        if step == GAUSS_NEWTON_STEPS - 1:
             fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
-        usable = smooth & (fit.sigma < COARSE) & (np.abs(fit.disparity - start) < FARTHEST)
+        usable = (
+            smooth
+            & (fit.sigma < MIN_COARSE_SIGMA_PX)
+            & (np.abs(fit.disparity - start) < MAX_SHIFT_PX)
+        )
         found = np.where(usable, fit.disparity, start)
     told = np.where(usable, fit.sigma, told)
     found[~known] = np.nan
@@ -86,8 +98,8 @@ def refined(
 
 
 def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return what has no hole next to it: behind a near thing's edge there is one."""
-    around = np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8)
+    """Return the mask of the pixels without a hole nearby, as there is behind a near edge."""
+    around = np.ones((2 * HOLE_MARGIN_PX + 1, 2 * HOLE_MARGIN_PX + 1), np.uint8)
     return np.asarray(load("cv2").erode(known.astype(np.uint8), around) > 0)
 
 
@@ -141,10 +153,11 @@ def _plane(disparity: Field, known: NDArray[np.bool_], sums: _WindowSums) -> _Di
 
 
 class _LinearMatch(NamedTuple):
-    """How the pictures differ, and by how much more with a disparity; 0 where that is unknown."""
+    """The difference of the pictures and its slope by disparity; 0 where they are unknown."""
 
     e: Field  # left less right, grey levels
     g: Field  # slope of both, grey levels a pixel
+    r: Field  # right, grey levels about the middle of their range
     mask: Field  # 1 where they are known
 
 
@@ -158,7 +171,8 @@ def _linearized(
     mask = inside.astype(np.float32)
     moved, slope = _sampled(right, np.where(inside, there, np.float32(2)))
     slope += np.gradient(left, axis=1)
-    return _LinearMatch((left - moved) * mask, slope * mask / 2, mask)
+    level = (moved - np.float32(MIDDLE_GREY)) * mask
+    return _LinearMatch((left - moved) * mask, slope * mask / 2, level, mask)
 
 
 class _Refined(NamedTuple):
@@ -167,14 +181,14 @@ class _Refined(NamedTuple):
     disparity: Field  # pixels
     sigma: Field  # of noise that is not correlated, pixels
     linear: _LinearMatch
-    mean: Field  # of linear.e in each window, grey levels
+    expected: Field  # of linear.e, by the constant and the gain of each window, grey levels
     variance: Field  # of linear.e, grey levels^2
 
 
 def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
     """Return the equations without pixels of another surface, whose disparity is far off."""
-    fits = np.abs(linear.e - fit.mean) <= OUTLIER * np.sqrt(fit.variance)
-    return _LinearMatch(linear.e * fits, linear.g * fits, linear.mask * fits)
+    fits = np.abs(linear.e - fit.expected) <= OUTLIER_SIGMAS * np.sqrt(fit.variance)
+    return _LinearMatch(*(one * fits for one in linear))
 
 
 def _fitted(
@@ -188,33 +202,42 @@ def _fitted(
 
     What noise there is follows from the ``trusted`` pixels.
     """
-    # With the right picture's row taken at u - d_q, L - R_q = b - g (D + s (q - p) - d_q) + noise
-    # for all q of the window around p: linear in D and b. g is the mean of both pictures' slopes,
-    # whose noise does not go with that of their difference.
-    e, g, mask = linear
-    gd, gg = g * disparity, g * g
+    # With the right picture's row taken at u - d_q, L - R_q = b + c R_q - g (D + s (q - p) - d_q)
+    # + noise for all q of the window around p: linear in D, b and the gain less 1, c. g is the mean
+    # of both pictures' slopes, whose noise does not go with that of their difference.
+    e, g, level, mask = linear
+    gd, gg, rg = g * disparity, g * g, g * level
     n = np.maximum(sums(mask), 1)
-    sg = sums(g)
+    sg, sr = sums(g), sums(level)
     sgd = sums(gd) - plane.across * sums(g, 1) - plane.down * sums(g, 0, 1)
     sggd = sums(g * gd) - plane.across * sums(gg, 1) - plane.down * sums(gg, 0, 1)
-    sgy, sy = sums(g * e) - sggd, sums(e) - sgd
-    curvature = sums(gg) - sg * sg / n
+    srgd = sums(rg * disparity) - plane.across * sums(rg, 1) - plane.down * sums(rg, 0, 1)
+    sy = sums(e) - sgd
+    gy, ry = sums(g * e) - sggd - sg * sy / n, sums(level * e) - srgd - sr * sy / n
     trust = mask * trusted
     m = np.maximum(sums(trust), 1)
-    se = sums(e * trust)
-    variance = (sums(e * e * trust) - se * se / m) / np.maximum(m - 2, 1)
-    variance = np.maximum(variance, ROUNDED)
+    se, st = sums(e * trust), sums(level * trust)
+    see = sums(e * e * trust) - se * se / m
+    sre = sums(level * e * trust) - st * se / m
+    srr = np.maximum(sums(level * level * trust) - st * st / m, 0)
+    # how little is known of the gain beforehand, as so much variance of R
+    held = np.maximum(see / np.maximum(m - 2, 1), MIN_VARIANCE) / np.float32(GAIN_SIGMA**2)
+    gain = sre / (srr + held)
+    variance = np.maximum((see - gain * sre) / np.maximum(m - 3, 1), MIN_VARIANCE)
+    rr = np.maximum(sums(level * level) - sr * sr / n, 0) + held
+    gr = sums(rg) - sg * sr / n
+    curvature = sums(gg) - sg * sg / n - gr * gr / rr
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's
     texture = curvature - n * variance / 8
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = (sg * sy / n - sgy) / curvature
+        found = (gr * ry / rr - gy) / curvature
         sigma = np.sqrt(variance / texture)
-    usable = (texture > 0) & np.isfinite(found) & (n >= LEAST_PIXELS)
+    usable = (texture > 0) & np.isfinite(found) & (n >= MIN_WINDOW_PIXELS)
     return _Refined(
         np.where(usable, found, disparity),
         np.where(usable, sigma, np.inf),
         linear,
-        se / m,
+        se / m + gain * (level - st / m),
         variance,
     )
 
@@ -252,7 +275,10 @@ def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     # one picture is sharper e has texture in it; that goes with g, and for the most part cancels.
     mask = fit.linear.mask * trusted
     e, g = fit.linear.e * mask, fit.linear.g * mask
+    # one constant and gain for the whole picture: those of windows would take noise with them
+    level = (fit.linear.r - (fit.linear.r * mask).sum() / np.maximum(mask.sum(), 1)) * mask
     e = (e - e.sum() / np.maximum(mask.sum(), 1)) * mask
+    e -= level * (float((e * level).sum()) / max(float((level * level).sum()), 1.0))
     height, width = e.shape
 
     def products(one: Field, other: Field, u: int, v: int) -> float:
@@ -264,9 +290,9 @@ def _correlation(fit: _Refined, trusted: NDArray[np.bool_]) -> float:
     if power <= 0:
         return 1.0
     whole = 1.0
-    for v in range(LAGS + 1):
-        for u in range(-LAGS if v else 1, LAGS + 1):
+    for v in range(MAX_NOISE_LAG_PX + 1):
+        for u in range(-MAX_NOISE_LAG_PX if v else 1, MAX_NOISE_LAG_PX + 1):
             both = products(e, e, u, v) * products(g, g, u, v)
             crossed = products(e, g, u, v) * products(g, e, u, v)
             whole += 2 * (both + crossed) / power
-    return max(whole, LEAST)
+    return max(whole, MIN_NOISE_FACTOR)

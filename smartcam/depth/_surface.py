@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,7 +17,7 @@ ROWS: Final = 1 << 15
 """Points at a time; each has its neighbours in memory."""
 
 SIGNIFICANT: Final = 12.0
-"""By how much a direction's information must exceed what the noise of the normals makes alone.
+"""Factor by which a direction's information must exceed that from noise of the normals alone.
 
 Along what planes, edges and corridors leave open it is 0.8 to 1.4, whatever the noise; along what
 cylinders and spheres leave open up to 11, since they are no planes; in a corner 29 and more.
@@ -38,7 +38,7 @@ class SurfacePlanes(NamedTuple):
     tilts: Array
 
     def taken(self, index: Any) -> SurfacePlanes:
-        """Return some of them."""
+        """Return the planes at an index."""
         return SurfacePlanes(*(one[index] for one in self))
 
 
@@ -64,9 +64,9 @@ def _fitted(groups: Array) -> SurfacePlanes:
 
 
 def slopes(arms: Array, directions: Array) -> Array:
-    """Return how shifts along directions (N, 3) follow from steps (N, 6), turn before shift.
+    """Return the derivatives (N, 6) of shifts along directions (N, 3), turn before shift.
 
-    ``arms`` (N, 3): from the point about which is turned.
+    ``arms`` (N, 3): vectors to the points from the centre of the turn.
     """
     return np.concatenate([np.cross(arms, directions), directions], axis=1)
 

@@ -19,8 +19,11 @@ MAX_FIELDS: Final = 256
 MAX_ROW: Final = 1 << 12
 """Bytes of a row."""
 
-LINES: Final = 1 << 14
-"""Of text at a time; each number is an object in memory for a while."""
+MAX_LINE: Final = 1 << 20
+"""Bytes of a line of text: 1,024 numbers, each with many spaces and digits."""
+
+WORDS: Final = 1 << 18
+"""Numbers of text at a time; each is an object in memory for a while."""
 
 
 class BadTableError(Exception):
@@ -31,7 +34,7 @@ class BadTableError(Exception):
 
 
 def shown(data: bytes | str) -> str:
-    """Return what came, for an error; not more than a line of it."""
+    """Return the beginning of what came, quoted for an error; at most a line."""
     text = data.decode("ascii", "backslashreplace") if isinstance(data, bytes) else data
     return repr(text if len(text) <= 60 else f"{text[:60]}...")
 
@@ -40,7 +43,9 @@ def header_line(data: bytes, start: int) -> tuple[str, int]:
     """Return a header's line and where the next one begins; it ends in LF, or CR LF."""
     end = data.find(b"\n", start, MAX_HEADER)
     if end < 0:
-        raise BadTableError(f"a header of up to {MAX_HEADER} bytes", shown(data[start:]))
+        raise BadTableError(
+            f"a header of up to {MAX_HEADER} bytes", shown(data[start : start + MAX_HEADER])
+        )
     line = data[start:end].removesuffix(b"\r")
     try:
         return line.decode(
@@ -84,17 +89,20 @@ def from_text(
 
     Numbers of whole types must be whole, and fit.
     """
+    check_row(np.dtype([(str(place), one) for place, one in enumerate(types)]))
     if 2 * len(types) * count > len(data) - start + 1:
         raise BadTableError(f"{count} lines of {len(types)} numbers", f"{len(data) - start} bytes")
     columns = tuple(np.empty(count, one) for one in types)
     done, place, left = 0, start, skipped
     while done < count:
         lines: list[list[bytes]] = []
-        while len(lines) < min(LINES, count - done):
+        while len(lines) < min(WORDS // len(types), count - done):
             if place >= len(data):
                 raise BadTableError(f"{count} lines of numbers", f"{done + len(lines)}")
             end = data.find(b"\n", place)
             end = len(data) if end < 0 else end
+            if end - place > MAX_LINE:
+                raise BadTableError(f"lines of up to {MAX_LINE} bytes", f"{end - place}")
             words, place = data[place:end].split(), end + 1
             if left:
                 left -= 1

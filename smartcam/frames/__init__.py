@@ -19,35 +19,53 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._clocks import ClockStatistics
-    from smartcam.frames._codecs import Codecs
+    from smartcam.frames._codecs.h264 import H264Decoder, H264Encoder
+    from smartcam.frames._codecs.threads import Codecs
     from smartcam.frames._driver import FoundSource, FrameDriver, FrameSink, StreamFormat
-    from smartcam.frames._frame import Frame, Moment
+    from smartcam.frames._events import FrameEvent, FrameEvents
+    from smartcam.frames._features import (
+        DeviceFeatures,
+        Feature,
+        FeatureValue,
+        FrameFeature,
+        FrameFeatures,
+    )
+    from smartcam.frames._frame import Frame, FrameTrigger, Moment
     from smartcam.frames._group import FrameGroup, FrameSet, GroupStatistics
-    from smartcam.frames._h264 import H264Decoder, H264Encoder
     from smartcam.frames._opening import discover, open
-    from smartcam.frames._pixels import PixelFormat, find_format
-    from smartcam.frames._rate import RateControl, RateStatistics
+    from smartcam.frames._pixels.formats import PixelFormat, find_format
     from smartcam.frames._reader import FrameReader, ReaderStatistics
-    from smartcam.frames._rtp.feedback import RtpReceiver
-    from smartcam.frames._rtp.receiver import RtpStatistics
-    from smartcam.frames._rtp.sender import RtpSender, RtpSenderStatistics
-    from smartcam.frames._rtsp.server import RtspServer
-    from smartcam.frames._rtsp.streams import RtspStatistics
     from smartcam.frames._source import FrameSource, SourceStatistics
     from smartcam.frames._stages import Rectifier, Undistorter
+    from smartcam.frames._streaming.rate import RateControl, RateStatistics
+    from smartcam.frames._streaming.rtp.feedback import RtpReceiver
+    from smartcam.frames._streaming.rtp.receiver import RtpStatistics
+    from smartcam.frames._streaming.rtp.sender import RtpSender, RtpSenderStatistics
+    from smartcam.frames._streaming.rtsp.server import RtspServer
+    from smartcam.frames._streaming.rtsp.streams import RtspStatistics
+    from smartcam.frames._trigger import AwaitedTrigger
 
 __all__ = [
+    "AwaitedTrigger",
     "ClockStatistics",
     "Codecs",
+    "DeviceFeatures",
+    "Feature",
+    "FeatureValue",
     "FoundSource",
     "Frame",
     "FrameAddress",
     "FrameDriver",
+    "FrameEvent",
+    "FrameEvents",
+    "FrameFeature",
+    "FrameFeatures",
     "FrameGroup",
     "FrameReader",
     "FrameSet",
     "FrameSink",
     "FrameSource",
+    "FrameTrigger",
     "GroupStatistics",
     "H264Decoder",
     "H264Encoder",
@@ -77,21 +95,24 @@ if not TYPE_CHECKING:
         {
             "_address": "FrameAddress",
             "_clocks": "ClockStatistics",
-            "_codecs": "Codecs",
+            "_codecs.h264": "H264Decoder H264Encoder",
+            "_codecs.threads": "Codecs",
             "_driver": "FoundSource FrameDriver FrameSink StreamFormat",
-            "_frame": "Frame Moment",
+            "_events": "FrameEvent FrameEvents",
+            "_features": "DeviceFeatures Feature FeatureValue FrameFeature FrameFeatures",
+            "_frame": "Frame FrameTrigger Moment",
             "_group": "FrameGroup FrameSet GroupStatistics",
-            "_h264": "H264Decoder H264Encoder",
             "_opening": "discover open",
-            "_pixels": "PixelFormat find_format",
-            "_rate": "RateControl RateStatistics",
+            "_pixels.formats": "PixelFormat find_format",
             "_reader": "FrameReader ReaderStatistics",
-            "_rtp.feedback": "RtpReceiver",
-            "_rtp.receiver": "RtpStatistics",
-            "_rtp.sender": "RtpSender RtpSenderStatistics",
-            "_rtsp.server": "RtspServer",
-            "_rtsp.streams": "RtspStatistics",
             "_source": "FrameSource SourceStatistics",
             "_stages": "Rectifier Undistorter",
+            "_trigger": "AwaitedTrigger",
+            "_streaming.rate": "RateControl RateStatistics",
+            "_streaming.rtp.feedback": "RtpReceiver",
+            "_streaming.rtp.receiver": "RtpStatistics",
+            "_streaming.rtp.sender": "RtpSender RtpSenderStatistics",
+            "_streaming.rtsp.server": "RtspServer",
+            "_streaming.rtsp.streams": "RtspStatistics",
         },
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from smartcam._arguments import check_text, fspath_of
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 
@@ -17,18 +18,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class FrameAddress:
-    """Where frames come from.
+    """The URL of a source of frames, taken apart.
 
     Attributes:
         url: as it was given.
-        scheme: before ``://``, in small letters; ``file`` for a bare path.
-        host: name or address, "" where there is none.
-        port: None: the scheme's own.
-        path: what stands behind the host, with its first slash; of a bare path the path.
-        query: what stands behind ``?``.
-        user: before the host, or "".
-        password: the same; it stands in no text.
-        fragment: what stands behind ``#``: our parameters, where the query is the server's.
+        scheme: part of the URL before ``://``, in small letters; ``file`` for a bare path.
+        host: name or address, "" where the URL has none.
+        port: port; None: the scheme's own.
+        path: part behind the host, with its first slash; the whole of a bare path.
+        query: part behind ``?``.
+        user: name of the user before the host, or "".
+        password: password of the user, or ""; no text shows the password.
+        fragment: part behind ``#``: our parameters, where the query belongs to the server.
     """
 
     url: str
@@ -48,7 +49,7 @@ class FrameAddress:
         Raises:
             ConfigurationError: it is none.
         """
-        given = str(url).strip()
+        given = check_text(fspath_of(url), "frame source").strip()
         if not given:
             raise ConfigurationError("frame source: expected a URL or a path, got ''")
         if "://" not in given:
@@ -76,14 +77,14 @@ class FrameAddress:
         return _masked(self.url)
 
     def __repr__(self) -> str:
-        """Return it without the password."""
+        """Return the URL without the password."""
         return f"FrameAddress({self.shown!r})"
 
     def parameters(self, known: Sequence[str], said_in: str | None = None) -> dict[str, str]:
-        """Return what the query says, or another part of the URL.
+        """Return the parameters in the query, or in another part of the URL.
 
         Raises:
-            ConfigurationError: it has a name that is not known, or one twice.
+            ConfigurationError: a parameter is unknown, or stands there twice.
         """
         said: dict[str, str] = {}
         for name, value in parse_qsl(

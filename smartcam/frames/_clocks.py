@@ -7,37 +7,31 @@ from dataclasses import dataclass
 from typing import Final
 
 WINDOW: Final = 40
-"""Pieces of time that are remembered."""
+"""Intervals of time that are remembered."""
 
-PIECE: Final = 0.5
-"""Seconds of one: of each the frame that came soonest counts."""
+PIECE_DURATION: Final = 0.5
+"""Seconds of one interval, in which only the frame that came soonest counts."""
 
-FAST: Final = 0.05
-"""Seconds; a frame that comes sooner than the clock allows by more means that the clock jumped."""
+MIN_EARLY_JUMP_SECONDS: Final = 0.05
+"""Seconds by which a frame must come sooner than the clock allows for a jump of the clock."""
 
 SETTLED: Final = 4
-"""Pieces from which on one is sure of that: before, the frames may all have been late."""
+"""Intervals after which such a jump is sure: before, all frames may have been late."""
 
-SLOW: Final = 1.0
-"""Seconds; frames that all come later by more mean the same: no way here takes that long."""
+MIN_DRIFT_DURATION: Final = 4.0
+"""Seconds of frames needed to measure a drift."""
 
-PATIENCE: Final = 5
-"""So many such frames in a row."""
-
-LEAST_SPAN: Final = 4.0
-"""Seconds of frames from which on a drift is told."""
-
-MOST_DRIFT: Final = 0.01
-"""A clock that is more than 1 % off is not followed: that is no drift, but another unit."""
+MAX_DRIFT: Final = 0.01
+"""Largest drift that is followed; a clock that is off by more counts in another unit."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockStatistics:
-    """What is known of a camera's clock.
+    """The measured drift and jumps of a camera's clock.
 
     Attributes:
-        drift: by how much it is too fast, seconds a second; None: not known yet.
-        jumps: how often it was set anew, forwards or backwards.
+        drift: seconds a second by which the clock is too fast; None: not known yet.
+        jumps: number of times that the clock was set anew, forwards or backwards.
     """
 
     drift: float | None
@@ -45,12 +39,16 @@ class ClockStatistics:
 
 
 class DeviceClock:
-    """Where a device's clock is on ours, from when its frames arrive.
+    """The offset of a device's clock from ours, estimated from when its frames arrive.
 
     A frame arrives after it was taken, by a way that takes longer now and shorter then. So
     arrival minus device time has a lower edge, which is the offset between the clocks and the
     shortest way; its slope is the drift. What is found is late by the shortest way, and by nothing
     else.
+
+    Frames that all come late have waited somewhere, however long it is: the offset rises no faster
+    than a clock drifts. A clock that was set back by less than the time between two frames looks
+    the same; its frames count as older than they are until the offset has followed.
     """
 
     def __init__(self) -> None:
@@ -58,11 +56,12 @@ class DeviceClock:
         self._drift: float | None = None
         self._last: float | None = None
         self._piece_began = 0.0
-        self._slow = 0
+        self._held: float | None = None  # the offset at the last frame
+        self._before_queue: float | None = None  # the offset before frames waited somewhere
         self._jumps = 0
 
     def statistics(self) -> ClockStatistics:
-        """Return what is known now."""
+        """Return the drift and the jumps of the device's clock known so far."""
         # device = (arrival - offset) / (1 + slope): a slope above 0 is a clock that is too slow
         drift = None if self._drift is None else -self._drift / (1 + self._drift)
         return ClockStatistics(drift, self._jumps)
@@ -77,10 +76,18 @@ class DeviceClock:
         if self._jumped(device, arrival):
             self._jumps += 1
             self._lowest.clear()
-            self._drift, self._slow = None, 0
-        self._last = device
+            self._drift = self._held = self._before_queue = None
         self._remember(device, arrival - device)
-        return min(arrival, device + self._offset(device))
+        offset = self._offset(device)
+        if self._held is not None and self._last is not None:
+            highest = self._held + MAX_DRIFT * (device - self._last)
+            if offset <= highest:
+                self._before_queue = None
+            elif self._before_queue is None:
+                self._before_queue = self._held
+            offset = min(offset, highest)
+        self._held, self._last = offset, device
+        return min(arrival, device + offset)
 
     def _jumped(self, device: float, arrival: float) -> bool:
         if self._last is None:
@@ -88,12 +95,12 @@ class DeviceClock:
         if device < self._last:
             return True
         late = arrival - device - self._offset(device)
-        self._slow = self._slow + 1 if late > SLOW else 0
-        settled = len(self._lowest) >= SETTLED
-        return (late < -FAST and settled) or self._slow >= PATIENCE
+        if self._before_queue is not None:  # frames come without waiting again
+            late = max(late, arrival - device - self._before_queue)
+        return late < -MIN_EARLY_JUMP_SECONDS and len(self._lowest) >= SETTLED
 
     def _remember(self, device: float, offset: float) -> None:
-        if not self._lowest or device - self._piece_began >= PIECE:
+        if not self._lowest or device - self._piece_began >= PIECE_DURATION:
             self._piece_began = device
             self._lowest.append((device, offset))
         elif offset < self._lowest[-1][1]:
@@ -105,7 +112,7 @@ class DeviceClock:
     def _slope(self) -> float | None:
         """Return the slope of the lower edge; None where too little is known."""
         points = list(self._lowest)
-        if points[-1][0] - points[0][0] < LEAST_SPAN:
+        if points[-1][0] - points[0][0] < MIN_DRIFT_DURATION:
             return None
         half = len(points) // 2
         first, second = _lowest(points[:half], 0.0), _lowest(points[half:], 0.0)
@@ -114,7 +121,7 @@ class DeviceClock:
             first = _lowest(points[:half], slope)
             second = _lowest(points[half:], slope)
         slope = _slope(first, second)
-        return slope if abs(slope) <= MOST_DRIFT else None
+        return slope if abs(slope) <= MAX_DRIFT else None
 
     def _offset(self, device: float) -> float:
         slope = self._drift or 0.0

@@ -1,20 +1,27 @@
-"""What a source of frames is made of: a driver for each scheme of URLs."""
+"""The parts of a source of frames: a driver for each scheme of URLs, and its sink."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from smartcam.exceptions import UnsupportedError
 
 if TYPE_CHECKING:
-    from smartcam.exceptions import FrameSourceError
+    from collections.abc import Awaitable, Callable, Coroutine
+
+    from smartcam.exceptions import FrameSourceError, SmartCamError
     from smartcam.frames._address import FrameAddress
+    from smartcam.frames._events import FrameEvent
+    from smartcam.frames._features import DeviceFeatures
     from smartcam.frames._frame import Frame
-    from smartcam.frames._pixels import PixelFormat
+    from smartcam.frames._pixels.formats import PixelFormat
+    from smartcam.frames._trigger import AwaitedTrigger
 
 
 class StreamFormat(NamedTuple):
-    """What a source streams, or could.
+    """The format and size that a source streams, or could.
 
     Attributes:
         format: of the pixels.
@@ -29,7 +36,7 @@ class StreamFormat(NamedTuple):
     rates: tuple[float, ...] = ()
 
     def __str__(self) -> str:
-        """Return it as URLs and error texts have it."""
+        """Return the format as URLs and error texts have it."""
         rates = f" at {', '.join(f'{rate:g}' for rate in self.rates)}/s" if self.rates else ""
         return f"{self.format.name} {self.width}x{self.height}{rates}"
 
@@ -52,7 +59,7 @@ class FoundSource:
 
 
 class FrameSink(ABC):
-    """Where a driver puts what comes. All is called in the event loop's thread."""
+    """The place into which a driver puts frames. All is called in the event loop's thread."""
 
     @abstractmethod
     def frame(self, frame: Frame) -> None:
@@ -60,7 +67,7 @@ class FrameSink(ABC):
 
     @abstractmethod
     def lost(self, count: int) -> None:
-        """Take that frames were lost; the next frame does not count them again."""
+        """Count lost frames; the next frame does not count them again."""
 
     def skipped(self, count: int) -> None:  # noqa: B027 - most drivers have none
         """Take that frames came to the far end of a link, where newer ones took their place."""
@@ -68,6 +75,9 @@ class FrameSink(ABC):
     @abstractmethod
     def ended(self, error: FrameSourceError | None) -> None:
         """Take that nothing more comes: None at the end of a file. Readers get the error."""
+
+    def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
+        """Take that the picture of the trigger under way will not come."""
 
     async def taken(self) -> None:  # noqa: B027 - who has no readers waits for none
         """Return once every reader has taken the last frame: for a recording that is to lose none.
@@ -90,22 +100,101 @@ class FrameDriver(ABC):
     Attributes:
         times_frames: ``captured`` of its frames is their time on our clock, also where they have a
             ``device_time``; else the source finds it out.
+        form: format of the stream since a feature changed it; None: as :meth:`open` returned it.
+        waits_for: what the device waits for before each picture, as a text for errors, such as
+            ``TriggerSource is Line1``; ``""``: it streams by itself. One that waits is never stuck.
     """
 
     times_frames: ClassVar[bool] = False
+    form: StreamFormat | None = None
+    waits_for: str = ""
 
     def __init__(self, address: FrameAddress) -> None:
         self.address = address
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
-        """Return what is there; nothing is opened for longer than that takes."""
+        """Return the sources found; open a device only for as long as the search takes."""
         return []
 
     @property
     def name(self) -> str:
         """The camera's name in frames, logs and errors."""
         return self.address.shown
+
+    @property
+    def features(self) -> DeviceFeatures:
+        """The features of the device that can be read and set while it is open.
+
+        Raises:
+            UnsupportedError: devices of this kind have none.
+        """
+        raise UnsupportedError(
+            f"{self.name}: a source of this kind has no features to read or set; those of gige: "
+            "and v4l2: have them"
+        )
+
+    async def watch_events(
+        self,
+        names: tuple[str, ...],
+        take: Callable[[FrameEvent], None],
+        ended: Callable[[FrameSourceError | None], None],
+    ) -> Callable[[], Coroutine[Any, Any, None]]:
+        """Have the device tell events; return the coroutine function that ends it.
+
+        Args:
+            names: names of the events.
+            take: takes each event.
+            ended: called when no more will come.
+
+        Raises:
+            UnsupportedError: devices of this kind tell no events.
+            FrameSourceError: the device has no such event.
+        """
+        raise UnsupportedError(f"{self.name}: a source of this kind tells no events")
+
+    async def trigger(
+        self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
+    ) -> None:
+        """Trigger one picture, and return when the device has taken the trigger.
+
+        The frame that the trigger causes goes into the sink with ``pending.number`` in its
+        ``trigger``; ``sink.trigger_failed`` tells a picture that will not come. It is called while
+        the device streams, and again only after :meth:`disarm`.
+
+        Args:
+            pending: the trigger; ``pending.fire_begins()`` is called right before it is sent, and
+                ``pending.refused()`` where the device surely did not take it.
+            fire: coroutine function that sets the trigger's line; None: by software.
+
+        Raises:
+            UnsupportedError: devices of this kind have no trigger.
+            TriggerError: the device does not take it.
+            FrameSourceError: the device does not answer.
+        """
+        raise UnsupportedError(
+            f"{self.name}: a source of this kind has no trigger; that of gige: has one. "
+            "after(time.monotonic()) is the first picture that is exposed from now on"
+        )
+
+    async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame | None:
+        """Have whoever has the device trigger it, and return the picture that this caused.
+
+        Args:
+            timeout: seconds for everything.
+            refuse: whether to raise where another trigger is under way.
+
+        Returns:
+            None where the device is here: :meth:`trigger` triggers it.
+
+        Raises:
+            SmartCamError: as :meth:`FrameSource.trigger`.
+        """
+        del timeout, refuse
+        return None
+
+    def disarm(self) -> None:  # noqa: B027 - most drivers have no trigger
+        """Take no picture for that of the last trigger any longer."""
 
     @abstractmethod
     async def open(self) -> StreamFormat:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import enum
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.frames._pixels import PixelFormat
+    from smartcam.frames._features import FeatureValue
+    from smartcam.frames._pixels.formats import PixelFormat
+    from smartcam.geometry import CameraModel
 
 
 class Moment(enum.Enum):
-    """Which moment a frame's capture time is."""
+    """The moment that a frame's capture time stands for."""
 
     EXPOSURE_START = "start of exposure"
     """The sensor began to see."""
@@ -25,28 +28,50 @@ class Moment(enum.Enum):
     """The frame was here; when it was taken nobody said."""
 
 
+@dataclass(frozen=True, slots=True)
+class FrameTrigger:
+    """The trigger that caused a frame.
+
+    Attributes:
+        number: number of the trigger, counted by its source.
+        fired: time right before it was sent, seconds of ``time.monotonic()``.
+        evidence: reasons why the frame is the one that this trigger caused, for people.
+    """
+
+    number: int
+    fired: float
+    evidence: tuple[str, ...]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frame:
     """One picture as its camera gave it.
 
     Attributes:
-        data: its bytes, as they came: nothing is converted, and nobody else writes into them.
-        format: how they are to be read.
+        data: bytes of the picture, as they came: nothing is converted, and nobody else writes into
+            them.
+        format: format of the bytes.
         width: pixels.
         height: pixels.
         stride: bytes from one row to the next one; 0 where the format is compressed.
-        captured: when, seconds of ``time.monotonic()``.
-        utc: the same, seconds since 1970.
-        moment: which moment these are.
+        captured: time of the capture, seconds of ``time.monotonic()``.
+        utc: time of the capture, seconds since 1970.
+        moment: moment of the capture that these times are of.
         duration: longest time from the start of the exposure to ``captured``, seconds: 0 where
             that is the start; else what the source knows of its frame time and of its way here.
-        device_time: what the camera's own clock said, seconds; None: it has none, or said nothing.
-            A driver that has it gives the arrival as ``captured``, and the source puts in its place
-            where the device's time is on our clock.
+        device_time: seconds of the camera's own clock; None: the camera has none, or sent no time.
+            A driver that knows the device's time gives the arrival as ``captured``, which the
+            source replaces by the device's time on our clock.
         sequence: the camera's number of the frame; it counts lost ones, too.
         lost: frames that were lost between the last one and this one, on the way or in the camera.
         source: name of the camera.
-        camera_info: its lens, as it was told; None: nobody said.
+        camera_info: lens of the camera, if it was given; else None.
+        remark: remark of the decoder that made this frame of a compressed one, such as bytes that
+            belong to nothing, on a picture that is whole all the same; mostly empty. So it tells
+            chunk data that could not be read.
+        chunks: values that the camera sent with the picture, by the name of their feature, such as
+            ``ChunkExposureTime``; empty where it sends none.
+        trigger: trigger of :meth:`FrameSource.trigger` that caused the frame; None: it was none.
     """
 
     data: bytes | bytearray | memoryview
@@ -63,6 +88,9 @@ class Frame:
     lost: int = 0
     source: str
     camera_info: CameraModel | None = None
+    remark: str = ""
+    chunks: Mapping[str, FeatureValue] = field(default_factory=dict)
+    trigger: FrameTrigger | None = None
 
     @property
     def age(self) -> float:
@@ -71,7 +99,7 @@ class Frame:
 
     @property
     def began(self) -> float:
-        """When the exposure began at the earliest, seconds of ``time.monotonic()``."""
+        """Earliest time at which the exposure began, seconds of ``time.monotonic()``."""
         return self.captured - self.duration
 
     def array(self) -> NDArray[Any]:

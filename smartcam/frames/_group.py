@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import collections
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from smartcam._arguments import check_kind, check_seconds_or_none
 from smartcam.exceptions import (
     ConfigurationError,
     FrameSourceError,
@@ -16,7 +18,6 @@ from smartcam.exceptions import (
 from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from typing import Self
 
     from smartcam.frames._frame import Frame
@@ -48,13 +49,13 @@ class FrameSet:
 
     @property
     def captured(self) -> float:
-        """When the last of them was captured, seconds of ``time.monotonic()``."""
+        """Capture time of the last of the frames, seconds of ``time.monotonic()``."""
         return max(frame.captured for frame in self.frames.values())
 
 
 @dataclass(frozen=True, slots=True)
 class GroupStatistics:
-    """What became of the frames of a group.
+    """Counts of the frames of a group.
 
     Attributes:
         offered: sets that came together; always delivered + skipped + waiting.
@@ -102,15 +103,14 @@ class FrameGroup:
         within: float | None = None,
         timeout: float | None = FRAME_TIMEOUT,
     ) -> None:
+        check_kind(sources, Mapping, "group of frame sources", "a mapping from name to source")
         if not sources or len({id(one) for one in sources.values()}) < len(sources):
             raise ConfigurationError(
                 f"group of frame sources: expected one or more, each once, got {list(sources)}"
             )
-        for name, value in (("within", within), ("timeout", timeout)):
-            if value is not None and not 0 < value < float("inf"):
-                raise ConfigurationError(f"{name}: expected seconds above 0 or None, got {value!r}")
+        self._within = check_seconds_or_none(within, "within", above=True)
+        self._timeout = check_seconds_or_none(timeout, "timeout", above=True)
         self._sources = dict(sources)
-        self._within, self._timeout = within, timeout
         self._readers: dict[str, _GroupReader] = {}
         self._open = False
         self._kept: dict[str, collections.deque[Frame]] = {
@@ -220,7 +220,7 @@ class FrameGroup:
 
     def _start(self) -> None:
         if not self._open:
-            raise LocalProtocolError("the group of frame sources is not open: async with it")
+            raise LocalProtocolError("the group of frame sources is not open: use `async with`")
         if not self._readers and self._over is None:
             # all in one turn of the loop, so that each begins when the others do
             self._readers = {

@@ -10,10 +10,10 @@ from urllib.parse import parse_qsl, urlencode, urlsplit, urlunsplit
 
 from smartcam.client import SmartCamera
 from smartcam.exceptions import FrameFormatError, FrameSourceError, SmartCamError
-from smartcam.frames._bitmap import read_bitmap
+from smartcam.frames._codecs.bitmap import read_bitmap
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._frame import Frame, Moment
-from smartcam.frames._pixels import find_format
+from smartcam.frames._pixels.formats import find_format
 from smartcam.settings import CameraSettings
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
-    from smartcam.frames._pixels import PixelFormat
+    from smartcam.frames._pixels.formats import PixelFormat
 
 
 OURS = ("fps", "name", "timeout")

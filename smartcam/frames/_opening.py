@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, cast
 
+from smartcam._arguments import check_text
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames._address import FrameAddress
@@ -12,8 +15,14 @@ from smartcam.frames._source import FrameSource
 from smartcam.registry import FRAMES
 
 if TYPE_CHECKING:
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.frames._driver import FoundSource, FrameDriver
+    from smartcam.geometry import CameraModel
+
+
+RECORDING: Final = "mcap"
+"""Scheme whose driver reads recordings."""
+
+RECORDING_SUFFIX: Final = ".mcap"
 
 
 def open(
@@ -29,7 +38,7 @@ def open(
     Args:
         url: ``v4l2:///dev/video0?format=YUYV&size=640x480&fps=30``, ``gige://HOST``,
             ``rtsp://...``, ``http://...``, ``rtp://...``, ``synthetic://``, ``insight://...``, or
-            the path of a file.
+            the path of a file, also of a recording (``run.mcap``) or a folder of recordings.
         camera_info: the lens, which every frame gets.
         timeout: seconds that an iteration waits for a frame; None: as long as it takes.
         stall: seconds without a frame after which a streaming device counts as stuck; None: never.
@@ -39,7 +48,8 @@ def open(
         ConfigurationError: the URL is wrong; the text says what is known.
     """
     address = FrameAddress.parse(url)
-    driver = _driver(address.scheme, address.shown)(address)
+    scheme = RECORDING if _is_recording(address) else address.scheme
+    driver = _driver(scheme, address.shown)(address)
     return FrameSource(driver, camera_info=camera_info, timeout=timeout, stall=stall, linger=linger)
 
 
@@ -52,9 +62,22 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
     Raises:
         ConfigurationError: no such scheme.
     """
-    schemes = [info.name for info in FRAMES.available()] if scheme is None else [scheme]
+    if scheme is None:
+        schemes = [info.name for info in FRAMES.available()]
+    else:
+        schemes = [check_text(scheme, "scheme", "discover", most=100)]
     kinds = dict.fromkeys(_driver(one, one) for one in schemes)
     return [found for kind in kinds for found in await kind.discover()]
+
+
+def _is_recording(address: FrameAddress) -> bool:
+    """Return True if a path is that of an MCAP file, or of a folder with such files."""
+    if address.scheme != "file":
+        return False
+    path = Path(re.sub(r"#\w+=[^#/]*$", "", address.path))
+    if path.suffix.lower() == RECORDING_SUFFIX:
+        return True
+    return path.is_dir() and next(path.glob(f"*{RECORDING_SUFFIX}"), None) is not None
 
 
 def _driver(scheme: str, url: str) -> type[FrameDriver]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import ConfigurationError, FrameSourceError, FrameTimeoutError
+from smartcam._arguments import check_age, check_moment, check_seconds_or_none
+from smartcam.exceptions import FrameSourceError, FrameTimeoutError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -16,20 +16,23 @@ if TYPE_CHECKING:
     from smartcam.frames._frame import Frame
     from smartcam.frames._source import FrameSource
 
+RELEASE_INTERVAL = 0.05
+"""Seconds after which it is looked again whether a frame that was held back can be handed on."""
+
 FRAME_TIMEOUT = 5.0
 """Seconds that a frame is waited for, unless one says otherwise."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReaderStatistics:
-    """What became of the frames that came while a reader was there.
+    """Counts of the frames since a reader began.
 
     Attributes:
-        offered: came since it began; always delivered + skipped + waiting.
-        delivered: it took them.
-        skipped: a newer one came before it took them.
-        waiting: 1 where one is there that it has not taken, else 0.
-        lost: never came: lost in the camera or on the way.
+        offered: frames that came since the reader began; always delivered + skipped + waiting.
+        delivered: frames that the reader took.
+        skipped: frames replaced by newer ones before the reader took them.
+        waiting: 1 while a frame waits that the reader has not taken, else 0.
+        lost: frames that never came: lost in the camera or on the way.
     """
 
     offered: int
@@ -114,8 +117,8 @@ class FrameReader:
 
         Cancellation: safe.
         """
-        if not max_age >= 0:
-            raise ConfigurationError(f"max_age: expected 0 or more seconds, got {max_age!r}")
+        max_age = check_age(max_age, "max_age")
+        timeout = check_seconds_or_none(timeout, "timeout")
         what = f"a frame of the last {max_age:g} s"
         held = self._next or self._last
         if held is not None and held.age <= max_age:
@@ -139,8 +142,8 @@ class FrameReader:
 
         Cancellation: safe; frames that came before are skipped.
         """
-        if not math.isfinite(moment):
-            raise ConfigurationError(f"moment: expected seconds, got {moment!r}")
+        moment = check_moment(moment, "moment")
+        timeout = check_seconds_or_none(timeout, "timeout")
         for held in (self._last, self._next):
             if held is not None and held.began >= moment:
                 return self._taken(held)
@@ -156,6 +159,8 @@ class FrameReader:
 
         Cancellation: safe.
         """
+        check_moment(since, "since")
+        check_moment(until, "until")
         loop = asyncio.get_running_loop()
         while not self._ended and loop.time() < until:
             if self._next is not None and self.came >= since:
@@ -164,8 +169,23 @@ class FrameReader:
 
     @property
     def came(self) -> float:
-        """When the newest frame came here, on the loop's clock; 0.0 before the first."""
+        """Time of the newest frame's arrival on the loop's clock; 0.0 before the first."""
         return 0.0 if self._source is None else self._source._last_came  # noqa: SLF001
+
+    def check_not_ended(self) -> None:
+        """Raise the error that the source ended with, where it ended.
+
+        Raises:
+            FrameSourceError: it ended.
+        """
+        if self._ended:
+            ended = FrameSourceError(f"{self._name}: it ended", source=self._name)
+            raise self._error or ended
+
+    def _waits(self) -> str:
+        """Return the trigger that the device waits for, behind an error's text."""
+        waits = "" if self._source is None else self._source.driver.waits_for
+        return f": {waits}, and nothing triggered it" if waits else ""
 
     async def _first(
         self, what: str, timeout: float | None, wanted: Callable[[Frame], bool]
@@ -185,10 +205,6 @@ class FrameReader:
     def _deadline(timeout: float | None) -> float | None:
         if timeout is None:
             return None
-        if not timeout >= 0:
-            raise ConfigurationError(
-                f"timeout: expected 0 or more seconds or None, got {timeout!r}"
-            )
         return asyncio.get_running_loop().time() + timeout
 
     async def _take(self, end: float | None, what: str) -> Frame | None:
@@ -196,7 +212,8 @@ class FrameReader:
         while self._next is None and not self._ended:
             if not await self._woken(end):
                 raise FrameTimeoutError(
-                    f"{self._name}: expected {what}, got none in time", source=self._name
+                    f"{self._name}: expected {what}, got none in time{self._waits()}",
+                    source=self._name,
                 )
         if self._next is not None:
             return self._taken(self._next)
@@ -251,6 +268,72 @@ class FrameReader:
                 self._source._took.set()  # noqa: SLF001 - the two are one
         self._last = frame
         return frame
+
+
+class FrameTap(FrameReader):
+    """A reader that has every frame handed on as it comes, where others get the newest one.
+
+    While ``busy`` says so it holds the last frame back, for which a source waits that can wait,
+    such as a file. It hands that on when another one comes.
+
+    Args:
+        source: open source; the device streams from now on.
+        take: function that takes a frame and returns at once: False where it did not want it,
+            which counts as skipped.
+        busy: function that returns True where frames had better come later.
+    """
+
+    def __init__(
+        self, source: FrameSource, take: Callable[[Frame], bool], busy: Callable[[], bool]
+    ) -> None:
+        super().__init__(source, None)
+        self._take_frame, self._busy = take, busy
+        source.attach(self)
+
+    async def ended(self) -> None:
+        """Wait until the source has ended, and hand everything on.
+
+        Raises:
+            FrameSourceError: the source ended with it.
+
+        Cancellation: safe.
+        """
+        loop = asyncio.get_running_loop()
+        while not self._ended:
+            await self._woken(loop.time() + RELEASE_INTERVAL)
+            if self._next is not None and not self._busy():
+                self._hand_on(self._next)
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Read no longer; a frame that was held back is handed on. Idempotent."""
+        if self._next is not None:
+            self._hand_on(self._next)
+        super().close()
+
+    def _offer(self, frame: Frame) -> None:
+        self._offered += 1
+        if self._next is not None:
+            self._hand_on(self._next)
+        if self._busy():
+            self._next = frame
+        else:
+            self._hand_on(frame)
+
+    def _hand_on(self, frame: Frame) -> None:
+        self._next = None
+        if self._take_frame(frame):
+            self._delivered += 1
+        else:
+            self._skipped += 1
+        if self._source is not None:
+            self._source._took.set()  # noqa: SLF001 - the two are one
+
+    def _end(self, error: FrameSourceError | None) -> None:
+        if self._next is not None:
+            self._hand_on(self._next)
+        super()._end(error)
 
 
 def _settle(waiter: asyncio.Future[bool], came: bool) -> None:

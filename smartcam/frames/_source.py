@@ -3,51 +3,71 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import logging
-import math
 import time
+import warnings
 import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import (
+    check_age,
+    check_callable,
+    check_choice,
+    check_moment,
+    check_number,
+    check_seconds,
+    check_seconds_or_none,
+)
+from smartcam._finishing import finish
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import (
-    ConfigurationError,
     FrameFormatError,
     FrameSourceError,
     LocalProtocolError,
 )
 from smartcam.frames._clocks import DeviceClock
-from smartcam.frames._driver import FrameSink
+from smartcam.frames._driver import FrameDriver, FrameSink
+from smartcam.frames._events import FrameEvents
+from smartcam.frames._features import FrameFeatures
 from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
+from smartcam.frames._trigger import TriggerQueue
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable, Coroutine
     from types import EllipsisType
-    from typing import Self
+    from typing import Literal, Self
 
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.exceptions import SmartCamError
     from smartcam.frames._clocks import ClockStatistics
-    from smartcam.frames._driver import FrameDriver, StreamFormat
+    from smartcam.frames._driver import StreamFormat
+    from smartcam.frames._events import FrameEvent
+    from smartcam.frames._features import DeviceFeatures
     from smartcam.frames._frame import Frame
+    from smartcam.geometry import CameraModel
 
 
 _log = logging.getLogger(__name__)
 
+MAX_LINGER = 3600.0
+"""Seconds that a device may go on streaming after the last reader at most."""
+
 
 @dataclass(frozen=True, slots=True)
 class SourceStatistics:
-    """What a source did since it was opened.
+    """Counts of a source since it was opened.
 
     Attributes:
         streaming: whether the device streams now.
-        readers: who reads now.
-        started: how often the device began to stream.
-        frames: came, for readers or not.
-        lost: never came: lost in the camera or on the way.
-        ahead: frames whose time was later than that of their arrival; they have that of the
-            arrival instead.
-        clock: of the camera's own clock; None: it has none.
+        readers: number of present readers.
+        started: number of times that the device began to stream.
+        frames: frames that came, with or without a reader.
+        lost: frames that never came: lost in the camera or on the way.
+        ahead: frames whose time was later than their arrival; the time of the arrival replaced it.
+        clock: drift and jumps of the camera's own clock; None: the camera has none.
     """
 
     streaming: bool
@@ -86,17 +106,15 @@ class FrameSource(FrameSink):
         stall: float | None = 5.0,
         linger: float = 0.0,
     ) -> None:
-        for name, value in (("timeout", timeout), ("stall", stall)):
-            if value is not None and not 0 < value < math.inf:
-                raise ConfigurationError(f"{name}: expected seconds above 0 or None, got {value!r}")
-        if not 0 <= linger <= 3600:
-            raise ConfigurationError(f"linger: expected 0 to 3600 seconds, got {linger!r}")
+        self._timeout = check_seconds_or_none(timeout, "timeout", above=True)
+        self._stall = check_seconds_or_none(stall, "stall", above=True)
+        self._linger = check_number(linger, "linger", 0, MAX_LINGER, unit="seconds")
         self._driver = driver
         self._camera_info = camera_info
-        self._timeout, self._stall, self._linger = timeout, stall, linger
         self._readers: set[weakref.ref[FrameReader]] = set()
         self._format: StreamFormat | None = None
-        self._task: asyncio.Task[None] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # while it is open
+        self._task: asyncio.Task[None] | None = None  # while somebody reads, and it lingers
         self._changed = asyncio.Event()  # readers came or went, or the driver ended
         self._took = asyncio.Event()  # a reader took a frame, or went
         self._held_up = False  # the driver waits for readers
@@ -105,6 +123,8 @@ class FrameSource(FrameSink):
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
         self._newest: Frame | None = None
+        self._again = False  # the stream is to begin anew
+        self._triggers = TriggerQueue(self)
         self._last_came = self._idle_since = 0.0  # on the loop's clock
 
     @property
@@ -114,22 +134,75 @@ class FrameSource(FrameSink):
 
     @property
     def driver(self) -> FrameDriver:
-        """The device's driver, for what only its kind can, such as a V4L2 device's controls."""
+        """The device's driver, for what only its kind can."""
         return self._driver
 
     @property
+    def features(self) -> FrameFeatures:
+        """Features of the device: ``await source.features["ExposureTime"].set(5000.0)``.
+
+        GigE Vision cameras have those of their GenICam description, V4L2 devices their controls.
+        """
+        return FrameFeatures(self._device_features, self._feature_changed)
+
+    @property
+    def has_features(self) -> bool:
+        """True if devices of this kind have features that can be read and set."""
+        return type(self._driver).features is not FrameDriver.features
+
+    def events(self, *names: str, size: int = 1000, timeout: float | None = None) -> FrameEvents:
+        """Return the events that the device tells, such as ``ExposureEnd``; see the class.
+
+        Args:
+            *names: names of the events, as ``EventSelector`` has them.
+            size: events that are kept for a reader that is slow.
+            timeout: seconds that an iteration waits for an event; None: as long as it takes.
+
+        Raises:
+            ConfigurationError: no name, or a number that is none.
+        """
+        return FrameEvents(self, names, size, timeout)
+
+    async def watch_events(
+        self,
+        names: tuple[str, ...],
+        take: Callable[[FrameEvent], None],
+        ended: Callable[[FrameSourceError | None], None],
+    ) -> Callable[[], Coroutine[Any, Any, None]]:
+        """Have the device tell events, as :meth:`FrameDriver.watch_events` does.
+
+        Raises:
+            LocalProtocolError: the source is not open.
+            FrameSourceError: the device has no such event, or does not answer.
+        """
+        if self._loop is None:
+            raise LocalProtocolError(f"{self.name} is not open: use `async with`")
+        return await self._driver.watch_events(names, take, ended)
+
+    def _device_features(self) -> DeviceFeatures:
+        if self._loop is None:
+            raise LocalProtocolError(f"{self.name} is not open: use `async with`")
+        return self._driver.features
+
+    async def _feature_changed(self) -> None:
+        """Take the format that the device has since a feature was set."""
+        if self._loop is not None and self._driver.form is not None:
+            self._format = self._driver.form
+        self._changed.set()
+
+    @property
     def format(self) -> StreamFormat:
-        """What it streams.
+        """Format of the stream.
 
         Raises:
             LocalProtocolError: it is not open.
         """
         if self._format is None:
-            raise LocalProtocolError(f"{self.name} is not open: async with it")
+            raise LocalProtocolError(f"{self.name} is not open: use `async with`")
         return self._format
 
     def statistics(self) -> SourceStatistics:
-        """Return what it did since it was opened."""
+        """Return the counts of the source since it was opened."""
         return SourceStatistics(
             self._streaming,
             len(self._readers),
@@ -148,15 +221,30 @@ class FrameSource(FrameSink):
 
         Cancellation: nothing stays open.
         """
-        if self._task is not None:
+        if self._loop is not None:
             raise LocalProtocolError(f"{self.name} is open already")
         try:
             self._format = self._checked(await self._driver.open())
         except BaseException:
             await self._driver.close()
             raise
-        self._task = asyncio.create_task(self._run(), name=f"frames of {self.name}")
+        self._loop = asyncio.get_running_loop()
         return self
+
+    def _begin(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Have the device stream: somebody reads."""
+        self._task = loop.create_task(self._run(), name=f"frames of {self.name}")
+        self._task.add_done_callback(self._stopped)
+
+    def _stopped(self, task: asyncio.Task[None]) -> None:
+        """Begin again for who came meanwhile; tell readers where somebody cancelled the task."""
+        if task is not self._task or self._loop is None:
+            return
+        self._task = None
+        if task.cancelled() or task.exception() is not None:
+            self._tell(FrameSourceError(f"{self.name}: its task was cancelled", source=self.name))
+        elif self._readers:
+            self._begin(self._loop)
 
     def _checked(self, form: StreamFormat) -> StreamFormat:
         size = (form.width, form.height)
@@ -177,22 +265,34 @@ class FrameSource(FrameSink):
 
         Cancellation: the device is given back first; how long that takes its driver bounds.
         """
+        loop, self._loop = self._loop, None
         task, self._task, self._format = self._task, None, None
         for reader in self._alive():
             reader.close()
-        if task is None:
+        if loop is None:
             return
-        task.cancel()
-        cancelled: asyncio.CancelledError | None = None
-        while not task.done():
-            try:
-                await asyncio.wait([task])
-            except asyncio.CancelledError as again:
-                cancelled = again
-        if cancelled is not None:
-            raise cancelled
-        if not task.cancelled() and (error := task.exception()) is not None:
+        if task is not None:
+            task.cancel()
+        await finish(partial(self._give_back, task))
+
+    async def _give_back(self, task: asyncio.Task[None] | None) -> None:
+        """Close the device when the task has ended, whether that ever began."""
+        if task is not None:
+            await asyncio.wait({task})
+        await self._driver.close()
+        if task is not None and not task.cancelled() and (error := task.exception()) is not None:
             raise error
+
+    def __del__(self) -> None:
+        loop: asyncio.AbstractEventLoop | None = getattr(self, "_loop", None)
+        if loop is None:
+            return
+        warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(_close, loop, self._driver)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name}>"
 
     def reader(self, *, timeout: float | EllipsisType | None = ...) -> FrameReader:
         """Begin to read; the device streams from now on.
@@ -204,9 +304,12 @@ class FrameSource(FrameSink):
         Raises:
             LocalProtocolError: the source is not open.
         """
-        if self._task is None:
-            raise LocalProtocolError(f"{self.name} is not open: async with it, then read")
-        reader = FrameReader(self, self._timeout if timeout is ... else timeout)
+        if timeout is ...:
+            timeout = self._timeout
+        seconds = check_seconds_or_none(timeout, "timeout")
+        if self._loop is None:
+            raise LocalProtocolError(f"{self.name} is not open: use `async with`, then read")
+        reader = FrameReader(self, seconds)
         self.attach(reader)
         return reader
 
@@ -214,6 +317,8 @@ class FrameSource(FrameSink):
         """Have a reader hear of frames from now on."""
         self._readers.add(weakref.ref(reader, self._dropped))
         self._changed.set()
+        if self._task is None and self._loop is not None:
+            self._begin(self._loop)
 
     def __aiter__(self) -> FrameReader:
         return self.reader()
@@ -224,6 +329,8 @@ class FrameSource(FrameSink):
         Who asks often keeps a reader, or opens the source with ``linger``: without either the
         device begins to stream for each.
         """
+        max_age = check_age(max_age, "max_age")
+        timeout = check_seconds_or_none(timeout, "timeout")
         async with self.reader() as reader:
             if self._newest is not None and self._newest.age <= max_age:
                 return self._newest
@@ -231,23 +338,90 @@ class FrameSource(FrameSink):
 
     async def after(self, moment: float, *, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the first frame exposed after a moment, as :meth:`FrameReader.after` does."""
+        moment = check_moment(moment, "moment")
+        timeout = check_seconds_or_none(timeout, "timeout")
         async with self.reader() as reader:
             if self._newest is not None and self._newest.began >= moment:
                 return self._newest
             return await reader.after(moment, timeout=timeout)
 
+    async def trigger(
+        self,
+        *,
+        timeout: float = FRAME_TIMEOUT,
+        when_busy: Literal["wait", "refuse"] = "wait",
+        fire: Callable[[], Awaitable[object]] | None = None,
+    ) -> Frame:
+        """Trigger the device once, and return the picture that this trigger caused.
+
+        It is never a picture that was exposed before, and never that of an earlier trigger, also
+        where the earlier one was cancelled or timed out: the stream begins anew then.
+        :attr:`Frame.trigger` says on what that rests. The device streams for the trigger; one who
+        triggers often keeps a reader, or opens the source with ``linger``.
+
+        Args:
+            timeout: seconds for everything: waiting for its turn, the start of the stream, the
+                trigger and its picture.
+            when_busy: whether to wait for a trigger that is under way, or to raise.
+            fire: coroutine function that sets the line of ``TriggerSource``; None: the device is
+                triggered by its command ``TriggerSoftware``.
+
+        Raises:
+            UnsupportedError: a source of this kind has no trigger.
+            NotRunningError: the device is not set to be triggered so; the text says what to set.
+            CameraBusyError: another trigger is under way, and ``when_busy`` is ``refuse``; or the
+                device takes none now.
+            OvertriggeredError: the device says that it missed the trigger.
+            FrameLostError: the picture, or one that may be it, was lost on its way.
+            TriggerTimeoutError: no picture came within ``timeout``.
+            FrameSourceError: the device does not stream, or is gone.
+
+        Cancellation: the source works on; a picture that still comes is given to readers only.
+        """
+        seconds = check_seconds(timeout, "timeout", "trigger", above=True)
+        check_choice(when_busy, "when_busy", ("wait", "refuse"), "trigger")
+        if fire is not None:
+            check_callable(fire, "fire", "trigger")
+        if self._loop is None:
+            raise LocalProtocolError(f"{self.name} is not open: use `async with`, then trigger")
+        return self._seen(await self._triggers.trigger(seconds, when_busy == "refuse", fire))
+
+    def _seen(self, frame: Frame) -> Frame:
+        """Return a frame with the lens that was given for the source."""
+        if self._camera_info is None or frame.camera_info is not None:
+            return frame
+        return dataclasses.replace(frame, camera_info=self._camera_info)
+
+    async def wait_until_streaming(self, reader: FrameReader, *, anew: bool) -> None:
+        """Wait until the device streams; with ``anew`` the stream begins once more.
+
+        Raises:
+            FrameSourceError: it does not begin to stream.
+        """
+        if anew and self._streaming:
+            self._again = True
+            self._changed.set()
+        while not self._streaming or self._again:
+            reader.check_not_ended()
+            self._changed.clear()
+            await self._changed.wait()
+
     # what the driver says
+
+    def trigger_failed(self, error: SmartCamError) -> None:
+        """Take from the driver that the picture of the trigger under way will not come."""
+        self._triggers.failed(error)
 
     def frame(self, frame: Frame) -> None:
         """Take a frame from the driver."""
         if frame.lost:
             self.lost(frame.lost)
         self._last_came = asyncio.get_running_loop().time()
-        frame = self._timed(frame, time.monotonic())
-        if self._camera_info is not None and frame.camera_info is None:
-            frame = dataclasses.replace(frame, camera_info=self._camera_info)
+        frame = self._seen(self._timed(frame, time.monotonic()))
         self._frames += 1
         self._newest = frame
+        if frame.trigger is not None:
+            self._triggers.came(frame)
         for reader in self._alive():
             reader._offer(frame)  # noqa: SLF001 - the two are one
 
@@ -304,8 +478,8 @@ class FrameSource(FrameSink):
 
     def _dropped(self, one: weakref.ref[FrameReader]) -> None:
         self._readers.discard(one)
-        if not self._readers and self._task is not None:
-            self._idle_since = self._task.get_loop().time()
+        if not self._readers and self._loop is not None:
+            self._idle_since = self._loop.time()
         self._changed.set()
         self._took.set()
 
@@ -314,33 +488,37 @@ class FrameSource(FrameSink):
 
     async def _run(self) -> None:
         """Stream while somebody reads."""
-        try:
-            while True:
-                await self._until_changed(lambda: bool(self._readers))
-                try:
-                    await self._stream()
-                except FrameSourceError as error:
-                    self._tell(error)
-                except Exception as error:  # noqa: BLE001 - a driver may be anybody's
-                    _log.exception("%s: its driver failed", self.name)
-                    self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
-        finally:
-            self._newest = None
-            await self._driver.close()
+        while self._readers:
+            try:
+                await self._stream()
+            except FrameSourceError as error:
+                self._tell(error)
+            except asyncio.CancelledError:
+                raise
+            except ENDS_PROGRAM:
+                raise
+            except BaseException as error:  # noqa: BLE001 - a driver may be anybody's
+                _log.exception("%s: its driver failed", self.name)
+                self._tell(FrameSourceError(f"{self.name}: {error!r}", source=self.name))
 
     async def _stream(self) -> None:
         """Have the device stream until nobody reads, or it ends."""
         self._over = None
         self._newest = None
+        self._again = False
         try:
             await self._driver.start(self)
+            self._triggers.settled = True
             self._streaming = True
             self._started += 1
+            await self._feature_changed()
             self._last_came = asyncio.get_running_loop().time()
             await self._while_read()
         finally:
             self._streaming = False
             self._newest = None
+            ended = FrameSourceError(f"{self.name}: its stream ended", source=self.name)
+            self._triggers.failed((self._over and self._over[0]) or ended)
             await self._driver.stop()
         over, self._over = self._over, None
         if over is not None:
@@ -348,13 +526,14 @@ class FrameSource(FrameSink):
 
     async def _while_read(self) -> None:
         """Wait until the driver ended, it is stuck, or nobody reads for as long as it lingers."""
-        while self._over is None:
+        while self._over is None and not self._again:
             if not self._readers:
                 left = self._idle_since + self._linger - asyncio.get_running_loop().time()
                 if not await self._within(left, lambda: bool(self._readers)) and left <= 0:
                     return
-            elif self._stall is None:
-                await self._until_changed(lambda: not self._readers)
+            elif self._stall is None or self._driver.waits_for:
+                await self._until_changed(partial(self._is_free_of, self._driver.waits_for))
+                self._last_came = asyncio.get_running_loop().time()
             else:
                 left = self._last_came + self._stall - asyncio.get_running_loop().time()
                 if left <= 0 and self._held_up:
@@ -366,6 +545,10 @@ class FrameSource(FrameSink):
                     )
                 await self._within(left, lambda: not self._readers)
 
+    def _is_free_of(self, waits_for: str) -> bool:
+        """Return True if nobody reads, or the device no longer waits for the same."""
+        return not self._readers or self._driver.waits_for != waits_for
+
     async def _within(self, seconds: float, reached: Callable[[], bool]) -> bool:
         """Wait for a change; return whether it came in time."""
         try:
@@ -376,12 +559,24 @@ class FrameSource(FrameSink):
         return True
 
     async def _until_changed(self, reached: Callable[[], bool]) -> None:
-        while not (reached() or self._over is not None):
+        while not (reached() or self._over is not None or self._again):
             self._changed.clear()
             await self._changed.wait()
 
     def _tell(self, error: FrameSourceError | None) -> None:
         """End all readers; one that comes later has the device tried again."""
+        if error is not None:
+            self._triggers.failed(error)
         for reader in self._alive():
             reader._end(error)  # noqa: SLF001
             self._forget(reader)
+
+
+_closing: set[asyncio.Task[None]] = set()
+"""Tasks that give devices back whose sources nobody had any more."""
+
+
+def _close(loop: asyncio.AbstractEventLoop, driver: FrameDriver) -> None:
+    task = loop.create_task(driver.close(), name=f"closing {driver.name}")
+    _closing.add(task)
+    task.add_done_callback(_closing.discard)

@@ -1,4 +1,4 @@
-"""What is done to frames on their way: the lens taken out."""
+"""Process frames on their way: take the lens out."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 from smartcam.exceptions import ConfigurationError, FrameFormatError
+from smartcam.geometry import CameraModel
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration._stereo.rectification import Rectification
+    from smartcam.calibration._inside import Rectification
     from smartcam.frames._frame import Frame
     from smartcam.frames._group import FrameSet
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.frames._driver import FrameDriver, StreamFormat
 from smartcam.frames._frame import Frame, Moment
-from smartcam.frames._optional_imports import load
-from smartcam.frames._pixels import find_format
+from smartcam.frames._pixels.formats import find_format
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink
-    from smartcam.frames._pixels import PixelFormat
+    from smartcam.frames._pixels.formats import PixelFormat
 
 
-BITS: Final = 64
-"""Of each of the two rows of a stamp."""
+STAMP_BITS: Final = 64
+"""Bits of each of the two numbers in a stamp."""
 
-CELL: Final = 4
-"""Pixels along a side of a bit."""
+BIT_SIDE_PX: Final = 4
+"""Pixels along a side of the square that shows a bit."""
 
-LEAST: Final = (BITS * CELL, 4 * CELL)
-"""Pixels of the smallest picture that a stamp has room in."""
+MIN_SIZE_PX: Final = (STAMP_BITS * BIT_SIDE_PX, 4 * BIT_SIDE_PX)
+"""Width and height, in pixels, of the smallest picture that has room for a stamp."""
 
 
 class SyntheticDriver(FrameDriver):
@@ -47,9 +47,11 @@ class SyntheticDriver(FrameDriver):
         super().__init__(address)
         said = address.parameters(["size", "fps", "name", "format"])
         self._size = address.size(said.get("size", "640x480"))
-        if self._size[0] < LEAST[0] or self._size[1] < LEAST[1]:
+        if self._size[0] < MIN_SIZE_PX[0] or self._size[1] < MIN_SIZE_PX[1]:
             raise address.wrong(
-                "size", f"{LEAST[0]}x{LEAST[1]} or more, room for the stamp", said["size"]
+                "size",
+                f"{MIN_SIZE_PX[0]}x{MIN_SIZE_PX[1]} or more, room for the stamp",
+                said["size"],
             )
         self._format = _format(address, said.get("format", "Mono8"))
         self._rate = address.number("fps", said.get("fps", "30"), 0.01, 10_000)
@@ -63,10 +65,10 @@ class SyntheticDriver(FrameDriver):
         return self._name
 
     async def open(self) -> StreamFormat:
-        """Return what it draws.
+        """Return the format, size and rate of the pictures drawn.
 
         Raises:
-            MissingExtraError: MJPEG, and the extra ``frames`` is not installed.
+            MissingExtraError: the format is MJPEG, and the extra ``frames`` is not installed.
         """
         _FORMATS[self._format.name](stripes(*self._size))
         return StreamFormat(self._format, *self._size, (self._rate,))
@@ -137,7 +139,7 @@ _FORMATS: Final[dict[str, Callable[[NDArray[np.uint8]], bytes]]] = {
     "Coord3D_C16": lambda picture: (picture.astype("<u2") * 16).tobytes(),
     "MJPEG": _jpeg,
 }
-"""What makes bytes of a grey picture."""
+"""The function that makes a format's bytes of a grey picture."""
 
 
 def _format(address: FrameAddress, name: str) -> PixelFormat:
@@ -159,10 +161,10 @@ def write_stamp(picture: NDArray[np.uint8], number: int, nanoseconds: int) -> No
     """Draw a stamp into the upper left corner of (H, W) or (H, W, C)."""
     for row, value in enumerate((number, nanoseconds)):
         for half, shown in enumerate((value, ~value)):  # its complement tells a torn or damaged one
-            bits = (shown >> np.arange(BITS, dtype=object)) & 1
-            cells = np.repeat(np.array(bits, np.uint8) * 219 + 16, CELL)
-            top = (2 * row + half) * CELL
-            band = picture[top : top + CELL, : BITS * CELL]
+            bits = (shown >> np.arange(STAMP_BITS, dtype=object)) & 1
+            cells = np.repeat(np.array(bits, np.uint8) * 219 + 16, BIT_SIDE_PX)
+            top = (2 * row + half) * BIT_SIDE_PX
+            band = picture[top : top + BIT_SIDE_PX, : STAMP_BITS * BIT_SIDE_PX]
             band[...] = cells if picture.ndim == 2 else cells[:, None]
 
 
@@ -175,15 +177,17 @@ def read_stamp(picture: NDArray[Any]) -> tuple[int, int] | None:
     Returns:
         None where there is no stamp, or it is damaged.
     """
-    if picture.shape[0] < LEAST[1] or picture.shape[1] < LEAST[0]:
+    if picture.shape[0] < MIN_SIZE_PX[1] or picture.shape[1] < MIN_SIZE_PX[0]:
         return None
     grey = picture if picture.ndim == 2 else picture.mean(axis=2)
-    cells = grey[: 4 * CELL, : BITS * CELL].reshape(4, CELL, BITS, CELL)
+    cells = grey[: 4 * BIT_SIDE_PX, : STAMP_BITS * BIT_SIDE_PX].reshape(
+        4, BIT_SIDE_PX, STAMP_BITS, BIT_SIDE_PX
+    )
     means = cells[:, 1:-1, :, 1:-1].mean(axis=(1, 3))
     bits = means > (means.min() + means.max()) / 2
     if (bits[0::2] == bits[1::2]).any():
         return None
-    weights = [1 << place for place in range(BITS)]
+    weights = [1 << place for place in range(STAMP_BITS)]
     number, nanoseconds = (
         sum(weight for weight, one in zip(weights, row, strict=True) if one) for row in bits[0::2]
     )

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from smartcam.depth import SpatialFilter, TemporalFilter, fill_holes
 from smartcam.depth._cleaning import _widened, as_metres
-from smartcam.depth._simulation import FINE, TowerTable, WoodenBlock, _jumps, _TableRays
+from smartcam.depth._inside import TowerTable, WoodenBlock
+from smartcam.depth._simulation import FINE, _jumps, _TableRays
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 
 NEAR, FAR, SIGMA = 0.45, 0.50, 0.002

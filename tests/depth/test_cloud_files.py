@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ CLOUD = Cloud(
 PLY_HEAD = """\
 ply
 format {} 1.0
+comment unit m
 element vertex 2
 property float x
 property float y
@@ -44,6 +46,7 @@ PLY_TEXT = PLY_HEAD.format("ascii").encode() + (
     b"1.5 -2 0.100000001 255 128 1 0.5\n0 4 -8.25 0 2 3 0.00100000005\n"
 )
 PCD_HEAD = """\
+# unit m
 VERSION 0.7
 FIELDS x y z rgb sigma
 SIZE 4 4 4 4 4
@@ -80,7 +83,7 @@ def same(one: Cloud, other: Cloud) -> bool:
 def loaded(folder: Path, name: str, data: bytes) -> Cloud:
     path = folder / name
     path.write_bytes(data)
-    return load_cloud(path)
+    return load_cloud(path, unit="m")
 
 
 @pytest.mark.parametrize(("name", "text", "data"), GOLDEN)
@@ -240,7 +243,7 @@ def test_files_that_cannot_be_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         load_cloud(tmp_path / "a.ply")
     with pytest.raises(ConfigurationError, match="cannot be written: No such file"):
         save_cloud(tmp_path / "no" / "a.ply", CLOUD)
-    monkeypatch.setattr(files_module, "MAX_BYTES", 100)
+    monkeypatch.setattr(files_module, "MAX_FILE_BYTES", 100)
     with pytest.raises(FrameFormatError, match="100 bytes at most"):
         loaded(tmp_path, "a.ply", PLY_BYTES)
 
@@ -291,3 +294,38 @@ def test_torn_and_mixed_files_are_clouds_or_typed_errors(
 def test_any_bytes_unpack_or_are_refused(data: bytes, size: int) -> None:
     with contextlib.suppress(BadTableError):
         assert len(unpacked(data, size)) == size
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.ply", PLY_TEXT.replace(b"comment unit m\n", b"")),
+        ("a.pcd", PCD_BYTES.replace(b"# unit m\n", b"# .PCD v0.7\n")),
+        (
+            "scan.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty short x\nproperty short y\n"
+            b"property short z\nend_header\n120 -35 842\n",
+        ),
+    ],
+)
+def test_cloud_that_does_not_say_its_unit_is_asked_for_it(
+    tmp_path: Path, name: str, data: bytes
+) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(FrameFormatError, match=r'expected a unit, .* give unit="m" or unit="mm"'):
+        load_cloud(tmp_path / name)
+    metres, millimetres = (load_cloud(tmp_path / name, unit=unit) for unit in ("m", "mm"))
+    np.testing.assert_allclose(1000 * millimetres.points, metres.points, rtol=1e-6)
+    if metres.sigma is not None and millimetres.sigma is not None:
+        np.testing.assert_allclose(1000 * millimetres.sigma, metres.sigma, rtol=1e-6)
+
+
+def test_cloud_of_millimetres_says_so_in_a_comment(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(PLY_TEXT.replace(b"unit m\n", b"unit mm\n"))
+    np.testing.assert_allclose(load_cloud(tmp_path / "a.ply").points, CLOUD.points / 1000)
+
+
+def test_cloud_in_a_unit_of_no_name_is_refused(tmp_path: Path) -> None:
+    unit: Any = "furlong"
+    with pytest.raises(ConfigurationError, match="expected one of m, cm, mm, inch, got 'furlong'"):
+        load_cloud(tmp_path / "a.ply", unit=unit)

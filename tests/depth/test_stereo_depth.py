@@ -15,15 +15,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from smartcam.calibration import CameraModel, Transform
-from smartcam.calibration._geometry.rigid import exp_rotation
-from smartcam.calibration._stereo.calibration import StereoCalibration, calibrate_stereo
-from smartcam.calibration._stereo.rectification import _parallel, rectify
+from smartcam.calibration import CameraModel, StereoCalibration, Transform, calibrate_stereo
+from smartcam.calibration._inside import rectify
+from smartcam.calibration._stereo.rectification import _parallel
 from smartcam.calibration.formats import CameraChain, write_camera_info
 from smartcam.depth import StereoDepth, StereoMatcher, read_camera_infos
 from smartcam.depth._pair import CalibratedPair, _spread, scaled
 from smartcam.depth._stereo import _bytes
-from smartcam.depth._subpixel import COARSE
+from smartcam.depth._subpixel import MIN_COARSE_SIGMA_PX
 from smartcam.exceptions import (
     CalibrationError,
     ConfigurationError,
@@ -32,6 +31,7 @@ from smartcam.exceptions import (
     LocalProtocolError,
 )
 from smartcam.frames import Frame, FrameReader, FrameSource, find_format
+from smartcam.geometry._inside import exp_rotation
 from tests.calibration.lenskit import pairs
 from tests.depth.scenes import Room
 from tests.frames.drivers import GoneError, ScriptedDriver, frame
@@ -131,7 +131,7 @@ async def test_two_cameras_see_the_depth_that_is_there_and_how_sure_it_is() -> N
     error = found.depth - truth(found.camera_info)
     focal = found.camera_info.matrix[0, 0]
     sigma_disparity = found.sigma * focal * found.baseline / np.maximum(found.depth, 0.1) ** 2
-    fine = known & (sigma_disparity < COARSE)
+    fine = known & (sigma_disparity < MIN_COARSE_SIGMA_PX)
     assert fine.sum() > 0.9 * known.sum()
     assert np.median(np.abs(error[fine])) < 0.006
     spread = 1.4826 * np.median(np.abs(error[fine]) / found.sigma[fine])

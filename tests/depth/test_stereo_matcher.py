@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 from smartcam.depth import Disparity, StereoMatcher
-from smartcam.depth._subpixel import COARSE
+from smartcam.depth._subpixel import MIN_COARSE_SIGMA_PX
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from tests.depth.scenes import Scene, plane, step
 
@@ -43,7 +43,7 @@ def rms(values: NDArray[Any]) -> float:
 def compared(found: Disparity, scene: Scene) -> Compared:
     error = found.pixels - scene.truth
     known = np.isfinite(found.pixels) & scene.seen
-    fine = known & (found.sigma < COARSE)
+    fine = known & (found.sigma < MIN_COARSE_SIGMA_PX)
     return Compared(
         known.sum() / scene.seen.sum(),
         fine.sum() / known.sum(),
@@ -77,11 +77,24 @@ def test_the_noise_that_is_told_is_the_noise_that_is_found(name: str) -> None:
     assert 0.8 < seen.ratio < 1.2  # of each pixel, not only of all together
 
 
+@pytest.mark.parametrize("gain", [0.85, 1.15])
+@pytest.mark.parametrize("name", ["little noise", "some noise", "much noise", "fine", "both"])
+def test_unlike_exposures_cost_neither_the_disparity_nor_its_sigma(name: str, gain: float) -> None:
+    scene = SCENES[name]()
+    right = np.clip(np.round(scene.right * gain - 5), 0, 255).astype(np.uint8)
+    alike = compared(matcher()(scene.left, scene.right), scene)
+    seen = compared(matcher()(scene.left, right), scene)
+    assert seen.refined > 0.85
+    assert seen.found < 1.25 * alike.found  # of a constant alone it was six times as much
+    assert 0.8 < seen.told / seen.found < 1.2
+    assert 0.8 < seen.ratio < 1.2
+
+
 def test_refined_disparities_are_four_times_as_good_as_opencv_s() -> None:
     scene = SCENES["some noise"]()
     ours, opencv = (matcher(refine=side)(scene.left, scene.right) for side in (9, 0))
-    assert np.nanmin(opencv.sigma) == np.nanmax(opencv.sigma) == COARSE
-    known = np.isfinite(ours.pixels) & (ours.sigma < COARSE) & scene.seen
+    assert np.nanmin(opencv.sigma) == np.nanmax(opencv.sigma) == MIN_COARSE_SIGMA_PX
+    known = np.isfinite(ours.pixels) & (ours.sigma < MIN_COARSE_SIGMA_PX) & scene.seen
     errors = [rms((one.pixels - scene.truth)[known]) for one in (ours, opencv)]
     assert errors[0] * 4 < errors[1]
     assert abs(np.mean((ours.pixels - scene.truth)[known])) < 0.005
@@ -137,7 +150,7 @@ def test_the_same_pictures_have_the_same_disparity_again() -> None:
 def test_pictures_without_texture_have_no_sure_disparity() -> None:
     flat = np.full((120, 160), 90, np.uint8)
     found = matcher()(flat, flat)
-    assert not (found.sigma < COARSE).any()
+    assert not (found.sigma < MIN_COARSE_SIGMA_PX).any()
 
 
 @pytest.mark.parametrize(

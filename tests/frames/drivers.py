@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import asyncio
 import time
 from typing import Any
@@ -38,6 +39,28 @@ def frame(number: int = 1, **other: Any) -> Frame:
         "source": "scripted",
     }
     return Frame(**(about | other))
+
+
+class ShowingDriver(FrameDriver):
+    """Shows what :meth:`show` says from each start to the next stop."""
+
+    _task: asyncio.Task[None] | None = None
+
+    @abc.abstractmethod
+    async def show(self, sink: FrameSink) -> None:
+        """Give frames until it is cancelled, or there are no more."""
+
+    async def start(self, sink: FrameSink) -> None:
+        self._task = asyncio.create_task(self.show(sink))
+
+    async def stop(self) -> None:
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def close(self) -> None:
+        await self.stop()
 
 
 class ScriptedDriver(FrameDriver):

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.frames import Frame, Moment, find_format
-from smartcam.frames._optional_imports import load
 from smartcam.frames._synthetic import stripes, write_stamp
 
 if TYPE_CHECKING:
@@ -130,6 +130,31 @@ def part(data: bytes) -> bytes:
     """Return a picture as a part of an MJPEG stream over HTTP."""
     head = b"--next\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(data)
     return head + data + b"\r\n"
+
+
+def length(data: bytes, more: int = 0) -> bytes:
+    """Return the head of a part, with a length that may be wrong."""
+    return b"Content-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % (len(data) + more)
+
+
+PARTS: dict[str, Callable[[bytes], bytes]] = {
+    "as it should be": lambda one: b"--b\r\n" + length(one) + one + b"\r\n",
+    "the boundary behind it": lambda one: length(one) + one + b"\r\n--b\r\n",
+    "no length": lambda one: b"--b\r\nContent-Type: image/jpeg\r\n\r\n" + one + b"\r\n",
+    "no head": lambda one: b"--b\r\n\r\n" + one,
+    "nothing between": lambda one: one,
+    "lines end with LF": lambda one: b"--b\n" + length(one).replace(b"\r", b"") + one + b"\n",
+    "a length that is too small": lambda one: b"--b\r\n" + length(one, -9) + one + b"\r\n",
+    "a length that is too large": lambda one: b"--b\r\n" + length(one, 99) + one + b"\r\n",
+    "a length of 0": lambda one: b"--b\r\nContent-Length: 0\r\n\r\n" + one + b"\r\n",
+    "zeros behind it": lambda one: b"--b\r\n" + length(one, 20) + one + bytes(20) + b"\r\n",
+    "another boundary": lambda one: b"----other\r\n" + length(one) + one + b"\r\n",
+    "a part of text between": lambda one: (
+        b"--b\r\nContent-Type: text/plain\r\n\r\nmotion: 1\r\n--b\r\n" + length(one) + one
+    ),
+    "many headers": lambda one: b"--b\r\n" + b"X-More: 1\r\n" * 90 + length(one) + one + b"\r\n",
+}
+"""Pictures as cameras send them, by their oddity."""
 
 
 def rtp_packets(data: bytes, sequence: int, stamp: int) -> list[bytes]:

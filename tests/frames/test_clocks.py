@@ -55,6 +55,20 @@ def test_frames_that_come_late_for_a_while_are_no_jump() -> None:
     assert clock.statistics().jumps == 0
 
 
+@pytest.mark.parametrize("queue", [1.5, 4.0, 20.0])
+@pytest.mark.parametrize("seconds", [2, 15, 60])
+def test_a_queue_on_the_way_is_no_clock_set_anew(queue: float, seconds: float) -> None:
+    clock = DeviceClock()
+    for number in range(int(10 * (seconds + 40))):
+        taken = number * 0.1
+        held = 0.0 if not 20 < taken < 20 + seconds else min(queue, taken - 20)
+        found = clock.captured(taken, taken + 0.001 + held)
+        assert found <= taken + 0.001 + 0.01 * seconds  # never much fresher than it is
+        if taken > 21 + seconds:
+            assert found == pytest.approx(taken + 0.001, abs=1e-3)
+    assert clock.statistics().jumps == 0
+
+
 def test_drift_is_not_told_before_there_is_enough() -> None:
     clock = DeviceClock()
     for number in range(7):

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from smartcam._extras import load
 from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
@@ -20,9 +21,8 @@ from smartcam.exceptions import (
     MissingExtraError,
 )
 from smartcam.frames import Codecs, find_format
-from smartcam.frames import _pictures as pictures
-from smartcam.frames._optional_imports import load
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._codecs import pictures
+from smartcam.frames._inside import read_stamp
 from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamped
 
 simplejpeg: Any = load("simplejpeg")
@@ -60,7 +60,7 @@ async def test_quality_is_the_caller_s(codecs: Codecs) -> None:
     sizes = [len((await codecs.jpeg(GREY, quality=quality)).data) for quality in (15, 50, 95)]
     assert sizes == sorted(sizes)
     assert sizes[0] < sizes[2]
-    with pytest.raises(ConfigurationError, match="quality: expected 1 to 100, got 0"):
+    with pytest.raises(ConfigurationError, match=r"quality: .* 1 to 100, got 0"):
         await codecs.jpeg(GREY, quality=0)
 
 
@@ -313,7 +313,7 @@ async def test_codecs_that_are_not_open_say_so() -> None:
     with pytest.raises(LocalProtocolError, match="async with"):
         await Codecs().jpeg(GREY)
     for threads in (0, 65):
-        with pytest.raises(ConfigurationError, match=f"threads: expected 1 to 64, got {threads}"):
+        with pytest.raises(ConfigurationError, match=f"threads: .* 1 to 64, got {threads}"):
             Codecs(threads)
 
 

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import Codecs, find_format
-from smartcam.frames._h264 import entry_point
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import entry_point, read_stamp
 from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamped
 
 if TYPE_CHECKING:

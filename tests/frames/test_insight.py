@@ -18,7 +18,7 @@ from smartcam.emulator import EmulatedInSight
 from smartcam.emulator._insight.image import bitmap
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.frames import Moment
-from smartcam.frames._bitmap import read_bitmap
+from smartcam.frames._inside import read_bitmap
 
 
 def picture(value: int) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,9 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameFormatError, MissingExtraError
 from smartcam.frames import find_format
-from smartcam.frames._pixels import PIXEL_FORMATS
+from smartcam.frames._pixels.colours import MATRICES as COLOUR_MATRICES
+from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
+from smartcam.frames._pixels.layouts import Planes, YuvPairs
 
 PACKED = [
     (b"\x23\x61\x45\xab\xcd", "Mono10p", [0x123, 0x158, 0x2B4, 0x336]),
@@ -178,15 +181,20 @@ def test_planes_with_padding_and_odd_size(name: str, planes: tuple[list[list[int
     assert found.array(data, 3, 3, 4).shape == (20,)
 
 
-def expected_rgb(y: int, u: int, v: int, name: str) -> list[float]:
+MATRICES = {"709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
+"""Shares of red and blue in Y: ITU-R BT.709-6 and BT.2020-2, tables 4; else BT.601-7's."""
+
+
+def expected_rgb(y: int, u: int, v: int, name: str, depth: int) -> list[float]:
     """Return the colours by the formulas of the recommendations, in floating point."""
-    red, blue = (0.2126, 0.0722) if "709" in name else (0.299, 0.114)
+    red, blue = next((one for end, one in MATRICES.items() if end in name), (0.299, 0.114))
     full = "full" in name or name.startswith("YCbCr422")
-    bright = y / 255 if full else (y - 16) / 219
-    cb, cr = ((value - 128) / (255 if full else 224) for value in (u, v))
+    step, most = 2 ** (depth - 8), 2**depth - 1
+    bright = y / most if full else (y / step - 16) / 219
+    cb, cr = ((one - 128 * step) / (most if full else 224 * step) for one in (u, v))
     r, b = bright + 2 * (1 - red) * cr, bright + 2 * (1 - blue) * cb
     g = (bright - red * r - blue * b) / (1 - red - blue)
-    return [min(max(255 * value, 0.0), 255.0) for value in (r, g, b)]
+    return [min(max(most * one, 0.0), float(most)) for one in (r, g, b)]
 
 
 @pytest.mark.parametrize(
@@ -195,20 +203,45 @@ def expected_rgb(y: int, u: int, v: int, name: str) -> list[float]:
 )
 def test_colours_are_exact_to_the_rounding(name: str) -> None:
     found = find_format(name)
-    for y, u, v in [(16, 128, 128), (235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110)]:
-        order = (u, y, v, y) if found.name.endswith(("UYVY", "CbYCrY")) else (y, u, y, v)
-        data = bytes(order) * 2
-        if not name.startswith("Y"):
-            shared = found.size(2, 2) - 4
-            data = bytes([y] * 4)
-            data += (
-                bytes([u, v])
-                if name.startswith("NV")
-                else bytes([u] * (shared // 2) + [v] * (shared // 2))
-            )
+    step, kind = 2 ** (found.depth - 8), "<u1" if found.depth == 8 else "<u2"
+    for plain in [(16, 128, 128), (235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110)]:
+        y, u, v = (one * step + (one % step) for one in plain)
+        if name.startswith("Y"):
+            first = "UYVY" in name or "CbYCrY" in name
+            samples = ([u, y, v, y] if first else [y, u, y, v]) * 2
+        else:
+            shared = (found.size(2, 2) // (1 if found.depth == 8 else 2) - 4) // 2
+            woven = name.startswith("NV")
+            samples = [y] * 4 + ([u, v] * shared if woven else [u] * shared + [v] * shared)
+        data = np.array(samples, kind).tobytes()
         got = found.rgb(data, 2, 2, found.stride(2)).astype(float)
-        wanted = np.broadcast_to(expected_rgb(y, u, v, name), (2, 2, 3))
+        wanted = np.broadcast_to(expected_rgb(y, u, v, name, found.depth), (2, 2, 3))
         assert np.abs(got - wanted).max() <= 0.501, (y, u, v)
+
+
+def test_every_format_of_y_u_and_v_has_each_matrix() -> None:
+    for one in PIXEL_FORMATS:
+        if isinstance(one.layout, YuvPairs | Planes):
+            for matrix in COLOUR_MATRICES:
+                other = with_matrix(one, matrix)
+                assert (other.bits, other.depth) == (one.bits, one.depth)
+                assert other.layout == replace(one.layout, matrix=matrix)
+            assert with_matrix(one, one.layout.matrix) is one
+
+
+def test_alpha_is_kept_and_left_out_of_colours() -> None:
+    data = bytes([1, 2, 3, 4])
+    assert find_format("RGBa8").array(data, 1, 1, 4).tolist() == [[[1, 2, 3, 4]]]
+    assert find_format("RGBa8").rgb(data, 1, 1, 4).tolist() == [[[1, 2, 3]]]
+    assert find_format("BGRa8").rgb(data, 1, 1, 4).tolist() == [[[3, 2, 1]]]
+    assert find_format("BGRa8").grey(data, 1, 1, 4).tolist() == [[2]]
+
+
+def test_limited_red_green_and_blue_are_widened() -> None:
+    data = bytes([16, 235, 0, 255, 126, 17])
+    assert find_format("RGB8_limited").rgb(data, 2, 1, 6).tolist() == [[[0, 255, 0], [255, 128, 1]]]
+    assert find_format("BGR8_limited").rgb(data, 2, 1, 6)[0, 1].tolist() == [1, 128, 255]
+    assert find_format("RGB8_limited").array(data, 2, 1, 6)[0, 0].tolist() == [16, 235, 0]
 
 
 def test_grey_of_colours_is_made_and_says_so() -> None:

@@ -6,6 +6,7 @@ import asyncio
 import gc
 import sys
 import time
+import warnings
 from typing import Any
 
 import numpy as np
@@ -396,3 +397,46 @@ async def test_memory_is_flat_over_20_000_frames() -> None:
                 gc.collect()
                 held.append(sys.getallocatedblocks())
         assert max(held[1:]) - held[0] < 500  # of memory, of which a frame takes four
+
+
+# ---------------------------------------------------------------------- whose task it is
+
+
+async def test_source_closed_in_the_turn_in_which_it_was_read_gives_its_device_back() -> None:
+    driver = ScriptedDriver()
+    async with FrameSource(driver) as source:
+        source.reader()
+    assert driver.calls[0] == "open"
+    assert driver.calls[-1] == "close"
+
+
+async def test_source_whose_task_somebody_cancels_tells_its_readers_and_streams_again() -> None:
+    driver = ScriptedDriver()
+    async with FrameSource(driver, stall=None) as source:
+        reader = source.reader(timeout=None)
+        reading = asyncio.ensure_future(anext(reader))
+        await until(lambda: driver.sink)
+        (task,) = (one for one in asyncio.all_tasks() if one.get_name() == "frames of scripted")
+        task.cancel()
+        with pytest.raises(FrameSourceError, match="its task was cancelled"):
+            await reading
+        again = asyncio.ensure_future(anext(source.reader()))
+        await until(lambda: driver.sink)
+        driver.give(frame(7))
+        assert (await again).sequence == 7
+
+
+async def test_source_that_nobody_has_gives_its_device_back() -> None:
+    driver = ScriptedDriver()
+    kept: list[Any] = [await FrameSource(driver, stall=None).__aenter__()]
+    readers = [kept[0].reader()]
+    await until(lambda: driver.sink)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # its reader has it
+        kept.clear()
+        gc.collect()
+        driver.give(frame(1))
+        assert (await anext(readers[0])).sequence == 1
+    readers.clear()
+    with pytest.warns(ResourceWarning, match="FrameSource scripted> was not closed"):
+        await until(lambda: not gc.collect() and driver.calls[-1] == "close")

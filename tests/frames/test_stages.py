@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel, Transform
-from smartcam.calibration._lens.model import DistortionModel
-from smartcam.calibration._stereo.rectification import rectify
+from smartcam.calibration._inside import rectify
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import FrameSet, Rectifier, Undistorter, find_format
+from smartcam.geometry._inside import DistortionModel
 from tests.frames.drivers import frame
 
 SIZE = (320, 240)

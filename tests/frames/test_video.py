@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import random
 import threading
 import traceback
 from contextlib import suppress
@@ -17,18 +18,23 @@ from smartcam.exceptions import (
     ConfigurationError,
     FrameFormatError,
     FrameSourceError,
+    MessageError,
     MissingExtraError,
 )
 from smartcam.frames import Codecs, Moment
-from smartcam.frames import _video as video
-from smartcam.frames._optional_imports import load
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import read_stamp
+from smartcam.frames._streaming.rtp.packets import SenderReport
+from smartcam.frames._streaming.rtp.reception import ntp_time
+from smartcam.frames._video import driver as video
+from smartcam.frames._video.multipart import MAX_BETWEEN_BYTES, MAX_PICTURE_BYTES, PictureCutter
 from tests.frames.pictures import (
     HEIGHT,
     MULTIPART,
+    PARTS,
     WIDTH,
     frame_of,
     jpeg,
+    length,
     part,
     rtp_packets,
     rtsp_answers,
@@ -194,15 +200,11 @@ async def test_pictures_of_a_folder_or_pattern_come_by_name(tmp_path: Path) -> N
         ("text.mp4", "cannot be read: Invalid data"),
         ("empty.mp4", "cannot be read: "),
         ("*.png", "there is no picture"),
-        ("alpha.png", "FFmpeg's pixel format rgba: expected one of gray, .*#format=RGB8 converts"),
     ],
 )
 async def test_what_is_no_video_is_told(tmp_path: Path, file: str, said: str) -> None:
     (tmp_path / "text.mp4").write_text("no video at all\n" * 100)
     (tmp_path / "empty.mp4").write_bytes(b"")
-    if file == "alpha.png":
-        pixels = np.zeros((8, 8, 4), np.uint8)
-        (tmp_path / file).write_bytes(load("imagecodecs").png_encode(pixels))
     source = frames.open(str(tmp_path / file))
     with pytest.raises(FrameSourceError, match=said) as got:
         await source.__aenter__()
@@ -237,7 +239,7 @@ async def test_damaged_pictures_of_a_file_are_lost_and_counted(tmp_path: Path) -
     ("url", "said"),
     [
         ("rtsp://h/x#transport=quic", "transport: expected tcp or udp, got 'quic'"),
-        ("rtsp://h/x#pace=none", "unknown parameter 'pace'; known are delay, format,"),
+        ("rtsp://h/x#pace=none", "unknown parameter 'pace'; known are delay, elsewhere,"),
         ("http://h/x#transport=tcp", "unknown parameter 'transport'"),
         ("x.mp4#pace=fast", "pace: expected real or none, got 'fast'"),
         ("x.mp4#timeout=0", "timeout: expected a number from 0.1 to 600"),
@@ -298,10 +300,40 @@ class Camera:
                     await asyncio.sleep(0.005)
                 if self.then == "dies":
                     return
+                if self.then == "ends":  # and none of what it said is lost
+                    writer.write_eof()
+                    await reader.read()
+                    return
                 if self.then == "stalls":
                     await asyncio.sleep(1e6)
         finally:
             self.gone += 1
+
+
+@pytest.mark.parametrize("challenge", ['Digest realm="x", nonce="1"', 'Basic realm="x"'])
+async def test_camera_may_hang_up_after_it_asked_who_is_there(challenge: str) -> None:
+    camera = Camera()
+    refused: list[str] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        request = (await reader.readuntil(b"\r\n\r\n")).decode()
+        if "Authorization" in request:
+            reader.feed_data(request.encode())
+            await camera.serve(reader, writer)
+            return
+        refused.append(request)
+        said = f"HTTP/1.1 401 Unauthorized\r\nWWW-Authenticate: {challenge}\r\nConnection: close"
+        writer.write(f"{said}\r\n\r\n".encode())
+        writer.write_eof()
+        await reader.read()
+
+    async with (
+        served(serve) as port,
+        frames.open(f"http://admin:s3cret@127.0.0.1:{port}/video#timeout=2") as source,
+    ):
+        assert (await source.newest()).format.name == "Mono8"
+    assert refused
+    assert all("Authorization" in request for request in camera.requests)
 
 
 async def test_camera_is_read_and_its_query_left_to_it() -> None:
@@ -347,14 +379,16 @@ async def test_server_that_dies_or_stalls_ends_readers_and_the_next_connects_ane
         camera.then = "goes on"
         assert (await source.newest()).format.name == "Mono8"
         assert source.statistics().started == 2
-    assert len(camera.requests) == camera.gone == 3
+    # before an older FFmpeg, which follows redirects, the camera is asked for one first
+    assert len(camera.requests) == camera.gone
+    assert camera.gone in {3, 6}
 
 
 @pytest.mark.parametrize(
     ("answer", "then", "said"),
     [
-        (b"HTTP/1.0 401 Unauthorized\r\n\r\n", "dies", "401 Unauthorized"),
-        (b"HTTP/1.0 404 Not Found\r\n\r\n", "dies", "404 Not Found"),
+        (b"HTTP/1.0 401 Unauthorized\r\n\r\n", "ends", "401 Unauthorized"),
+        (b"HTTP/1.0 404 Not Found\r\n\r\n", "ends", "404 Not Found"),
         (b"HTTP/1.0 200 OK\r\n\r\nhello", "dies", "cannot be read: "),
         (b"", "dies", "cannot be read: "),
         (b"", "says nothing", "expected an answer, got none within 0.3 s"),
@@ -450,9 +484,9 @@ async def test_picture_of_another_size_ends_the_stream() -> None:
     camera = Camera()
     async with served(camera.serve) as port, frames.open(f"http://127.0.0.1:{port}/") as source:
         camera.pictures = [jpeg(0), jpeg(1, 256, 32)]
-        with pytest.raises(FrameFormatError, match="got Mono8 256x32: open it anew") as got:
+        with pytest.raises(FrameFormatError, match="got 256x32: open it anew") as got:
             await numbers(source)
-        assert got.value.available == ("Mono8 256x32",)
+        assert got.value.available == ("256x32",)
 
 
 async def test_leaving_ends_a_read_that_hangs() -> None:
@@ -484,6 +518,72 @@ async def test_cancelled_opening_leaves_nothing(steps: int) -> None:
             assert (await again.newest()).width == WIDTH
 
 
+# pictures in parts
+
+PICTURES = [jpeg(number) for number in range(8)]
+THUMBNAIL = b"\xff\xd8\xff\xe1" + (len(PICTURES[0]) + 2).to_bytes(2, "big") + PICTURES[0]
+
+
+@pytest.mark.parametrize("way", PARTS)
+def test_each_picture_comes_with_its_last_byte(way: str) -> None:
+    cutter = PictureCutter()
+    got: list[bytes] = []
+    for one in PICTURES:
+        sent = PARTS[way](one)
+        end = sent.index(one) + len(one)
+        got += cutter.feed(sent[: end - 1])
+        late = list(cutter.feed(sent[end - 1 : end]))
+        assert late == [one]
+        got += [*late, *cutter.feed(sent[end:])]
+    assert (got, cutter.damaged) == (PICTURES, 0)
+
+
+@pytest.mark.parametrize("way", PARTS)
+def test_pieces_do_not_matter(way: str) -> None:
+    chance = random.Random(1)  # noqa: S311
+    whole = b"".join(PARTS[way](one) for one in PICTURES)
+    for size in (1, 7, 100, 10**6):
+        cutter, place = PictureCutter(), 0
+        got: list[bytes] = []
+        while place < len(whole):
+            step = 1 + chance.randrange(size)
+            got += cutter.feed(whole[place : place + step])
+            place += step
+        assert (got, cutter.damaged) == (PICTURES, 0)
+
+
+def test_a_thumbnail_is_no_picture_of_its_own() -> None:
+    with_one = THUMBNAIL + PICTURES[1][2:]
+    assert list(PictureCutter().feed(with_one)) == [with_one]
+
+
+def test_what_is_cut_short_is_counted_and_the_next_one_comes() -> None:
+    cutter = PictureCutter()
+    cut = PICTURES[0][: len(PICTURES[0]) // 2]
+    unsaid = b"--b\r\n\r\n" + cut + b"\r\n--b\r\n\r\n" + PICTURES[1]
+    assert list(cutter.feed(unsaid)) == [PICTURES[1]]
+    assert cutter.damaged == 1
+    said = b"--b\r\n" + length(cut) + cut + b"\r\n--b\r\n\r\n" + PICTURES[1]
+    assert list(cutter.feed(said)) == [cut, PICTURES[1]]  # the decoder says what it is worth
+    cutter.damaged = 0
+    assert list(cutter.feed(b"\xff\xd8 none \xff\xd8\xff\x20 none" + PICTURES[2])) == [PICTURES[2]]
+    assert cutter.damaged == 2
+
+
+def test_memory_and_patience_are_bounded() -> None:
+    cutter, endless = PictureCutter(), PictureCutter()
+    with pytest.raises(MessageError, match="belong to no picture"):
+        _fed(cutter, 1000, MAX_BETWEEN_BYTES // 1000 + 20)
+    list(endless.feed(PICTURES[0][:-2]))
+    with pytest.raises(MessageError, match="bytes at most"):
+        _fed(endless, 1 << 20, MAX_PICTURE_BYTES // (1 << 20) + 1)
+
+
+def _fed(cutter: PictureCutter, size: int, count: int) -> None:
+    for _ in range(count):
+        assert not list(cutter.feed(bytes(size)))
+
+
 # RTSP
 
 
@@ -510,6 +610,9 @@ async def test_rtsp_camera_is_read_over_tcp_with_its_clock() -> None:
         await rtsp_answers(reader, writer, seen)
         sequence = 0
         for number in range(1000):
+            if number == 10:
+                report = SenderReport(7, ntp_time(1e9), 30_000, 0, 0).pack()
+                writer.write(b"$\1" + len(report).to_bytes(2, "big") + report)
             packets = rtp_packets(bytes(sent[number % 16].data), sequence, number * 3000)
             sequence = sequence + len(packets) & 0xFFFF
             for packet in packets:
@@ -530,11 +633,11 @@ async def test_rtsp_camera_is_read_over_tcp_with_its_clock() -> None:
         stamp = read_stamp(frame.grey())
         assert stamp is not None
         assert np.abs(frame.grey().astype(int) - stamped(stamp[0])).mean() < 3
-    waited = [frame.device_time is None for frame in got]  # while FFmpeg looked what comes
+    waited = [frame.device_time is None for frame in got]  # until the camera told
     times = [frame.device_time for frame in got if frame.device_time is not None]
     assert waited == sorted(waited, reverse=True)
     assert len(times) > 20
     assert times == sorted(times)
-    assert all(frame.captured < got[-1].captured - 0.1 for frame in got[: sum(waited)])
+    assert times[0] == pytest.approx(1e9, abs=1)
     assert any("channel=1" in one and one.startswith("DESCRIBE") for one in seen)
     assert any("RTP/AVP/TCP" in one for one in seen)

@@ -2,17 +2,64 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+import contextlib
+import time
+from typing import TYPE_CHECKING, Any, Final
 
+from smartcam.exceptions import (
+    CameraBusyError,
+    FrameFormatError,
+    FrameLostError,
+    FrameSourceError,
+    OvertriggeredError,
+    SmartCamError,
+)
 from smartcam.frames._driver import FoundSource, FrameDriver
-from smartcam.frames._gige._aravis import AravisDriver
-from smartcam.frames._gige._discovery import find, networks
-from smartcam.frames._gige._own import OwnDriver
-from smartcam.frames._gige._places import found, wanted
+from smartcam.frames._frame import Frame, Moment
+from smartcam.frames._gige.assembler import Assembler
+from smartcam.frames._gige.control import RequestRefusedError
+from smartcam.frames._gige.device_features import GigEFeatures
+from smartcam.frames._gige.discovery import find, networks
+from smartcam.frames._gige.gvcp import GvcpStatus, Register
+from smartcam.frames._gige.gvsp import IP_UDP
+from smartcam.frames._gige.places import found, place, wanted
+from smartcam.frames._gige.session import GigESession
+from smartcam.frames._gige.setup import (
+    MAX_NUMBER,
+    connect,
+    lock,
+    read_exposure,
+    read_shape,
+    set_up,
+)
+from smartcam.frames._gige.stream import Stream, StreamSocket
+from smartcam.frames._gige.triggering import (
+    EXPOSED,
+    MISSED,
+    ArmedTrigger,
+    one_setting,
+    read_settings,
+    selected,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine
+
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink, StreamFormat
+    from smartcam.frames._events import FrameEvent
+    from smartcam.frames._frame import FrameTrigger
+    from smartcam.frames._gige.assembler import PacketCounts
+    from smartcam.frames._gige.block import WholePicture
+    from smartcam.frames._gige.features import GenicamFeatures
+    from smartcam.frames._gige.setup import StreamShape
+    from smartcam.frames._gige.triggering import TriggerSetting
+    from smartcam.frames._trigger import AwaitedTrigger
+
+MAX_SETTLING_TIME: Final = 30.0
+"""Seconds for which the picture of a trigger that failed is waited for, at most, before the stream
+begins anew: exposure and readout, as the camera tells them."""
 
 
 class GigEDriver(FrameDriver):
@@ -23,7 +70,9 @@ class GigEDriver(FrameDriver):
 
     A frame's ``captured`` is when its first packet was read, and ``moment`` says so: ``ARRIVAL``.
     Its ``duration`` is the exposure time and one frame time for the readout, as far as the camera
-    tells them. ``device_time`` is the camera's own clock.
+    tells them; where the camera chooses the exposure time, the one that came with the frame
+    (``ChunkExposureTime``), else the longest that it has. ``device_time`` is the camera's own
+    clock.
 
     The URL's parameters are carried out in their order:
 
@@ -39,16 +88,33 @@ class GigEDriver(FrameDriver):
     - ``packet_size``: bytes of the stream's IP packets, 576 to 16384; ``auto``, as it is: the
       largest that comes through in a test, or the camera's own where it sends no test packets.
     - ``resend=off``: packets that are missing are not asked for.
-    - ``through=aravis``: by the library aravis, where it is installed, instead of what smartcam
-      has itself.
+    - ``trigger``: source of the triggers, such as ``Software`` or ``Line1``, each of which causes
+      one picture; ``off``: it streams by itself. It is set after all others.
+
+    Args:
+        address: parts of the URL.
     """
 
     def __init__(self, address: FrameAddress) -> None:
         super().__init__(address)
-        what = wanted(address)
-        kind = AravisDriver if what.said.get("through") == "aravis" else OwnDriver
-        self.inside: OwnDriver | AravisDriver = kind(address, what)
-        """What does the work."""
+        self._wanted = wanted(address)
+        self._session: GigESession | None = None
+        self._shape: StreamShape | None = None
+        self._stream: Stream | None = None
+        self._sink: FrameSink | None = None
+        self._packet_size = 0  # that was found to come through
+        self._setting = asyncio.Lock()  # of features that belong together
+        self._opening = asyncio.Lock()
+        self._features = GigEFeatures(self._present, self._feature_changed, self._setting)
+        self._triggers: list[TriggerSetting] = []
+        self._armed: ArmedTrigger | None = None
+        self._busy_until = 0.0  # on the clock of time.monotonic()
+        self._is_wanted = False  # it was opened, and not closed since
+        self._is_changed = False  # a feature was set while it streamed
+        # of frames that may have been under way when a feature was set, and until when they come
+        self._before = 0.0, 0.0
+        self.counts: PacketCounts | None = None
+        """Counts of the packets of the stream that is under way, or was the last."""
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
@@ -57,21 +123,337 @@ class GigEDriver(FrameDriver):
 
     @property
     def name(self) -> str:
-        """What somebody called the camera, or its model and serial number; closed: the URL."""
-        return self.inside.name
+        """Name that the camera was given, or its model and serial number; closed: the URL."""
+        return self.address.shown if self._session is None else self._session.label
 
     async def open(self) -> StreamFormat:
         """Take control of the camera and set it."""
-        return await self.inside.open()
+        self._is_wanted = True
+        return (await self._opened())[1].format
+
+    async def _opened(self) -> tuple[GigESession, StreamShape]:
+        """Return the session that is open; one that was lost is opened anew.
+
+        Raises:
+            FrameSourceError: it cannot be opened, or was closed meanwhile.
+        """
+        async with self._opening:
+            if self._session is not None and self._session.lost is not None:
+                await self._drop()
+            if self._session is None or self._shape is None:
+                host, port = await place(self.address, self._wanted)
+                session = await GigESession.open(host, port, self.address.shown)
+                try:
+                    self._shape = await set_up(session, self._wanted)
+                    self.form = self._shape.format
+                    await self._read_triggers(session)
+                    if not self._is_wanted:
+                        raise FrameSourceError(f"{self.name}: it was closed", source=self.name)
+                except BaseException:
+                    await session.close()
+                    raise
+                self._session = session
+            return self._session, self._shape
 
     async def start(self, sink: FrameSink) -> None:
-        """Have it stream."""
-        await self.inside.start(sink)
+        """Start the stream, and open the camera where that is not done."""
+        self._is_wanted = True
+        session, shape = await self._opened()
+        self._sink = sink
+        try:
+            if self._is_changed:
+                shape = await self._read_shape(session)
+            # a picture that a trigger of before still causes is not to come into this stream
+            await asyncio.sleep(max(0.0, self._busy_until - time.monotonic()))
+            self._stream = await self._listen(session, shape)
+            session.on_lost = self._end
+            await lock(session.features, True)
+            await session.features.execute("AcquisitionStart")
+        except BaseException:
+            self._quiet()
+            raise
 
     async def stop(self) -> None:
-        """Have it stream no longer."""
-        await self.inside.stop()
+        """Stop the stream; the camera stays open."""
+        streamed, session = self._stream is not None, self._session
+        self._quiet()
+        if not streamed or session is None or session.lost is not None:
+            return
+        try:
+            await session.features.execute("AcquisitionStop")
+            await lock(session.features, False)
+            await session.control.write_register(Register.STREAM_PORT, 0)
+        except FrameSourceError as exc:  # it is gone; the next start opens it anew
+            session.lost = exc
 
     async def close(self) -> None:
-        """Give it back."""
-        await self.inside.close()
+        """Stop the stream and give up control of the camera."""
+        self._is_wanted = False
+        await self._drop()
+
+    async def _drop(self) -> None:
+        """Stop the stream and give up control of the camera; it may be opened anew."""
+        try:
+            await self.stop()
+        finally:
+            session, self._session = self._session, None
+            if session is not None:
+                await session.close()
+
+    # features and triggers
+
+    @property
+    def features(self) -> GigEFeatures:
+        """The features that the camera's GenICam description lists."""
+        return self._features
+
+    async def _present(self) -> GenicamFeatures:
+        return (await self._opened())[0].features
+
+    async def _feature_changed(self) -> None:
+        """Read what a feature may have changed: the format, and how the camera is triggered."""
+        session, shape = await self._opened()
+        if self._stream is not None:
+            exposure = await read_exposure(session.features)
+            now = time.monotonic()
+            longest = max(self._longest(shape, now), exposure.duration)
+            self._before = longest, now + 2 * longest
+            self._shape = shape._replace(exposure=exposure)
+        await self._read_triggers(session)
+        self._is_changed = True
+        if self._stream is None:
+            await self._read_shape(session)
+
+    def _longest(self, shape: StreamShape, arrived: float) -> float:
+        """Return the longest time that a frame which arrives then may have taken, in seconds."""
+        before, until = self._before
+        return max(shape.exposure.duration, before if arrived < until else 0.0)
+
+    async def _read_shape(self, session: GigESession) -> StreamShape:
+        shape = self._shape = await read_shape(session)
+        self.form, self._is_changed = shape.format, False
+        return shape
+
+    async def _read_triggers(self, session: GigESession) -> None:
+        self._triggers = await read_settings(session.features)
+        self.waits_for = "; ".join(map(str, self._triggers))
+
+    async def trigger(
+        self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
+    ) -> None:
+        """Trigger one picture by the command TriggerSoftware, or by ``fire``."""
+        session, stream = self._session, self._stream
+        if session is None or stream is None:
+            raise FrameSourceError(f"{self.name}: it does not stream", source=self.name)
+        async with self._setting:
+            setting = await one_setting(
+                self._triggers, session.features, fire is not None, self.name
+            )
+            await self._watch_exposures(session)
+            async with selected(session.features, setting):
+                armed = ArmedTrigger(
+                    pending,
+                    await session.latched_clock(),
+                    setting,
+                    delay=(await session.features.number("TriggerDelay") or 0.0) / 1e6,
+                    is_first=not stream.assembler.counts.pictures,
+                )
+
+                def begin() -> None:
+                    self._armed = armed
+                    pending.fire_begins()
+
+                if fire is None:
+                    await self._fire(session, pending, begin)
+        if fire is not None:
+            begin()
+            await fire()
+
+    async def _fire(
+        self, session: GigESession, pending: AwaitedTrigger, begin: Callable[[], None]
+    ) -> None:
+        try:
+            await session.features.execute("TriggerSoftware", writing=begin)
+        except RequestRefusedError as exc:
+            pending.refused()
+            if exc.status != GvcpStatus.BUSY:
+                raise
+            raise CameraBusyError(f"{self.name}: it takes no trigger now: {exc}") from exc
+
+    def disarm(self) -> None:
+        """Take no picture for that of the last trigger any longer."""
+        armed, self._armed = self._armed, None
+        if armed is not None and armed.pending.fired is not None and self._shape is not None:
+            longest = self._longest(self._shape, time.monotonic())
+            busy = min(longest + armed.delay, MAX_SETTLING_TIME)
+            self._busy_until = armed.pending.fired + busy
+
+    def _trigger_of(
+        self, picture: WholePicture, session: GigESession
+    ) -> FrameTrigger | SmartCamError | None:
+        """Return the trigger that caused a picture; an error where that cannot be known."""
+        armed = self._armed
+        if armed is None or armed.is_older(picture):
+            return None
+        if doubt := armed.doubt(picture, ids_agree=session.ids_agree):
+            self.disarm()
+            return FrameLostError(
+                f"{self.name}: whose picture block {picture.block_id} is cannot be known: {doubt}"
+            )
+        self._armed = None
+        session.ids_agree = session.ids_agree or picture.block_id in armed.exposed
+        return armed.record(picture, session.ticks_per_second)
+
+    async def watch_events(
+        self,
+        names: tuple[str, ...],
+        take: Callable[[FrameEvent], None],
+        ended: Callable[[FrameSourceError | None], None],
+    ) -> Callable[[], Coroutine[Any, Any, None]]:
+        """Have the camera tell events through its message channel."""
+        async with self._setting:
+            session, _ = await self._opened()
+            end = await session.events.watch(names, take, ended)
+
+        async def stop() -> None:
+            async with self._setting:
+                await end()
+
+        return stop
+
+    async def _watch_exposures(self, session: GigESession) -> None:
+        """Have the camera tell what becomes of triggers, as far as it can."""
+        if session.watches_exposures:
+            return
+        session.watches_exposures = True
+        names = [name for name in await session.events.names() if name in (EXPOSED, MISSED)]
+        if names:
+            with contextlib.suppress(FrameSourceError):  # it works without
+                await session.events.watch(names, self._take_event, lambda _: None)
+
+    def _take_event(self, event: FrameEvent) -> None:
+        armed, session = self._armed, self._session
+        if armed is None or session is None:
+            return
+        ticks = session.ticks_per_second
+        at = None if event.device_time is None else event.device_time * ticks
+        if armed.take_event(event, at) and self._sink is not None:
+            self.disarm()
+            self._sink.trigger_failed(
+                OvertriggeredError(f"{self.name}: its event {event.name} came for this trigger")
+            )
+
+    async def _listen(self, session: GigESession, shape: StreamShape) -> Stream:
+        """Have the stream come to a socket of ours."""
+        try:
+            where = StreamSocket(session.control.local_address, session.control.camera_address)
+        except OSError as exc:
+            raise FrameSourceError(
+                f"{self.name}: no socket for it: {exc}", source=self.name
+            ) from exc
+        try:
+            asked = self._wanted.packet_size or self._packet_size
+            size = self._packet_size = await connect(session, where, asked)
+            resend = session.can_resend and self._wanted.resend
+            assembler = Assembler(
+                shape.payload,
+                size - IP_UDP,
+                resend=resend,
+                begins_low=not self._triggers and not session.streamed,
+            )
+            session.streamed = True
+            self.counts = assembler.counts
+            return Stream(where, assembler, self._take, session.control.resend)
+        except BaseException:
+            where.close()
+            raise
+
+    def _quiet(self) -> None:
+        """Listen no longer; what was lost is told."""
+        self.disarm()
+        stream, self._stream = self._stream, None
+        sink, self._sink = self._sink, None
+        if self._session is not None:
+            self._session.on_lost = lambda _: None
+        if stream is not None:
+            stream.close()
+            if sink is not None and (lost := stream.assembler.take_lost()):
+                sink.lost(lost)
+
+    def _end(self, error: FrameSourceError) -> None:
+        sink = self._sink
+        self._quiet()
+        if sink is not None:
+            sink.ended(error)
+
+    def _take(self, pictures: list[WholePicture]) -> None:
+        """Take what the stream has; it may be closed by whoever takes a frame."""
+        stream = self._stream
+        sink = None if pictures or self._armed is None else self._sink
+        if sink is not None and stream is not None and (lost := stream.assembler.take_lost()):
+            self.disarm()
+            sink.lost(lost)
+            sink.trigger_failed(
+                FrameLostError(
+                    f"{self.name}: {lost} picture{'s' if lost > 1 else ''} came incomplete while "
+                    "that of a trigger was waited for"
+                )
+            )
+        for picture in pictures:
+            if self._sink is None or self._shape is None or self._session is None:
+                return
+            shape, leader = self._shape, picture.leader
+            if (leader.pixel_format, leader.width) != (shape.number, shape.format.width):
+                self._end(self._changed(picture, shape))
+                return
+            trigger = self._trigger_of(picture, self._session)
+            if isinstance(trigger, SmartCamError):
+                self._sink.trigger_failed(trigger)
+                trigger = None
+            self._sink.frame(self._frame(picture, shape, self._session, trigger))
+        fault = None if self._stream is None else self._stream.assembler.fault
+        if fault is not None:
+            error = FrameFormatError(f"{self.name}: its stream: {fault}", source=self.name)
+            error.__cause__ = fault
+            self._end(error)
+
+    def _changed(self, picture: WholePicture, shape: StreamShape) -> FrameFormatError:
+        leader = picture.leader
+        return FrameFormatError(
+            f"{self.name}: it streams {shape.format} ({shape.number:#010x}), then came "
+            f"{leader.width}x{leader.height} of {leader.pixel_format:#010x}",
+            source=self.name,
+            available=(str(shape.format),),
+        )
+
+    def _frame(
+        self,
+        picture: WholePicture,
+        shape: StreamShape,
+        session: GigESession,
+        trigger: FrameTrigger | None,
+    ) -> Frame:
+        ticks = session.ticks_per_second
+        chunks, remark = session.read_chunks(picture)
+        duration = self._longest(shape, picture.arrived)
+        own = chunks.get("ChunkExposureTime") if shape.exposure.is_auto else None
+        if isinstance(own, (int, float)) and 0 < own < MAX_NUMBER:
+            duration = own / 1e6 + shape.exposure.readout
+        return Frame(
+            data=picture.data,
+            format=shape.format.format,
+            width=picture.leader.width,
+            height=picture.rows,
+            stride=picture.stride,
+            captured=picture.arrived,
+            utc=time.time() - (time.monotonic() - picture.arrived),
+            moment=Moment.ARRIVAL,
+            duration=duration,
+            device_time=picture.leader.ticks / ticks if ticks else None,
+            sequence=picture.number,
+            lost=picture.lost,
+            source=session.label,
+            remark=remark,
+            chunks=chunks,
+            trigger=trigger,
+        )

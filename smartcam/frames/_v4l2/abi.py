@@ -128,10 +128,33 @@ class BufferLayout(NamedTuple):
     field: int
     stride: int
     size: int
+    colorspace: int = 0
+    private: int = 0
+    flags: int = 0
+    ycbcr_enc: int = 0
+    quantization: int = 0
+
+
+PRIVATE_MAGIC: Final = 0xFEEDCAFE
+"""V4L2_PIX_FMT_PRIV_MAGIC: the fields behind ``private`` mean something."""
+
+COLORSPACE_JPEG: Final = 7
+
+MATRIX_OF_COLORSPACE: Final = {2: "240M", 3: "709", 10: "2020", 12: "709"}
+"""``V4L2_MAP_YCBCR_ENC_DEFAULT``: of SMPTE 240M, Rec. 709, BT.2020, DCI-P3; else BT.601's."""
+
+MATRIX_OF_ENCODING: Final = {
+    1: "601", 2: "709", 3: "601", 4: "709", 5: "601", 6: "2020",
+    7: "2020 of constant luminance", 8: "240M",
+}  # fmt: skip
+"""``enum v4l2_ycbcr_encoding``; 0 is what the color space has by default."""
+
+FULL_RANGE, LIMITED_RANGE = 1, 2
+"""``enum v4l2_quantization``; 0 is full for red, green and blue, and for JPEG's color space."""
 
 
 FULL_BUFFER: Final = Struct("I4xII4x0lll16xI0l")
-"""Of a buffer that was taken: its place, bytes, flags, seconds, microseconds, and number."""
+"""A filled buffer: its index, bytes, flags, seconds, microseconds, and frame number."""
 
 
 def new_buffer(index: int) -> bytearray:
@@ -142,7 +165,7 @@ def new_buffer(index: int) -> bytearray:
 
 
 def offset_and_length(argument: bytearray) -> tuple[int, int]:
-    """Return where a buffer is mapped, and its bytes."""
+    """Return the offset at which a buffer is mapped, and its length in bytes."""
     offset, length = _BUFFER.unpack(argument)[9:11]
     return offset, length
 

@@ -21,7 +21,7 @@ _unpack: Final = abi.FULL_BUFFER.unpack_from
 
 
 class Full(NamedTuple):
-    """What was in a buffer.
+    """The contents of a filled buffer.
 
     Attributes:
         data: a copy, the only one that is made; of a buffer with an error it is empty.

@@ -1,4 +1,4 @@
-"""What can be set at a device: exposure, gain, white balance and so on, with their ranges."""
+"""Read and set a device's controls: exposure, gain, white balance and so on, with their ranges."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from smartcam._suggestions import did_you_mean
-from smartcam.exceptions import FrameSourceError
+from smartcam.exceptions import FrameFeatureError
 from smartcam.frames._v4l2 import abi
 from smartcam.frames._v4l2.device import failure
 
@@ -26,7 +26,7 @@ KINDS: Final = {
     abi.CTRL_BITMASK: "bitmask",
     abi.CTRL_INTEGER_MENU: "menu",
 }
-"""Types that are known here; 64-bit numbers, texts and structures are not."""
+"""The supported types of controls; 64-bit numbers, texts and structures are not."""
 
 SWITCHES: Final = {"on": 1, "true": 1, "yes": 1, "off": 0, "false": 0, "no": 0}
 
@@ -36,16 +36,16 @@ class DeviceControl:
     """A control of a device.
 
     Attributes:
-        name: its label in small letters with underscores: ``white_balance_automatic``.
-        number: V4L2's id.
+        name: label in small letters with underscores: ``white_balance_automatic``.
+        number: id of the control in V4L2.
         kind: integer, boolean, menu, button or bitmask.
         least: smallest value.
         most: largest value.
-        step: between two values.
-        default: as the driver sets it.
-        value: as it is; None: it cannot be read.
-        menu: of a menu: value to label.
-        flags: of V4L2.
+        step: difference between two values.
+        default: value that the driver sets at first.
+        value: present value; None: the value cannot be read.
+        menu: label of each value, for a menu.
+        flags: flags of V4L2.
     """
 
     name: str
@@ -61,7 +61,7 @@ class DeviceControl:
 
     @property
     def range(self) -> str:
-        """What it takes, in words."""
+        """Range of the control, in words."""
         if self.menu:
             return ", ".join(f"{value} ({label})" for value, label in self.menu.items())
         if self.kind == "button":
@@ -74,12 +74,12 @@ class DeviceControl:
         return f"{self.least} to {self.most}{step}"
 
     def __str__(self) -> str:
-        """Return it as lists and error texts have it."""
+        """Return the control as lists and error texts have it."""
         now = "" if self.value is None else f", now {self.value}"
         return f"{self.name}: {self.range}; default {self.default}{now}"
 
     def number_of(self, value: int | str) -> int | None:
-        """Return what the device calls a value; None: it takes no such one."""
+        """Return the number of a value; None if the device does not take such a value."""
         found = self._read(value)
         if found is None or self.kind == "button":
             return found
@@ -122,7 +122,7 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
         What the device has it set to.
 
     Raises:
-        FrameSourceError: there is none of that name, it cannot be set, or takes no such value; it
+        FrameFeatureError: there is none of that name, it cannot be set, or takes no such value; it
             lists what there is.
     """
     answer = _described(device).get(simple(name))
@@ -163,9 +163,9 @@ def _described(device: CaptureDevice) -> dict[str, tuple[Any, ...]]:
             found.setdefault(simple(abi.text(answer[2])), answer)
 
 
-def _unknown(device: CaptureDevice, name: str) -> FrameSourceError:
+def _unknown(device: CaptureDevice, name: str) -> FrameFeatureError:
     controls = list_controls(device)
-    return FrameSourceError(
+    return FrameFeatureError(
         f"{device.path}: no control {name!r}; it has {', '.join(controls) or 'none'}"
         f"{did_you_mean(simple(name), list(controls))}",
         source=device.path,
@@ -173,8 +173,8 @@ def _unknown(device: CaptureDevice, name: str) -> FrameSourceError:
     )
 
 
-def _refusal(device: CaptureDevice, control: DeviceControl, text: str) -> FrameSourceError:
-    return FrameSourceError(
+def _refusal(device: CaptureDevice, control: DeviceControl, text: str) -> FrameFeatureError:
+    return FrameFeatureError(
         f"{device.path}: control {control.name}: {text}",
         source=device.path,
         available=(str(control),),

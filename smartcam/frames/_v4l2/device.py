@@ -9,25 +9,27 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._pixels import PIXEL_FORMATS
+from smartcam.frames._pixels.colours import MATRICES
+from smartcam.frames._pixels.formats import PIXEL_FORMATS, find_format, with_matrix
+from smartcam.frames._pixels.layouts import Planes, YuvPairs
 from smartcam.frames._v4l2 import abi, system
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from typing import Self
 
-    from smartcam.frames._pixels import PixelFormat
+    from smartcam.frames._pixels.formats import PixelFormat
     from smartcam.frames._v4l2.abi import BufferLayout, Ioctl
 
 
 FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fourcc}
-"""What of V4L2's formats is known here."""
+"""The supported formats of V4L2."""
 
 ENOUGH: Final = 512
 """Answers to one enumeration at most; a driver that goes on is broken."""
 
 NEAR: Final = 0.01
-"""Part of a rate that it may be off: 29.97/s is 30/s to a camera."""
+"""Share by which a rate may differ from the wanted one: 29.97/s is 30/s to a camera."""
 
 REASONS: Final = {
     errno.ENOENT: "there is no such device",
@@ -43,7 +45,7 @@ REASONS: Final = {
 
 
 def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
-    """Return what a refusal of the system means; it lists the devices that are here."""
+    """Return the error for a refusal of the system; its text lists the devices present."""
     number = error.errno or 0
     here = tuple(f"{one} ({name})" for one, name in system.nodes().items())
     reason = REASONS.get(number, os.strerror(number))
@@ -56,7 +58,7 @@ def failure(path: str, tried: str, error: OSError) -> FrameSourceError:
 
 
 class WantedSetting(NamedTuple):
-    """What is asked of a device; None: as it is."""
+    """The setting asked of a device; None leaves a value as it is."""
 
     format: PixelFormat | None
     size: tuple[int, int] | None
@@ -64,10 +66,10 @@ class WantedSetting(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """How a device is set.
+    """The setting of a device.
 
     Attributes:
-        format: of the pixels.
+        format: format of the pixels.
         layout: how they lie in a buffer.
         rate: frames a second; None: it does not say.
     """
@@ -134,7 +136,7 @@ class CaptureDevice:
         return layout.unpack(argument)
 
     def enumerate(self, request: Ioctl, *fields: object) -> Iterator[tuple[Any, ...]]:
-        """Return what the driver counts up; nothing where it does not."""
+        """Yield the entries that the driver enumerates; none where it has no enumeration."""
         for index in range(ENOUGH):
             try:
                 yield self.try_to(request, index, *fields)
@@ -202,7 +204,33 @@ class CaptureDevice:
             )
         )  # fmt: skip
         self._compare(code, wanted.size, layout)
-        return Setting(FORMATS[code], layout, self._rate(wanted.rate, layout))
+        found = self._coloured(FORMATS[code], layout)
+        return Setting(found, layout, self._rate(wanted.rate, layout))
+
+    def _coloured(self, found: PixelFormat, layout: BufferLayout) -> PixelFormat:
+        """Return the format with the matrix and the range that the device tells.
+
+        Raises:
+            FrameFormatError: the device has a matrix that is not known here.
+        """
+        told = layout.private == abi.PRIVATE_MAGIC
+        encoding, quantization = (layout.ycbcr_enc, layout.quantization) if told else (0, 0)
+        if found.name in ("RGB8", "BGR8"):
+            limited = quantization == abi.LIMITED_RANGE
+            return find_format(f"{found.name}_limited") if limited else found
+        if not isinstance(found.layout, YuvPairs | Planes):
+            return found
+        by_default = abi.MATRIX_OF_COLORSPACE.get(layout.colorspace, "601")
+        matrix = abi.MATRIX_OF_ENCODING.get(encoding, by_default)
+        jpeg = quantization == 0 and layout.colorspace == abi.COLORSPACE_JPEG
+        full = " full" if jpeg or quantization == abi.FULL_RANGE else ""
+        if matrix not in MATRICES:
+            raise FrameFormatError(
+                f"{self.path}: expected Y, U and V by BT.601, BT.709 or BT.2020, the device has "
+                f"those of {matrix} (color space {layout.colorspace}, encoding {encoding})",
+                source=self.path,
+            )
+        return with_matrix(found, matrix + full)
 
     def _check(self) -> None:
         """See that it captures pictures in a way that is known here."""
@@ -228,7 +256,7 @@ class CaptureDevice:
 
     @staticmethod
     def _layout(answer: tuple[Any, ...]) -> BufferLayout:
-        return abi.BufferLayout(*answer[1:7])
+        return abi.BufferLayout(*answer[1:12])
 
     def _code(self, wanted: PixelFormat | None, current: int) -> int:
         """Return the fourcc that is to be streamed."""

@@ -10,10 +10,11 @@ from urllib.parse import parse_qsl
 
 from smartcam.exceptions import FrameSourceError, LocalProtocolError
 from smartcam.frames._driver import FrameDriver, StreamFormat
-from smartcam.frames._pixels import find_format
+from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._v4l2.controls import list_controls, set_control
-from smartcam.frames._v4l2.device import CaptureDevice, WantedSetting
+from smartcam.frames._v4l2.device import FORMATS, CaptureDevice, WantedSetting
 from smartcam.frames._v4l2.discovery import find
+from smartcam.frames._v4l2.features import V4L2Features
 from smartcam.frames._v4l2.stream import CaptureStream
 
 if TYPE_CHECKING:
@@ -26,11 +27,11 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 
-ANSWER: Final = 10.0
+DEVICE_TIMEOUT: Final = 10.0
 """Seconds for a device to be opened, set and started; the slowest cameras take one or two."""
 
 CONTROL: Final = "control."
-"""What parameters that set a control begin with."""
+"""Prefix of the parameters that set a control."""
 
 
 class V4L2Driver(FrameDriver):
@@ -48,7 +49,8 @@ class V4L2Driver(FrameDriver):
       ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is its label in
       small letters with underscores, the value a number, a menu's label, or ``on`` and ``off``.
 
-    ``source.driver`` has :meth:`controls` and :meth:`set_control` for the time in between.
+    ``source.features`` has the controls for the time in between; what is set so is set until the
+    URL's are set again.
 
     While nothing is read from it, the device is closed: another program can use it. Each frame's
     bytes are copied out of the driver's buffer once. One that is replaced before a reader took it
@@ -123,11 +125,16 @@ class V4L2Driver(FrameDriver):
             if thread is not None:
                 thread.shutdown(wait=False)
 
+    @property
+    def features(self) -> V4L2Features:
+        """The controls, by SFNC's names where it has the same: ``ExposureTime``, ``Gain``."""
+        return V4L2Features(self)
+
     async def controls(self) -> dict[str, DeviceControl]:
-        """Return what can be set at the device, by name.
+        """Return the device's controls by name.
 
         Raises:
-            FrameSourceError: it is not there.
+            FrameSourceError: the device is not there.
         """
         return await self._do(lambda: self._with_device(list_controls), "list its controls")
 
@@ -166,13 +173,13 @@ class V4L2Driver(FrameDriver):
         Cancellation: it is done all the same, and what it leaves the next :meth:`stop` ends.
         """
         if self._thread is None:
-            raise LocalProtocolError(f"{self.name} is not open: async with it")
+            raise LocalProtocolError(f"{self.name} is not open: use `async with`")
         done = asyncio.get_running_loop().run_in_executor(self._thread, job)
         done.add_done_callback(_heard)
-        finished, _ = await asyncio.wait([done], timeout=ANSWER)
+        finished, _ = await asyncio.wait([done], timeout=DEVICE_TIMEOUT)
         if not finished:
             raise FrameSourceError(
-                f"{self.name}: it was to {what}, and did not answer within {ANSWER:g} s",
+                f"{self.name}: it was to {what}, and did not answer within {DEVICE_TIMEOUT:g} s",
                 source=self.name,
             )
         return done.result()
@@ -185,7 +192,8 @@ class V4L2Driver(FrameDriver):
             self._identity = device.identity
         rates = () if setting.rate is None else (setting.rate,)
         size = (setting.layout.width, setting.layout.height)
-        self._wanted = WantedSetting(setting.format, size, self._wanted.rate)  # so it stays
+        asked = FORMATS[setting.layout.fourcc]  # as V4L2 calls it, whatever its colours mean
+        self._wanted = WantedSetting(asked, size, self._wanted.rate)  # so it stays
         return StreamFormat(setting.format, *size, rates)
 
     def _begin(self) -> CaptureStream:

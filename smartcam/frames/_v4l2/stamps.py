@@ -1,4 +1,4 @@
-"""When a frame was taken: what a driver's time stamps say, and when they are not to be believed."""
+"""Judge a driver's time stamps: the moment that they mean, and whether they can be believed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from smartcam.frames._v4l2 import abi
 
 _log = logging.getLogger("smartcam.frames")
 
-UNTOLD: Final = 1.0
+UNKNOWN_DURATION: Final = 1.0
 """Seconds that a frame is taken to last where neither driver nor frames tell."""
 
 
 class BufferStamp(NamedTuple):
-    """When a frame was taken; as in :class:`smartcam.frames.Frame`."""
+    """The time at which a frame was taken, as in :class:`smartcam.frames.Frame`."""
 
     captured: float
     moment: Moment
@@ -46,7 +46,7 @@ class BufferStamps:
         self._told = period
         self._began = self._empty = began
         # stamp and number of the frame before; none is from long before the stream began
-        self._last: tuple[float, int | None] = (began - 2 * (period or UNTOLD), None)
+        self._last: tuple[float, int | None] = (began - 2 * (period or UNKNOWN_DURATION), None)
         self.is_newest = False  # the last one that was read: no later one can be there yet
         self._doubted = False
 
@@ -68,7 +68,7 @@ class BufferStamps:
         if kind != abi.TIMESTAMP_MONOTONIC:
             return self._arrived(now, seconds if kind == abi.TIMESTAMP_COPY else None)
         starts = flags & abi.TSTAMP_SRC_MASK == abi.TSTAMP_SRC_SOE
-        period = self._told or UNTOLD
+        period = self._told or UNKNOWN_DURATION
         last, then = self._last
         if not last < seconds <= (now if starts else now + period):
             self._doubt(seconds, now)
@@ -85,7 +85,7 @@ class BufferStamps:
         return BufferStamp(min(seconds, now), Moment.FRAME_END, 2 * period, None)
 
     def _arrived(self, now: float, device_time: float | None) -> BufferStamp:
-        duration = now - self._empty + 2 * (self._told or UNTOLD)
+        duration = now - self._empty + 2 * (self._told or UNKNOWN_DURATION)
         return BufferStamp(now, Moment.ARRIVAL, duration, device_time)
 
     def _doubt(self, seconds: float, now: float) -> None:

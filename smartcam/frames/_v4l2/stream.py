@@ -17,27 +17,27 @@ if TYPE_CHECKING:
     from smartcam.frames._v4l2.buffers import Full
     from smartcam.frames._v4l2.device import CaptureDevice, Setting
 
-BAD_IN_A_ROW: Final = 30
-"""Buffers without a picture after which the stream ends: there is no use in waiting."""
+MAX_BAD_IN_A_ROW: Final = 30
+"""Buffers without a picture, one after the other, after which the stream ends."""
 
-EMPTY_IN_A_ROW: Final = 1000
-"""Times that the system says a buffer is full, and none is; then it would say so for ever."""
+MAX_EMPTY_IN_A_ROW: Final = 1000
+"""Times that the system may report a full buffer and give none before the stream ends."""
 
-HALF: Final = 1 << 31
-"""Of the numbers of frames, which are of 32 bits: more than that onwards is backwards."""
+HALF_OF_NUMBERS: Final = 1 << 31
+"""Half of all frame numbers, which have 32 bits: a larger step forwards is one backwards."""
 
 
 class CaptureStream:
     """The frames of a device that was set.
 
     Args:
-        device: set, and this stream's from now on.
-        setting: of the device.
-        buffers: how many to ask for.
-        name: of the camera.
+        device: device with its setting made, which belongs to this stream from now on.
+        setting: setting of the device.
+        buffers: number of buffers to ask for.
+        name: name of the camera.
 
     Raises:
-        FrameSourceError: it does not stream; the device is still the caller's.
+        FrameSourceError: the device does not stream; it still belongs to the caller.
     """
 
     def __init__(self, device: CaptureDevice, setting: Setting, buffers: int, name: str) -> None:
@@ -86,12 +86,12 @@ class CaptureStream:
                     return
 
     def _frame(self, full: Full, sink: FrameSink) -> Frame | None:
-        """Return what was in a buffer as a frame; what is none counts as lost."""
+        """Return the frame in a buffer; count a buffer without a whole picture as lost."""
         steps = self._steps(full.sequence)
         if len(full.data) < self._least:
             sink.lost(steps)
             self._bad += 1
-            if self._bad >= BAD_IN_A_ROW:
+            if self._bad >= MAX_BAD_IN_A_ROW:
                 raise self._no_pictures(full)
             return None
         self._bad = 0
@@ -115,20 +115,20 @@ class CaptureStream:
 
     def _none_was_there(self) -> None:
         self._empty += 1
-        if self._empty > EMPTY_IN_A_ROW:
+        if self._empty > MAX_EMPTY_IN_A_ROW:
             raise FrameSourceError(
                 f"{self._name}: its driver says that a picture is there, and gives none",
                 source=self._name,
             )
 
     def _steps(self, sequence: int) -> int:
-        """Return how many frames on it is; a driver that does not count has none lost."""
+        """Return the number of frames since the last one, 1 for a driver that does not count."""
         last, self._sequence = self._sequence, sequence
         if last is None:
             self._number = sequence
             return 1
-        steps = (sequence - last) % (2 * HALF)
-        steps = steps if 0 < steps < HALF else 1
+        steps = (sequence - last) % (2 * HALF_OF_NUMBERS)
+        steps = steps if 0 < steps < HALF_OF_NUMBERS else 1
         self._number += steps
         return steps
 

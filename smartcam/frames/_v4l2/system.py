@@ -1,4 +1,4 @@
-"""What is asked of the system, in one place: tests answer in its stead."""
+"""All calls of the system, in one place: tests answer in its stead."""
 
 from __future__ import annotations
 

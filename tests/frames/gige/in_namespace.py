@@ -36,6 +36,20 @@ async def discovered() -> list[str]:
     return []
 
 
+async def triggered(query: str) -> dict[str, object]:
+    """Trigger twenty times."""
+    await discovered()
+    wrong, sequences = [], []
+    async with smartcam.frames.open(f"gige://127.0.0.1?{query}", linger=20) as source:
+        for _ in range(20):
+            frame = await source.trigger()
+            sequences.append(frame.sequence)
+            if text := wrong_in(frame):
+                wrong.append(text)
+        started = source.statistics().started
+    return {"wrong": wrong, "sequences": sequences, "started": started}
+
+
 async def read(frames: int, query: str) -> dict[str, object]:
     found = await discovered()
     driver = GigEDriver(FrameAddress.parse(f"gige://127.0.0.1?{query}"))
@@ -66,7 +80,7 @@ async def read(frames: int, query: str) -> dict[str, object]:
         "offered": account.offered,
         "delivered": account.delivered,
         "lost": account.lost,
-        "counts": repr(getattr(driver.inside, "counts", "")),
+        "counts": repr(driver.counts),
         "cpu": spent,
     }
 
@@ -79,7 +93,8 @@ def main() -> None:
             [PROGRAM, "-i", "127.0.0.1", "-s", "FAKE01", *arguments], stdout=nothing, stderr=nothing
         )
     try:
-        print(json.dumps(asyncio.run(read(int(frames), query))))  # noqa: T201
+        made = read(int(frames), query) if int(frames) else triggered(query)
+        print(json.dumps(asyncio.run(made)))  # noqa: T201
     finally:
         fake.terminate()
         fake.wait(10)

@@ -7,9 +7,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige import _assembler
-from smartcam.frames._gige._assembler import MOST_OPEN, Assembler, Resend
-from smartcam.frames._gige._block import WholePicture
+from smartcam.frames._gige import assembler as _assembler
+from smartcam.frames._gige.assembler import MAX_OPEN_BLOCKS, Assembler, Resend
+from smartcam.frames._gige.block import WholePicture
 from tests.frames.gige.packets import FULL, frame, header, leader, payload, trailer
 
 START = 100.0
@@ -39,7 +39,7 @@ class Stream:
             assert len(one.data) == 256
             assert one.data[0] == one.leader.ticks % 256
             self.pictures.append(one)
-        assert len(self.inside._blocks) <= MOST_OPEN
+        assert len(self.inside._blocks) <= MAX_OPEN_BLOCKS
 
     def wait(self, seconds: float) -> None:
         """Let time pass, as a timer does it."""
@@ -107,12 +107,12 @@ def test_each_frame_is_whole_or_lost(
     assert stream.numbers == sorted(set(stream.numbers))
     if kept and not stream.inside.counts.restarts:
         begun = seen_id(kept[0][1], extended)
-        spanned = stream.inside._newest - (0 if begun <= MOST_OPEN else begun - 1)
+        spanned = stream.inside._newest - (0 if begun <= MAX_OPEN_BLOCKS else begun - 1)
         assert len(stream.pictures) + stream.lost == spanned
     told = sum(one.lost for one in stream.pictures) + stream.inside.take_lost()
     assert told == stream.lost
     if not drop and reorder <= 3:
-        assert len(stream.pictures) >= 24 - (MOST_OPEN if start > MOST_OPEN else 0)
+        assert len(stream.pictures) >= 24 - (MAX_OPEN_BLOCKS if start > MAX_OPEN_BLOCKS else 0)
 
 
 @given(st.permutations(range(7)), st.booleans())
@@ -162,7 +162,7 @@ def test_random_packets_raise_nothing(noise: list[bytes]) -> None:
         inside.feed(memoryview(one), len(one), at / 100, 0.0)
         inside.handle_timeout(at / 100)
         inside.pictures()
-        assert len(inside._blocks) <= MOST_OPEN
+        assert len(inside._blocks) <= MAX_OPEN_BLOCKS
 
 
 def test_nothing_answers_and_the_frame_is_lost_after_its_tries() -> None:
@@ -277,10 +277,10 @@ def test_a_gap_of_many_frames_is_counted() -> None:
 
 def test_the_oldest_is_given_up_where_too_many_are_open() -> None:
     stream = Stream()
-    for number in range(1, MOST_OPEN + 3):
+    for number in range(1, MAX_OPEN_BLOCKS + 3):
         packets = frame(number, number)
         stream.feed(*packets[:3], *packets[4:], step=0.00001)
-    assert len(stream.inside._blocks) == MOST_OPEN
+    assert len(stream.inside._blocks) == MAX_OPEN_BLOCKS
     assert stream.lost == 2
 
 

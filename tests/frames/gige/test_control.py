@@ -1,22 +1,25 @@
 """The control channel and discovery on real sockets."""
 
 import asyncio
+import ipaddress
 import socket
 import struct
-import sys
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import pytest
 
-from smartcam.exceptions import FrameSourceError, FrameTimeoutError
+from smartcam.exceptions import ConfigurationError, FrameSourceError, FrameTimeoutError
 from smartcam.frames import FrameAddress
-from smartcam.frames._gige import _places, driver
-from smartcam.frames._gige._control import ControlChannel, RequestRefusedError
-from smartcam.frames._gige._discovery import AnsweringCamera as Found
-from smartcam.frames._gige._discovery import Network, find, networks
-from smartcam.frames._gige._gvcp import DeviceInfo
+from smartcam.frames._gige import driver
+from smartcam.frames._gige import force_address as force
+from smartcam.frames._gige import places as _places
+from smartcam.frames._gige.control import ControlChannel, RequestRefusedError
+from smartcam.frames._gige.discovery import AnsweringCamera as Found
+from smartcam.frames._gige.discovery import Network, find, networks
 from smartcam.frames._gige.driver import GigEDriver
+from smartcam.frames._gige.force_address import checked_mac, force_address
+from smartcam.frames._gige.gvcp import DeviceInfo
 from tests.frames.gige.camera import camera
 
 Answers = Callable[[int, bytes], list[bytes]]
@@ -182,9 +185,72 @@ async def test_a_camera_is_chosen_by_its_serial_number(monkeypatch: pytest.Monke
     assert "10.0.0.9 is not of the network" in second.remark
 
 
-async def test_aravis_that_is_not_installed_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gi", None)
-    driver = GigEDriver(FrameAddress.parse("gige://127.0.0.1?through=aravis"))
-    with pytest.raises(FrameSourceError, match="not installed for this Python: apt-get install"):
-        await driver.open()
-    await driver.close()
+# FORCEIP
+
+
+HERE = [Network("127.0.0.1", ("127.0.0.1",), ipaddress.IPv4Network("127.0.0.0/8"))]
+
+
+MAC = "02:00:00:00:00:01"
+
+
+async def test_a_camera_gets_an_address() -> None:
+    async with camera(address="10.9.8.7") as there:
+        found = await force_address(
+            "02-00-00-00-00-01",
+            "127.0.5.6/16",
+            gateway="127.0.0.2",
+            places=HERE,
+            port=there.port,
+        )
+        assert there.forced == ("127.0.5.6", "255.255.0.0", "127.0.0.2")
+        assert found.url == "gige://127.0.5.6"
+        assert not found.remark
+
+
+async def test_a_camera_that_is_not_there_is_said() -> None:
+    async with camera() as there:
+        with pytest.raises(FrameSourceError, match="answers; there are 02:00:00:00:00:01 Maker"):
+            await force_address("02:00:00:00:00:02", "127.0.5.6/8", places=HERE, port=there.port)
+        assert not there.forced
+
+
+async def test_a_camera_that_somebody_controls_refuses() -> None:
+    async with camera() as there:
+        there.owner = ("127.0.0.1", 1)
+        with pytest.raises(FrameSourceError, match="ACCESS_DENIED"):
+            await force_address(MAC, "127.0.5.6/8", places=HERE, port=there.port)
+
+
+async def test_a_camera_that_does_not_take_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(force, "APPEAR_TIMEOUT", 0.1)
+    async with camera() as there:
+        there.answer_forceip_only = True
+        with pytest.raises(FrameTimeoutError, match="does not answer a search by it"):
+            await force_address(MAC, "127.0.5.6/8", places=HERE, port=there.port)
+
+
+@pytest.mark.parametrize(
+    ("mac", "address", "more", "text"),
+    [
+        ("02:00:00:00:00", "127.0.5.6/8", {}, "mac: expected"),
+        (7, "127.0.5.6/8", {}, "mac: expected a text"),
+        (MAC, "127.0.5.6", {}, "prefix is missing"),
+        (MAC, "127.0.5.999/8", {}, "expected an IPv4 address"),
+        (MAC, "::1/64", {}, "expected an IPv4 address"),
+        (MAC, "192.168.0.0/24", {}, "the network's own"),
+        (MAC, "192.168.0.255/24", {}, "the network's own"),
+        (MAC, "224.0.0.5/24", {}, "no device can have it"),
+        (MAC, "0.0.0.0/31", {}, "no device can have it"),
+        (MAC, "127.0.5.6/8", {"gateway": "here"}, "gateway: expected"),
+    ],
+)
+async def test_addresses_that_are_none_are_refused(
+    mac: Any, address: str, more: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=text):
+        await force_address(mac, address, places=[], **more)
+
+
+def test_a_hardware_address_may_be_written_in_many_ways() -> None:
+    assert checked_mac("0A0b.0c0D.0E0f") == checked_mac("0a-0b-0c-0d-0e-0f") == "0a:0b:0c:0d:0e:0f"

@@ -11,11 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameSourceError, MessageError
-from smartcam.frames._gige import _description
-from smartcam.frames._gige._description import locate, parse, unpack
-from smartcam.frames._gige._expressions import evaluate
-from smartcam.frames._gige._features import GenicamFeatures
-from tests.frames.gige.camera import DESCRIPTION
+from smartcam.frames._gige import description as _description
+from smartcam.frames._gige.description import locate, parse, unpack
+from smartcam.frames._gige.event_channel import decode_events
+from smartcam.frames._gige.expressions import evaluate
+from smartcam.frames._gige.features import GenicamFeatures
+from smartcam.frames._gige.messages import MAX_CHUNKS, MessageFeatures, cut_chunks
+from tests.frames.gige.camera import DESCRIPTION, HEAD
 
 
 def described(inside: str) -> str:
@@ -233,14 +235,14 @@ VARIABLES = {"A": 0, "B": 5, "A.Max": 7}
     ("formula", "whole", "expected"),
     [
         ("1+2*3", True, 7),
-        ("2**3**2", True, 512),
-        ("-2**2", True, -4),
+        ("2**(3**2)", True, 512),
+        ("-(2**2)", True, -4),
         ("-7/2", True, -3),
         ("-7%3", True, -1),
         ("7/2", False, 3.5),
         ("A?1:B?2:3", True, 2),
         ("(A=0)&&(B<>0)||X", True, 1),
-        ("0xFF>>4&3", True, 3),
+        ("(0xFF>>4)&3", True, 3),
         ("1<<63", True, -(1 << 63)),
         ("ROUND(2.345, 2)", False, 2.35),
         ("SQRT(16)+TRUNC(2.9)-FLOOR(1.5)+CEIL(1.1)", False, 7),
@@ -249,12 +251,37 @@ VARIABLES = {"A": 0, "B": 5, "A.Max": 7}
         ("1>0=1", True, 1),
         ("LG(1000)+LN(E)+SGN(-3)", False, 3),
         ("A.Max+1", True, 8),
-        ("1|2^3&1", True, 3),
+        ("1|(2^(3&1))", True, 3),
+        ("(A<B) && (B=5)", True, 1),
+        ("(A=0)?1:((B=2)?3:4)", True, 1),
         ("1e3", False, 1000),
     ],
 )
 def test_formulas(formula: str, whole: bool, expected: float) -> None:
     assert evaluate(formula, VARIABLES, whole=whole) == expected
+
+
+@pytest.mark.parametrize(
+    ("formula", "by_c", "by_emva"),
+    [
+        ("2**3**2", "512", "64"),
+        ("-2**2", "-4", "4"),
+        ("0xFF>>4&3", "3", "255"),
+        ("1<<2+1", "8", "5"),
+        ("B=5 && A=1", "0", "0"),
+        ("A=0 || B=5 && B=6", "1", "0"),
+        ("-(B)+1", "-4", "-6"),
+        ("(A=0)?2:(B=2)?3:4", "2", "3"),
+    ],
+)
+def test_a_formula_of_two_readings_has_no_value_where_they_differ(
+    formula: str, by_c: str, by_emva: str
+) -> None:
+    if by_c == by_emva:
+        assert evaluate(formula, VARIABLES, whole=True) == int(by_c)
+        return
+    with pytest.raises(MessageError, match=f"got {by_c} in C's order .* {by_emva} in that of EMVA"):
+        evaluate(formula, VARIABLES, whole=True)
 
 
 @pytest.mark.parametrize(
@@ -283,3 +310,161 @@ def test_a_damaged_stream_in_the_archive_is_refused() -> None:
     data[at : at + 8] = bytes(8)
     with pytest.raises(MessageError):
         unpack(bytes(data))
+
+
+# what comes with messages
+
+
+def chunk(number: int, data: bytes) -> bytes:
+    return data + struct.pack(">II", number, len(data))
+
+
+class NoMemory:
+    """A camera that is not to be asked."""
+
+    async def read(self, address: int, length: int) -> bytes:
+        raise AssertionError(f"{length} bytes at {address:#x} were read")
+
+    async def write(self, address: int, data: bytes) -> None:
+        raise AssertionError(f"{data.hex()} was written at {address:#x}")
+
+
+def chunk_features() -> MessageFeatures:
+    return MessageFeatures(GenicamFeatures(parse(DESCRIPTION.encode()), NoMemory(), "T"), "ChunkID")
+
+
+def test_chunks_are_cut_from_the_end() -> None:
+    data = chunk(1, b"pixels") + chunk(7, b"") + chunk(0xFFFFFFFF, b"abc")
+    found = {number: bytes(part) for number, part in cut_chunks(memoryview(data)).items()}
+    assert found == {1: b"pixels", 7: b"", 0xFFFFFFFF: b"abc"}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"1234567",
+        struct.pack(">II", 1, 1),
+        struct.pack(">II", 1, 0xFFFFFFFF),
+        b"x" + chunk(1, b"abcd"),
+        chunk(1, b"a") + chunk(1, b"b"),
+        b"".join(chunk(number, b"") for number in range(MAX_CHUNKS + 1)),
+    ],
+)
+def test_lengths_that_do_not_fit_are_refused(data: bytes) -> None:
+    with pytest.raises(MessageError, match="chunk data"):
+        cut_chunks(memoryview(data))
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_chunks_or_an_error(data: bytes) -> None:
+    try:
+        found = cut_chunks(memoryview(data))
+    except MessageError:
+        return
+    assert sum(len(one) + 8 for one in found.values()) == len(data)
+
+
+def test_a_chunk_that_is_too_short_gives_no_value() -> None:
+    values, problems = chunk_features().read({0xA0000001: memoryview(bytes(7)), 3: memoryview(b"")})
+    assert values == {}
+    assert "ChunkExposureTime: expected 8 bytes at 0x0, its message has 7" in problems
+
+
+def test_a_chunk_that_did_not_come_gives_no_value() -> None:
+    values, problems = chunk_features().read({3: memoryview(struct.pack(">I", 0x01080001))})
+    assert values == {"ChunkPixelFormat": "Mono8"}
+    assert not problems
+
+
+@pytest.mark.long
+@given(st.binary(min_size=8, max_size=8), st.binary(min_size=8, max_size=8))
+def test_chunk_values_are_those_of_emvas_genapi(exposure: bytes, counter: bytes) -> None:
+    genapi = pytest.importorskip("genicam.genapi", reason="needs PyPI's genicam")
+    begin = DESCRIPTION.index('<Float Name="ChunkExposureTime">')
+    inside = DESCRIPTION[begin : DESCRIPTION.index('<Category Name="EventControl">')]
+    inside = inside.replace("<pIsAvailable>ChunkModeActive</pIsAvailable>", "")
+    text = (
+        f'{HEAD}<Category Name="Root"><pFeature>ChunkFrameID</pFeature></Category>{inside}'
+        "</RegisterDescription>"
+    )
+    theirs = genapi.NodeMap()
+    theirs.load_xml_from_string(text)
+    adapter = genapi.ChunkAdapterGEV(theirs)
+    data = chunk(1, b"pixels..") + chunk(0xA0000001, exposure) + chunk(0xA0000002, counter)
+    adapter.attach_buffer(data, len(data))
+    values, problems = chunk_features().read(cut_chunks(memoryview(data)))
+    assert not problems
+    assert set(values) == {"ChunkExposureTime", "ChunkFrameID", "ChunkLineStatusAll"}
+    for name, ours in values.items():
+        value = theirs.get_node(name).value
+        assert value == ours or (value != value and ours != ours), name
+
+
+def message(command: int, *items: bytes, flags: int = 1) -> bytes:
+    return struct.pack(">BBHHH", 0x42, flags, command, sum(map(len, items)), 3) + b"".join(items)
+
+
+def item_of(number: int, size: int = 0) -> bytes:
+    return struct.pack(">HHHHQ", size, number, 0, 1, 2)
+
+
+def test_several_events_in_one_message() -> None:
+    request = decode_events(message(0xC0, item_of(0x9001), item_of(0x9002)))
+    assert [one.number for one in request.items] == [0x9001, 0x9002]
+    assert [one.data[:2] for one in request.items] == [b"\0\x10"] * 2
+    long = struct.pack(">HHHHQQ", 26, 0x9001, 0, 0, 7, 8) + b"ab"
+    request = decode_events(message(0xC2, long, long, flags=0x10))
+    assert [(one.block, one.ticks, one.data[24:]) for one in request.items] == [(7, 8, b"ab")] * 2
+    assert not request.wants_ack
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        message(0xC0, item_of(1))[:-1],
+        message(0xC0, item_of(1) + b"x"),
+        message(0x80, item_of(1)),
+        b"\x43" + message(0xC0, item_of(1))[1:],
+        message(0xC2, struct.pack(">HHHHQQ", 99, 1, 0, 0, 7, 8), flags=0x11),
+        message(0xC2, struct.pack(">HHHHQQ", 8, 1, 0, 0, 7, 8), flags=0x11),
+        message(0xC0, *[item_of(1)] * 101),
+    ],
+)
+def test_what_is_no_event_is_refused(data: bytes) -> None:
+    with pytest.raises(MessageError):
+        decode_events(data)
+
+
+@given(st.binary(max_size=120), st.sampled_from([0xC0, 0xC2]), st.sampled_from([1, 0x11]))
+def test_any_bytes_are_events_or_an_error(data: bytes, command: int, flags: int) -> None:
+    try:
+        request = decode_events(message(command, data, flags=flags))
+    except MessageError:
+        return
+    assert sum(len(one.data) for one in request.items) == len(data)
+
+
+@pytest.mark.long
+@given(st.integers(0, 0xFFFF), st.integers(0, (1 << 63) - 1), st.binary(min_size=4, max_size=20))
+def test_event_values_are_those_of_emvas_genapi(block: int, ticks: int, more: bytes) -> None:
+    genapi = pytest.importorskip("genicam.genapi", reason="needs PyPI's genicam")
+    names = ["EventExposureEndTimestamp", "EventExposureEndFrameID", "EventExposureEndLines"]
+    inside = DESCRIPTION
+    begin = inside.index('<Integer Name="EventExposureEndTimestamp">')
+    inside = inside[begin : inside.index('<Port Name="Device"/>', begin)]
+    listed = "".join(f"<pFeature>{name}</pFeature>" for name in names)
+    text = f'{HEAD}<Category Name="Root">{listed}</Category>{inside}</RegisterDescription>'
+    theirs = genapi.NodeMap()
+    theirs.load_xml_from_string(text)
+    adapter = genapi.EventAdapterGEV()
+    adapter.attach_node_map(theirs.pointer)
+    datagram = message(0xC2, struct.pack(">HHHHQ", 0, 0x9002, 0, block, ticks) + more)
+    adapter.deliver_message(datagram)
+    ours = MessageFeatures(GenicamFeatures(parse(DESCRIPTION.encode()), NoMemory(), "T"), "EventID")
+    (event,) = decode_events(datagram).items
+    values, problems = ours.read({event.number: memoryview(event.data)})
+    expected = {name: theirs.get_node(name).value for name in names}
+    adapter.detach_node_map()
+    assert values == expected
+    assert not problems

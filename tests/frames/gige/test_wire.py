@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._gige import _gvcp as gvcp
-from smartcam.frames._gige import _gvsp as gvsp
+from smartcam.frames._gige import gvcp, gvsp
 from tests.frames.gige.packets import header, leader, trailer
 
 

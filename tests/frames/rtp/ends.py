@@ -13,8 +13,8 @@ import time
 
 from smartcam import frames
 from smartcam.exceptions import FrameSourceError
-from smartcam.frames._rtp.driver import RtpDriver
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import read_stamp
+from smartcam.frames._streaming.rtp.driver import RtpDriver
 
 
 def say(what: object) -> None:

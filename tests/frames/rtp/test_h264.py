@@ -13,20 +13,15 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError
 from smartcam.frames import Codecs
-from smartcam.frames._rtp.assembling import AccessUnit
-from smartcam.frames._rtp.h264 import (
-    MOST_AHEAD,
-    H264Depacketizer,
-    H264Packetizer,
-    parameter_sets,
-    units,
-)
-from smartcam.frames._rtp.packets import RtpPacket
-from smartcam.frames._rtp.parameters import description, picture_size, size_in
+from smartcam.frames._streaming.rtp.assembling import AccessUnit
+from smartcam.frames._streaming.rtp.depacketizer import MAX_PACKETS_AHEAD, Depacketizer
+from smartcam.frames._streaming.rtp.h264 import H264Packetizer, parameter_sets, units
+from smartcam.frames._streaming.rtp.packets import RtpPacket
+from smartcam.frames._streaming.rtp.parameters import description, picture_size, size_in
 from tests.frames.pictures import frame_of
 
 SPS, PPS = b"\x67\x42\xc0\x1e\xa6", b"\x68\xce\x0f\xc8"
-SEI, SLICE = b"\x06\x06\x01\x84\x80", b"\x41\x9a\x20"
+SEI, SLICE, KEY = b"\x06\x06\x01\x84\x80", b"\x41\x9a\x20", b"\x65\x88\x84"
 MTU = 64
 
 
@@ -39,14 +34,14 @@ def packet(payload: bytes | str, sequence: int, stamp: int = 0, last: bool = Fal
     return RtpPacket(last, 96, sequence & 0xFFFF, stamp, 1, data)
 
 
-def took(depacketizer: H264Depacketizer, *packets: RtpPacket) -> list[AccessUnit]:
+def took(depacketizer: Depacketizer, *packets: RtpPacket) -> list[AccessUnit]:
     return [made for one in packets for made in depacketizer.take(one)]
 
 
-def begun() -> H264Depacketizer:
+def begun() -> Depacketizer:
     """Return one that has had a whole frame: the next sequence number is 1."""
-    made = H264Depacketizer(window=8)
-    first = made.take(packet(SPS, 0, 77, last=True))
+    made = Depacketizer(window=8)
+    first = made.take(packet(KEY, 0, 77, last=True))
     assert [one.begins for one in first] == [True]
     return made
 
@@ -164,11 +159,70 @@ def test_what_comes_behind_a_marker_is_no_frame_of_its_own() -> None:
     depacketizer = begun()
     assert len(took(depacketizer, packet(SLICE, 1, 9, last=True))) == 1
     assert took(depacketizer, packet(SLICE, 2, 9, last=True)) == []
-    assert depacketizer.damaged == 1
+    (after,) = took(depacketizer, packet(SLICE, 3, 12, last=True), packet(SLICE, 4, 15))
+    assert (after, depacketizer.damaged) == ((annex_b(SLICE), 12, 0, 1, 0.0, False), 1)
+
+
+def wary() -> Depacketizer:
+    return Depacketizer(window=8, wary=True)
+
+
+def test_a_marker_proves_itself_before_it_is_believed() -> None:
+    depacketizer = wary()
+    taken = [took(depacketizer, packet(KEY, number, number, True)) for number in range(6)]
+    made = [[one.timestamp for one in some] for some in taken]
+    assert made == [[], [0], [1, 2], [3], [4], [5]]
+
+
+def test_another_stream_s_marker_proves_itself_anew() -> None:
+    depacketizer = wary()
+    took(depacketizer, *(packet(KEY, number, number, True) for number in range(4)))
+    assert depacketizer.proofs == 3
+    assert took(depacketizer, packet(KEY, 9, 9, True)._replace(ssrc=2)) == []
+    assert depacketizer.proofs == 0
+    took(depacketizer, packet(SLICE, 10, 9, True)._replace(ssrc=2))
+    assert took(depacketizer, packet(KEY, 11, 10, True)._replace(ssrc=2))[0].data == annex_b(
+        KEY, SLICE
+    )
+
+
+def test_a_marker_on_each_slice_ends_no_frame() -> None:
+    depacketizer, made = wary(), []
+    for number in range(12):
+        made += took(
+            depacketizer, packet(KEY if number % 3 == 0 else SLICE, number, number // 3, True)
+        )
+    assert [one.data for one in made] == [annex_b(KEY, SLICE, SLICE)] * 3
+    assert depacketizer.damaged == 0
+
+
+def test_a_marker_on_parameters_ends_no_frame_whatever_their_timestamp() -> None:
+    for depacketizer in (wary(), Depacketizer(window=8)):
+        made = took(depacketizer, packet(SPS, 0, 7, True), packet(PPS, 1, 8, True))
+        made += took(depacketizer, packet(KEY, 2, 9, True), packet(SLICE, 3, 10, True))
+        assert made[0].data == annex_b(SPS, PPS, KEY)
+        assert depacketizer.damaged == 0
+
+
+def test_a_frame_whose_marker_is_not_believed_ends_after_a_while() -> None:
+    depacketizer = wary()
+    assert depacketizer.take(packet(KEY, 0, 7, last=True), 5.0) == []
+    assert (depacketizer.marked_at, depacketizer.tail()) == (5.0, None)
+    assert depacketizer.end_marked(5.0) == []
+    (made,) = depacketizer.end_marked(5.1)
+    assert (made.data, depacketizer.marked_at) == (annex_b(KEY), None)
+    assert depacketizer.end_marked(9.0) == []
+
+
+def test_a_marker_before_a_gap_proves_nothing() -> None:
+    depacketizer = wary()
+    assert took(depacketizer, packet(KEY, 0, 7, True), packet(SLICE, 2, 8, True)) == []
+    assert depacketizer.give_up(1.0) == []
+    assert (depacketizer.lost, depacketizer.damaged) == (1, 1)
 
 
 def test_a_frame_whose_beginning_may_be_missing_is_damaged() -> None:
-    first = H264Depacketizer()
+    first = Depacketizer()
     assert took(first, packet(SLICE, 4, 9, last=True)) == []
     assert first.damaged == 1
     after_loss = begun()
@@ -222,18 +276,18 @@ def test_another_ssrc_is_a_new_stream() -> None:
 
 
 def test_numbers_that_jump_are_believed_when_a_second_one_follows() -> None:
-    for jump in (MOST_AHEAD + 100, -5000):
+    for jump in (MAX_PACKETS_AHEAD + 100, -5000):
         depacketizer = begun()
-        assert took(depacketizer, packet(SPS, jump, 9, last=True)) == []
+        assert took(depacketizer, packet(KEY, jump, 9, last=True)) == []
         (here,) = took(depacketizer, packet(SLICE, 1, 8, last=True))
         assert not here.begins  # one alone is a stray
-        strays = [packet(SPS, jump + one, 20 + one, last=True) for one in range(3)]
+        strays = [packet(KEY, jump + one, 20 + one, last=True) for one in range(3)]
         made = took(depacketizer, *strays)
         assert [(one.timestamp, one.begins) for one in made] == [(21, True), (22, False)]
 
 
 def test_memory_is_bounded() -> None:
-    depacketizer = H264Depacketizer(window=8)
+    depacketizer = Depacketizer(window=8)
     part = bytes(60_000)
     made = took(depacketizer, packet(b"\x67", 0), packet(b"\x7c\x85" + part, 1))
     for number in range(400):
@@ -249,17 +303,19 @@ def test_memory_is_bounded() -> None:
 
 UNITS = st.builds(
     lambda kind, body: bytes((0x40 | kind,)) + bytes(1 + byte % 255 for byte in body),
-    st.sampled_from([1, 5, 6, 8]),
+    st.sampled_from([1, 6, 8]),
     st.binary(min_size=1, max_size=300),
 )
-FRAMES = st.lists(st.lists(UNITS, min_size=1, max_size=4), min_size=2, max_size=20)
+FRAMES = st.lists(
+    st.lists(UNITS, max_size=3).map(lambda units: [*units, SLICE]), min_size=2, max_size=20
+)
 
 
 @given(FRAMES, st.integers(0, 0xFFFF), st.randoms(use_true_random=False))
 def test_any_frames_come_back(
     frames: list[list[bytes]], sequence: int, chance: random.Random
 ) -> None:
-    packetizer, depacketizer = H264Packetizer(96, 1, sequence, MTU), H264Depacketizer(window=16)
+    packetizer, depacketizer = H264Packetizer(96, 1, sequence, MTU), Depacketizer(window=16)
     frames[0].insert(0, SPS)
     sent = []
     for number, one in enumerate(frames):
@@ -277,7 +333,7 @@ def test_any_frames_come_back(
 def test_only_whole_frames_come_in_order_and_what_is_missing_is_counted(
     frames: list[list[bytes]], sequence: int, chance: random.Random, loss: float
 ) -> None:
-    packetizer, depacketizer = H264Packetizer(96, 1, sequence, MTU), H264Depacketizer(window=8)
+    packetizer, depacketizer = H264Packetizer(96, 1, sequence, MTU), Depacketizer(window=8)
     frames[0].insert(0, SPS)
     sent = [
         RtpPacket.parse(data)
@@ -308,7 +364,7 @@ def test_only_whole_frames_come_in_order_and_what_is_missing_is_counted(
 
 @given(st.lists(st.binary(max_size=8), max_size=30), st.randoms(use_true_random=False))
 def test_any_payloads_are_taken(payloads: list[bytes], chance: random.Random) -> None:
-    depacketizer = H264Depacketizer(window=4)
+    depacketizer = Depacketizer(window=4)
     for payload in payloads:
         number, stamp = chance.randrange(40), chance.randrange(3)
         made = depacketizer.take(packet(payload, number, stamp, chance.random() < 0.3))

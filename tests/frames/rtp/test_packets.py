@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError
-from smartcam.frames._rtp.packets import (
+from smartcam.frames._streaming.rtp.packets import (
     Goodbye,
     PacketsMissing,
     PictureLost,

@@ -20,11 +20,12 @@ from smartcam.exceptions import (
     LocalProtocolError,
 )
 from smartcam.frames import Codecs, Moment, RtpSender
-from smartcam.frames._h264 import entry_point
-from smartcam.frames._rtp import driver as receiving
-from smartcam.frames._rtp import feedback
-from smartcam.frames._rtp.h264 import H264Packetizer
-from smartcam.frames._rtp.packets import (
+from smartcam.frames._inside import entry_point, read_stamp
+from smartcam.frames._streaming.rtp import decoding as receiving
+from smartcam.frames._streaming.rtp import feedback
+from smartcam.frames._streaming.rtp.driver import RtpDriver
+from smartcam.frames._streaming.rtp.h264 import H264Packetizer
+from smartcam.frames._streaming.rtp.packets import (
     Goodbye,
     PacketsMissing,
     PictureLost,
@@ -34,8 +35,8 @@ from smartcam.frames._rtp.packets import (
     compound,
     parse_rtcp,
 )
-from smartcam.frames._rtp.sockets import host_and_port
-from smartcam.frames._synthetic import read_stamp, stripes, write_stamp
+from smartcam.frames._streaming.rtp.sockets import host_and_port
+from smartcam.frames._synthetic import stripes, write_stamp
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
 from tests.frames.rtp.ways import HOST, two_ports, way
@@ -55,14 +56,14 @@ LIMIT = 30.0
 
 def seen(source: FrameSource) -> RtpStatistics:
     driver = source.driver
-    assert isinstance(driver, receiving.RtpDriver)
+    assert isinstance(driver, RtpDriver)
     return driver.statistics()
 
 
 def patient(source: FrameSource) -> FrameSource:
     """Have a source wait for what is missing, however slow the machine is."""
     driver = source.driver
-    assert isinstance(driver, receiving.RtpDriver)
+    assert isinstance(driver, RtpDriver)
     driver._plan = driver._plan._replace(repair=LIMIT)
     return source
 
@@ -140,7 +141,7 @@ async def test_pictures_come_whole_and_in_order_with_their_times(
 
 async def test_packets_that_are_lost_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(receiving, "WAITING", 10_000)
-    monkeypatch.setattr(feedback, "OLD", LIMIT)
+    monkeypatch.setattr(feedback, "MAX_RESEND_AGE", LIMIT)
     port = two_ports()
     async with way(port) as between, frames.open(DRAWN) as drawn:
         gone: set[int] = set()
@@ -318,6 +319,7 @@ async def test_pictures_of_another_size_are_refused() -> None:
             await anext(reader)
 
 
+@pytest.mark.long
 async def test_what_cannot_be_decoded_at_all_is_told() -> None:
     port = two_ports()
     async with Codecs(threads=1) as codecs:

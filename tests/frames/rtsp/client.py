@@ -10,9 +10,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.frames import find_format
-from smartcam.frames._rtp.h264 import H264Depacketizer
-from smartcam.frames._rtp.packets import RtpPacket
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import read_stamp
+from smartcam.frames._streaming.rtp.depacketizer import Depacketizer
+from smartcam.frames._streaming.rtp.packets import RtpPacket
 from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class Watcher:
     """Makes pictures of packets, and reads their numbers."""
 
     def __init__(self, codecs: Codecs, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
-        self.depacketizer = H264Depacketizer(window=0)  # the loopback keeps the order
+        self.depacketizer = Depacketizer(window=0)  # the loopback keeps the order
         self.decoder: H264Decoder = codecs.h264_decoder()
         self.size = size
         self.sequences: list[int] = []

@@ -9,9 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.frames._rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
-from smartcam.frames._rtsp.authentication import MOST_TRIES, Authentication, PasswordGate
-from smartcam.frames._rtsp.messages import RtspError, RtspRequest
+from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish, target_of, wish_of
+from smartcam.frames._streaming.rtsp.authentication import (
+    MAX_WRONG_ANSWERS,
+    Authentication,
+    PasswordGate,
+)
+from smartcam.frames._streaming.rtsp.messages import RtspError, RtspRequest
 from tests.frames.rtsp.client import Reply, digest
 
 URL = "rtsp://h:8554/left"
@@ -125,11 +129,11 @@ def test_another_password_user_method_url_nonce_or_realm_does_not() -> None:
 def test_tries_are_counted() -> None:
     gate = PasswordGate(Authentication("me", "secret"))
     ends = []
-    for _ in range(MOST_TRIES):
+    for _ in range(MAX_WRONG_ANSWERS):
         with pytest.raises(RtspError) as caught:
             gate.check(asked("Digest x=y"))
         ends.append(caught.value.fatal)
-    assert ends == [False] * (MOST_TRIES - 1) + [True]
+    assert ends == [False] * (MAX_WRONG_ANSWERS - 1) + [True]
 
 
 @given(st.text(st.characters(max_codepoint=255), max_size=60))

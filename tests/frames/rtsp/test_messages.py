@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.frames._rtsp.messages import (
-    MOST_BODY,
-    MOST_HEADERS,
-    MOST_LINE,
+from smartcam.frames._streaming.rtsp.messages import (
+    MAX_BODY_BYTES,
+    MAX_HEADERS,
+    MAX_LINE_BYTES,
     ROOM,
     ChannelData,
     RequestParser,
@@ -109,13 +109,16 @@ def test_any_bytes_are_read_alike_in_any_pieces_or_refused(
         (b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\ncseq: 2\r\n", 400, "cseq: expected once"),
         (b"OPTIONS * RTSP/1.0\r\nContent-Length: -1\r\n", 413, "Content-Length"),
         (b"OPTIONS * RTSP/1.0\r\nContent-Length: \xb2\r\n", 413, "Content-Length"),
-        (b"OPTIONS * RTSP/1.0\r\nContent-Length: %d\r\n" % (MOST_BODY + 1), 413, "Content-Length"),
-        (b"OPTIONS * RTSP/1.0\r\n" + b"A: b\r\n" * MOST_LINE, 400, "headers"),
-        (b"A" * (MOST_LINE + 1), 400, "a line"),
-        (b"A" * (MOST_LINE + 1) + b"\n", 400, "a line"),
         (
-            b"OPTIONS * RTSP/1.0\r\n"
-            + b"".join(b"A%d: b\r\n" % n for n in range(MOST_HEADERS + 1)),
+            b"OPTIONS * RTSP/1.0\r\nContent-Length: %d\r\n" % (MAX_BODY_BYTES + 1),
+            413,
+            "Content-Length",
+        ),
+        (b"OPTIONS * RTSP/1.0\r\n" + b"A: b\r\n" * MAX_LINE_BYTES, 400, "headers"),
+        (b"A" * (MAX_LINE_BYTES + 1), 400, "a line"),
+        (b"A" * (MAX_LINE_BYTES + 1) + b"\n", 400, "a line"),
+        (
+            b"OPTIONS * RTSP/1.0\r\n" + b"".join(b"A%d: b\r\n" % n for n in range(MAX_HEADERS + 1)),
             400,
             "headers",
         ),

@@ -12,7 +12,7 @@ import pytest
 
 import smartcam.frames
 from smartcam.frames import RtspServer
-from smartcam.frames._synthetic import read_stamp
+from smartcam.frames._inside import read_stamp
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

@@ -13,9 +13,13 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames import RtspServer
-from smartcam.frames._rtsp.connection import HALF, IDLE, MOST_STRAYS
-from smartcam.frames._rtsp.session import TIMEOUT
-from smartcam.frames._shared_stream import LINGER
+from smartcam.frames._streaming.rtsp.connection import (
+    IDLE_TIMEOUT,
+    MAX_STRAY_PACKETS,
+    REQUEST_TIMEOUT,
+)
+from smartcam.frames._streaming.rtsp.session import TIMEOUT
+from smartcam.frames._streaming.shared_stream import LINGER
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.rtsp.client import TCP, Client, digest
 from tests.frames.rtsp.test_shared_stream import drawn
@@ -53,7 +57,7 @@ async def server() -> AsyncIterator[tuple[ScriptedDriver, RtspServer]]:
 def connections(server: RtspServer) -> set[Any]:
     """Return those that are open."""
     assert server._serving is not None
-    return server._serving.connections
+    return set(server._serving.places)
 
 
 Served = tuple["ScriptedDriver", RtspServer]
@@ -203,12 +207,12 @@ async def test_half_a_request_has_its_time(server: Served) -> None:
         client.writer.write(b"OPTIONS * RTSP/1.0\r\n")
         before = loop.time()
         for _ in range(3):  # a byte now and then does not lengthen it
-            await asyncio.sleep(HALF / 4)
+            await asyncio.sleep(REQUEST_TIMEOUT / 4)
             client.writer.write(b"A")
-        await asyncio.sleep(HALF / 4)
+        await asyncio.sleep(REQUEST_TIMEOUT / 4)
         reply = await client.reply()
         assert (reply.status, await client.ended()) == (408, True)
-        assert loop.time() - before == pytest.approx(HALF, abs=0.2)
+        assert loop.time() - before == pytest.approx(REQUEST_TIMEOUT, abs=0.2)
 
 
 async def test_a_connection_that_asks_nothing_is_closed(server: Served) -> None:
@@ -216,16 +220,16 @@ async def test_a_connection_that_asks_nothing_is_closed(server: Served) -> None:
     async with await Client.connect(serving) as client:
         assert (await client.ask("OPTIONS")).status == 200
         for _ in range(7):
-            await asyncio.sleep(IDLE / 8)
+            await asyncio.sleep(IDLE_TIMEOUT / 8)
             client.writer.write(b"\r\n$\1\0\0")
-        await asyncio.sleep(IDLE / 7)
+        await asyncio.sleep(IDLE_TIMEOUT / 7)
         assert await client.ended()
 
 
 async def test_packets_without_a_session_are_left_but_not_many(server: Served) -> None:
     _, serving = server
     async with await Client.connect(serving) as client:
-        client.writer.write(b"$\1\0\0" * MOST_STRAYS)
+        client.writer.write(b"$\1\0\0" * MAX_STRAY_PACKETS)
         assert (await client.ask("OPTIONS")).status == 200
         before = asyncio.get_running_loop().time()
         client.writer.write(b"$\1\0\0")
@@ -325,10 +329,25 @@ async def test_there_are_so_many_connections_and_viewers() -> None:
             await one.set_up()
             assert (await two.ask("SETUP", Transport=TCP)).status == 453
             async with await Client.connect(serving) as three:
+                assert await two.ended()  # it has no session, and makes room
+                assert (await one.ask("TEARDOWN")).status == 200
+                await three.set_up()
+        await until(lambda: not connections(serving))
+
+
+async def test_where_each_connection_has_a_session_the_newcomer_is_refused() -> None:
+    async with served(max_connections=2) as (_, serving):
+        async with await Client.connect(serving) as one, await Client.connect(serving) as two:
+            await one.set_up()
+            await two.set_up()
+            async with await Client.connect(serving) as three:
                 assert (await three.reply()).status == 503
                 assert await three.ended()
-            assert (await one.ask("TEARDOWN")).status == 200
-            await two.set_up()
+            assert (await one.ask("GET_PARAMETER")).status == 200
+            assert (await two.ask("TEARDOWN")).status == 200
+            async with await Client.connect(serving) as three:
+                assert await two.ended()
+                await three.set_up()
         await until(lambda: not connections(serving))
         async with await Client.connect(serving) as client:
             await client.set_up()

@@ -10,7 +10,7 @@ import pytest
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
 from smartcam.frames import Codecs
-from smartcam.frames._shared_stream import FAILURES, KEY_PAUSE, LINGER, SharedH264
+from smartcam.frames._streaming.shared_stream import FAILURES, KEY_PAUSE, LINGER, SharedH264
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.pictures import frame_of, stamped
 from tests.handmade import until

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from smartcam.frames import Codecs, RtspServer
-from smartcam.frames._rtp.packets import (
+from smartcam.frames._streaming.rtp.packets import (
     Goodbye,
     PictureLost,
     ReceiverReport,
@@ -24,10 +24,15 @@ from smartcam.frames._rtp.packets import (
     compound,
     parse_rtcp,
 )
-from smartcam.frames._rtsp import delivery
-from smartcam.frames._rtsp.delivery import STALLED, port_pair
-from smartcam.frames._rtsp.session import CLOCK, NTP_EPOCH, REPORT_EVERY, TIMEOUT
-from smartcam.frames._shared_stream import KEY_PAUSE, LINGER
+from smartcam.frames._streaming.rtp.reception import SECONDS_FROM_1900_TO_1970
+from smartcam.frames._streaming.rtsp import delivery
+from smartcam.frames._streaming.rtsp.delivery import STALL_TIMEOUT, port_pair
+from smartcam.frames._streaming.rtsp.session import (
+    CLOCK,
+    REPORT_INTERVAL,
+    TIMEOUT,
+)
+from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER
 from smartcam.frames._synthetic import write_stamp
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.pictures import frame_of, stamped
@@ -215,7 +220,7 @@ async def test_who_takes_nothing_is_cut_off() -> None:
                 await stage.give(noise(number))
                 assert await seen(one, good) == number
             assert stage.counts.viewers == 2
-            await asyncio.sleep(STALLED - 1.5)
+            await asyncio.sleep(STALL_TIMEOUT - 1.5)
             assert (stage.counts.viewers, stage.counts.stalled) == (2, 0)
             await asyncio.sleep(3)
             assert (stage.counts.viewers, stage.counts.stalled) == (1, 1)
@@ -269,13 +274,13 @@ async def test_reports_tell_what_a_timestamp_is_in_utc(stage: Stage) -> None:
         await client.play()
         await stage.show(1)
         first = parse_rtcp(await client.packet(1))
-        await asyncio.sleep(REPORT_EVERY + 1)
+        await asyncio.sleep(REPORT_INTERVAL + 1)
         second = parse_rtcp(await client.packet(1))
         for report, described in (first, second):
             assert isinstance(report, SenderReport)
             assert isinstance(described, SourceDescription)
             assert report.ssrc == RtpPacket.parse(client.packets[0][0]).ssrc
-            assert report.ntp >> 32 > NTP_EPOCH
+            assert report.ntp >> 32 > SECONDS_FROM_1900_TO_1970
         a, b = first[0], second[0]
         assert isinstance(a, SenderReport)
         assert isinstance(b, SenderReport)
@@ -368,7 +373,7 @@ async def test_datagrams_that_have_no_room_are_dropped_and_it_begins_anew(
         made.append(Full(rtp, 1_000_000))
         return made[0], rtcp
 
-    monkeypatch.setattr("smartcam.frames._rtsp.requests.port_pair", pair)
+    monkeypatch.setattr("smartcam.frames._streaming.rtsp.requests.port_pair", pair)
     async with staged(crf=5) as stage:
         watcher = stage.watcher(SMALL)
         async with await Client.connect(stage.server) as client:

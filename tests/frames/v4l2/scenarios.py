@@ -12,6 +12,8 @@ from smartcam.frames._v4l2.controls import DeviceControl
 from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
 from smartcam.frames._v4l2.driver import V4L2Driver
 
+__all__ = ["DeviceControl", "V4L2Driver", "abi"]
+
 URL = "v4l2:///dev/video0?format=YUYV&size=320x180&fps=25"
 
 

@@ -13,6 +13,7 @@ import smartcam.frames
 from smartcam.exceptions import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.frames import Moment
 from smartcam.frames._v4l2 import abi, discovery, stream, system
+from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
 from tests.frames.v4l2 import scenarios
 from tests.frames.v4l2.conversations import WRAPPED, Replay
 
@@ -212,7 +213,7 @@ async def _reading(expected: type[Exception]) -> str:
 async def test_half_a_picture_is_never_delivered(
     play: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "BAD_IN_A_ROW", 3)
+    monkeypatch.setattr(stream, "MAX_BAD_IN_A_ROW", 3)
     changed(play("stream"), monkeypatch, used=57600)
     said = await _reading(FrameFormatError)
     assert "expected YUV422_8 320x180, 115200 bytes or more, got 57600 bytes 3 times" in said
@@ -221,7 +222,7 @@ async def test_half_a_picture_is_never_delivered(
 async def test_a_device_with_nothing_but_errors_ends(
     play: Player, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "BAD_IN_A_ROW", 3)
+    monkeypatch.setattr(stream, "MAX_BAD_IN_A_ROW", 3)
     changed(play("stream"), monkeypatch, flags=abi.BUF_ERROR | abi.TIMESTAMP_MONOTONIC)
     assert "got an error of the device 3 times" in await _reading(FrameFormatError)
 
@@ -287,3 +288,50 @@ async def test_a_start_that_is_cancelled_leaves_nothing(play: Player, steps: int
 def test_a_wrong_url_says_what_is_expected(url: str, words: str) -> None:
     with pytest.raises(ConfigurationError, match=words):
         smartcam.frames.open(url)
+
+
+DEFAULT, FULL, LIMITED = 0, 1, 2
+
+
+@pytest.mark.parametrize(
+    ("fourcc", "colorspace", "encoding", "quantization", "name"),
+    [
+        ("YUYV", 8, 0, DEFAULT, "YUV422_8"),  # sRGB, as most webcams say
+        ("YUYV", 1, 0, DEFAULT, "YUV422_8"),  # SMPTE 170M
+        ("YUYV", 8, 0, FULL, "YCbCr422_8"),
+        ("YUYV", 7, 0, DEFAULT, "YCbCr422_8"),  # JPEG
+        ("YUYV", 7, 0, LIMITED, "YUV422_8"),
+        ("YUYV", 3, 0, DEFAULT, "YCbCr709_422_8"),  # Rec. 709
+        ("YUYV", 3, 1, DEFAULT, "YUV422_8"),  # with BT.601's matrix
+        ("UYVY", 8, 2, FULL, "YUV422_8_UYVY_709_full"),
+        ("NV12", 10, 0, DEFAULT, "NV12_2020"),  # BT.2020
+        ("YU12", 8, 6, FULL, "I420_2020_full"),
+        ("422P", 8, 4, DEFAULT, "I422_709"),  # xvYCC of 709
+        ("RGB3", 8, 0, DEFAULT, "RGB8"),
+        ("BGR3", 8, 0, LIMITED, "BGR8_limited"),
+        ("GREY", 8, 0, FULL, "Mono8"),
+        ("MJPG", 3, 2, LIMITED, "MJPEG"),
+    ],
+)
+def test_colours_are_what_the_device_tells(
+    fourcc: str, colorspace: int, encoding: int, quantization: int, name: str
+) -> None:
+    device = CaptureDevice.__new__(CaptureDevice)
+    code = abi.fourcc(fourcc)
+    layout = abi.BufferLayout(8, 8, code, 1, 16, 128, colorspace, abi.PRIVATE_MAGIC, 0, encoding)
+    told = layout._replace(quantization=quantization)
+    assert device._coloured(FORMATS[code], told).name == name
+    # a kernel that does not know the fields leaves anything there
+    untold = told._replace(private=0)
+    by_colorspace = told._replace(ycbcr_enc=0, quantization=0)
+    assert device._coloured(FORMATS[code], untold) is device._coloured(FORMATS[code], by_colorspace)
+
+
+@pytest.mark.parametrize(("colorspace", "encoding"), [(2, 0), (8, 8), (10, 7)])
+def test_matrix_that_is_not_known_is_refused(colorspace: int, encoding: int) -> None:
+    device = CaptureDevice.__new__(CaptureDevice)
+    device.path = "/dev/video0"
+    code = abi.fourcc("YUYV")
+    layout = abi.BufferLayout(8, 8, code, 1, 16, 128, colorspace, abi.PRIVATE_MAGIC, 0, encoding)
+    with pytest.raises(FrameFormatError, match=r"BT.601, BT.709 or BT.2020, the device has"):
+        device._coloured(FORMATS[code], layout)

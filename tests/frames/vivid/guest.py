@@ -204,8 +204,8 @@ async def dropped_frames_are_counted() -> None:
         await take(reader, 1)
         before = reader.statistics()
         frames = await take(reader, 20)
-        press(0, "percentage_of_dropped_buffers", 0)
         after = reader.statistics()
+        press(0, "percentage_of_dropped_buffers", 0)
     lost = sum(one.lost for one in frames)
     assert lost == after.lost - before.lost >= 5
     steps = [b.sequence - a.sequence - 1 for a, b in itertools.pairwise(frames)]
@@ -335,7 +335,49 @@ async def controls_are_listed_set_and_bounded() -> None:
             else:
                 raise AssertionError(name)
         await driver.set_control("hue", 0)
+        assert await source.features["GainAuto"].set("Off") == "Off"
+        assert await source.features["Gain"].set(7) == 7
+        assert (await driver.controls())["gain"].value == 7
+        assert await source.features["ReverseX"].set(True) is True
+        assert await source.features["menu"].set("Menu Item 1") == "Menu Item 1"
+        await source.features["button"].execute()
+        await source.features["ReverseX"].set(False)
     await refused("v4l2:///dev/video0?control.brightness=bright", "expected 0 to 255, got 'bright'")
+
+
+COLOURS_TOLD = (
+    # color space, encoding, quantization: the device's menus; and the format that follows
+    (("sRGB", "Default", "Default"), "YUV422_8"),
+    (("Rec. 709", "Default", "Default"), "YCbCr709_422_8"),
+    (("sRGB", "Rec. 709", "Default"), "YCbCr709_422_8"),
+    (("sRGB", "ITU-R 601", "Full Range"), "YCbCr422_8"),
+    (("Rec. 709", "Rec. 709", "Full Range"), "YUV422_8_709_full"),
+    (("sRGB", "BT.2020", "Limited Range"), "YUV422_8_2020"),
+)
+
+
+@check
+async def colours_are_what_the_device_says_they_are() -> None:
+    menus = ("colorspace", "y_cbcr_encoding", "quantization")
+    device = CaptureDevice.open("/dev/video0")
+    for name, values in (("brightness", 128), ("test_pattern", 7), ("osd_text_mode", 2)):
+        set_control(device, name, values)
+    device.close()
+    for told, name in COLOURS_TOLD:
+        device = CaptureDevice.open("/dev/video0")
+        for menu, value in zip(menus, told, strict=True):
+            set_control(device, menu, value)
+        device.close()
+        async with smartcam.frames.open(URL.format(0)) as source:
+            frame = await source.newest()
+            assert frame.format.name == name, (told, frame.format.name)
+            red = frame.rgb()[90, 160].astype(int)
+            assert max(abs(red - [255, 0, 0])) <= 4 or told[0] != "sRGB", (told, red.tolist())
+    device = CaptureDevice.open("/dev/video0")
+    for name in ("test_pattern", "osd_text_mode", *menus):
+        set_control(device, name, 0)
+    set_control(device, "colorspace", "sRGB")
+    device.close()
 
 
 @check

@@ -1,0 +1,41 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.depth._colours import hsv
+    from smartcam.depth._simulation import (
+        AXES,
+        BLOCK,
+        FOCAL,
+        TableSight,
+        TowerTable,
+        WoodenBlock,
+        laid,
+        to_robot,
+    )
+
+__all__ = [
+    "AXES",
+    "BLOCK",
+    "FOCAL",
+    "TableSight",
+    "TowerTable",
+    "WoodenBlock",
+    "hsv",
+    "laid",
+    "to_robot",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_colours": "hsv",
+            "_simulation": "AXES BLOCK FOCAL TableSight TowerTable WoodenBlock laid to_robot",
+        },
+    )

@@ -1,0 +1,65 @@
+"""Bitmap files, as smart cameras send their pictures."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.exceptions import FrameFormatError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+FILE: Final = struct.Struct("<2sIHHI")
+INFO: Final = struct.Struct("<IiiHHIIiiII")
+MOST: Final = 1 << 28
+"""Bytes of pixels; no camera has more."""
+
+
+def read_bitmap(data: bytes) -> NDArray[np.uint8]:
+    """Return the pixels of a BMP file: (H, W) where it is grey, else (H, W, 3), red first.
+
+    Read are 8 bits with a palette and 24 or 32 bits, uncompressed, either row first.
+
+    Raises:
+        FrameFormatError: it is cut off, compressed, of other bits, or no bitmap.
+    """
+    if len(data) < FILE.size + INFO.size or data[:2] != b"BM":
+        raise FrameFormatError(
+            f"expected a bitmap file, got {len(data)} bytes that begin with {data[:8].hex(' ')}"
+        )
+    offset = FILE.unpack_from(data)[4]
+    head, width, rows, _, bits, compression, _, _, _, used, _ = INFO.unpack_from(data, FILE.size)
+    height = abs(rows)
+    if head < INFO.size or compression or bits not in (8, 24, 32):
+        raise FrameFormatError(
+            f"expected an uncompressed bitmap of 8, 24 or 32 bits, got one of {bits} bits, "
+            f"compression {compression}, with a head of {head} bytes"
+        )
+    stride = (width * bits // 8 + 3) & ~3
+    if width < 1 or height < 1 or stride * height > MOST or len(data) < offset + stride * height:
+        raise FrameFormatError(
+            f"bitmap of {width}x{height}: expected {stride * height} bytes of pixels from byte "
+            f"{offset} on, got {max(len(data) - offset, 0)}"
+        )
+    pixels = np.ndarray((height, width, bits // 8), np.uint8, data, offset, (stride, bits // 8, 1))
+    if rows > 0:
+        pixels = pixels[::-1]
+    if bits == 8:
+        return _looked_up(pixels[..., 0], data[FILE.size + head :][: 4 * (used or 256)])
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def _looked_up(pixels: NDArray[Any], palette: bytes) -> NDArray[np.uint8]:
+    """Return the colours of a palette's indices; an index beyond the palette is black."""
+    colours = np.zeros((256, 4), np.uint8)
+    given = np.frombuffer(palette[: len(palette) // 4 * 4], np.uint8).reshape(-1, 4)[:256]
+    colours[: len(given)] = given
+    if (colours[:, :1] == colours[:, 1:3]).all():
+        grey: NDArray[np.uint8] = colours[:, 0][pixels]
+        return grey
+    coloured: NDArray[np.uint8] = colours[:, 2::-1][pixels]
+    return coloured

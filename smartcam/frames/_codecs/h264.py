@@ -1,0 +1,320 @@
+"""H.264 by x264 and FFmpeg, without a frame of delay."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from dataclasses import replace
+from fractions import Fraction
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, TypeVar
+
+from smartcam._arguments import check_integer, check_number
+from smartcam._extras import load
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames._codecs.pictures import decoded
+from smartcam.frames._pixels.formats import find_format
+from smartcam.frames._video.frames import from_video, to_video
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.frames._frame import Frame
+
+
+T = TypeVar("T")
+
+HELD: Final = 32
+"""Encoded frames whose data a decoder remembers until their pictures come out."""
+
+
+class Runs(Protocol):
+    """A function that runs work in a thread, such as that of ``Codecs``."""
+
+    def __call__(self, work: Callable[[], T], /) -> Awaitable[T]:
+        """Run the work, in a thread or right here, and return its result."""
+        ...
+
+
+class H264Encoder:
+    """One stream of H.264; made by :meth:`Codecs.h264_encoder`.
+
+    Each frame gives its own bytes at once. Instead of key frames, which are large, a column of each
+    frame is sent whole (intra refresh); the parameter sets are repeated, so one can join late.
+    Another size or format begins the stream anew, with a key frame, and so does a cancelled call,
+    whose bytes nobody has.
+
+    U and V are shared by four pixels. Y goes in as the camera sent it, with its range told; only
+    RGB is converted, to BT.601 of limited range. A JPEG is decoded to RGB before.
+    """
+
+    def __init__(
+        self, run: Runs, *, fps: float, keyint: int, crf: float, bitrate: int | None
+    ) -> None:
+        load("av")
+        who = "h264_encoder"
+        fps = check_number(fps, "fps", 0.01, 1000.0, who)
+        keyint = check_integer(keyint, "keyint", 2, 600, who)
+        crf = check_number(crf, "crf", 0, 51, who)
+        if bitrate is not None:
+            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, who)
+        self._run = run
+        self._rate = Fraction(fps).limit_denominator(1000)
+        self._options = {
+            "preset": "ultrafast",
+            "tune": "zerolatency",
+            "x264-params": f"intra-refresh=1:keyint={keyint}:repeat-headers=1",
+        }
+        if bitrate is None:
+            self._options["crf"] = f"{crf:g}"
+        else:
+            self._options |= {"maxrate": str(bitrate), "bufsize": str(bitrate // 4)}
+        self._bitrate = bitrate
+        self._turn = asyncio.Lock()
+        self._one = threading.Lock()  # a cancelled call's thread may still be at it
+        self._codec: Any = None
+        self._grey: Any = None  # frame of the last grey picture, which x264 has copied
+        self._kind: tuple[object, ...] = ()
+        self._broken = 0  # calls whose bytes nobody has
+        self._count = 0
+
+    def begin_anew(self) -> None:
+        """Have the next frame be a key frame, for who joins or has lost something."""
+        self._broken += 1
+
+    async def encode(self, frame: Frame) -> Frame:
+        """Return a frame of format ``H264`` with all that was known of the one given.
+
+        Raises:
+            FrameFormatError: it cannot become video: see the error for what can.
+            LocalProtocolError: the codecs are closed.
+
+        Cancellation: safe; the stream begins anew with the next frame.
+        """
+        async with self._turn:
+            try:
+                return await self._run(partial(self._encode, frame, self._broken))
+            except BaseException:
+                self.begin_anew()
+                raise
+
+    def _encode(self, frame: Frame, broken: int) -> Frame:
+        with self._one:
+            if frame.format.name == "MJPEG":
+                frame = decoded(frame, "RGB8")
+            video = to_video(frame, self._grey)
+            self._grey = video if frame.format.name == "Mono8" else None
+            kind = (broken, video.width, video.height, video.format.name, *_colours(video))
+            if kind != self._kind:
+                self._codec = self._begun(video)
+                self._kind = kind
+            video.pts = self._count
+            video.time_base = 1 / self._rate
+            self._count += 1
+            packets = self._codec.encode(video)
+            data = b"".join(bytes(packet) for packet in packets)
+            return replace(frame, data=data, format=find_format("H264"), stride=0)
+
+    def _begun(self, video: Any) -> Any:
+        codec = load("av").CodecContext.create("libx264", "w")
+        codec.width, codec.height, codec.pix_fmt = video.width, video.height, video.format.name
+        codec.framerate, codec.time_base = self._rate, 1 / self._rate
+        codec.color_range, codec.colorspace = _colours(video)
+        codec.thread_count = 1
+        codec.options = self._options
+        if self._bitrate is not None:
+            codec.bit_rate = self._bitrate
+        return codec
+
+
+class H264Decoder:
+    """One stream of H.264; made by :meth:`Codecs.h264_decoder`.
+
+    Its pictures are whole: it begins at a key frame, or where a refresh is complete that began when
+    it had decoded something before (FFmpeg alone can take one for complete whose first frame it had
+    no reference for). That takes up to three times the encoder's ``keyint`` in the midst of a
+    stream, two after a loss, and none after :meth:`H264Encoder.begin_anew`.
+
+    Args:
+        run: runs the work.
+        reorders: whether pictures come in another order than they are shown in, so that some have
+            to wait for others.
+        to: pixel format of FFmpeg that pictures are converted to; "": as they are.
+    """
+
+    CODEC: ClassVar = "h264"
+    """The codec's name, as FFmpeg has it."""
+    NAME: ClassVar = "H264"
+    """The codec's name in texts."""
+
+    def __init__(self, run: Runs, *, reorders: bool = False, to: str = "") -> None:
+        load("av")
+        self._run, self._reorders, self._to = run, reorders, to
+        self._turn = asyncio.Lock()
+        self._one = threading.Lock()
+        self._codec: Any = None
+        self._size = (0, 0)
+        self._losses = self._losses_seen = 0
+        self._missing: int | None = None  # frames until the picture is whole; None: unknown
+        self._begun = False  # something was decoded that a refresh can refer to
+        self._held: dict[int, Frame] = {}
+        self._count = 0
+
+    @property
+    def whole(self) -> bool:
+        """True if pictures come: the stream is whole since its beginning or the last loss."""
+        return self._missing == 0 and self._losses == self._losses_seen
+
+    def lost(self) -> None:
+        """Report that bytes of the stream are missing: no picture comes until it is whole again.
+
+        A decoder cannot see what is missing, and would go on with a picture that is none.
+        """
+        self._losses += 1
+
+    async def decode(self, frame: Frame) -> Frame | None:
+        """Return the next picture, with all that was known of its encoded frame.
+
+        Args:
+            frame: of format ``H264``; one encoded frame, whole.
+
+        Returns:
+            None as long as there is no whole picture: at the start in the midst of a stream, and
+            after a loss.
+
+        Raises:
+            FrameFormatError: damaged, or of another size than the frame says; it counts as a loss.
+            LocalProtocolError: the codecs are closed.
+
+        Cancellation: safe; it counts as a loss.
+        """
+        async with self._turn:
+            try:
+                return await self._run(partial(self._decode, frame, self._losses))
+            except BaseException:
+                self.lost()
+                raise
+
+    def _decode(self, frame: Frame, losses: int) -> Frame | None:
+        with self._one:
+            if self._size != (frame.width, frame.height):
+                self._begin(frame)
+            if losses != self._losses_seen:
+                self._losses_seen, self._missing = losses, None
+            missing = self._follow(bytes(frame.data))
+            packet = self._packet(frame)
+            try:
+                pictures = self._codec.decode(packet)
+            except load("av").FFmpegError as exc:
+                if self._missing is None:
+                    return None
+                raise self._damaged(frame, str(exc)) from exc
+            self._begun = True
+            made = [self._made(picture) for picture in pictures]
+            if any(picture.is_corrupt for picture in pictures) and missing == 0:
+                raise self._damaged(frame, "a picture with holes")
+            return made[-1] if made and missing == 0 else None
+
+    def _begin(self, frame: Frame) -> None:
+        self._codec = codec = load("av").CodecContext.create(self.CODEC, "r")
+        codec.thread_count = 1
+        self._size = (frame.width, frame.height)
+        room = (frame.width + 64) * (frame.height + 64)
+        codec.options = {
+            "max_pixels": str(room),
+            "err_detect": "explode",  # half a picture is none
+        } | ({} if self._reorders else {"flags": "low_delay"})
+        self._held.clear()
+        self._missing, self._begun = None, False
+
+    def _follow(self, data: bytes) -> int | None:
+        """Return the number of frames until the picture is whole; None if that is not known."""
+        if self._missing == 0:
+            return 0
+        key, refresh = self._entry_point(data)
+        if key:
+            self._missing = 0
+        elif self._missing is not None:
+            self._missing -= 1
+        elif refresh is not None and self._begun:
+            self._missing = refresh
+        return self._missing
+
+    def _entry_point(self, data: bytes) -> tuple[bool, int | None]:
+        return entry_point(data)
+
+    def _packet(self, frame: Frame) -> Any:
+        packet = load("av").Packet(frame.data)
+        self._count += 1
+        packet.pts = self._count
+        self._held[self._count] = frame
+        if len(self._held) > HELD:
+            del self._held[next(iter(self._held))]
+        return packet
+
+    def _made(self, picture: Any) -> Frame:
+        frame = self._held.pop(picture.pts)
+        pixels = from_video(picture.reformat(format=self._to) if self._to else picture)
+        if (pixels.width, pixels.height) != (frame.width, frame.height):
+            raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
+        return replace(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
+
+    def _damaged(self, frame: Frame, got: str) -> FrameFormatError:
+        return FrameFormatError(
+            f"{frame.source}: {self.NAME} {frame.width}x{frame.height}: expected a whole encoded "
+            f"frame, got {len(frame.data)} bytes: {got}",
+            source=frame.source,
+        )
+
+
+SLICES, KEY, SEI, RECOVERY_POINT = (1, 2, 3, 4), 5, 6, 6
+"""Kinds of units (ITU-T H.264, table 7-1), and a kind of message in one (annex D)."""
+
+
+def entry_point(data: bytes) -> tuple[bool, int | None]:
+    """Return True for a key frame, and the number of frames until a refresh is over.
+
+    The number is None where no refresh begins with the frame.
+    """
+    refresh = None
+    place = data.find(b"\0\0\1")
+    while 0 <= place < len(data) - 3:
+        kind, after = data[place + 3] & 0x1F, data.find(b"\0\0\1", place + 3)
+        if kind == KEY or kind in SLICES:
+            return kind == KEY, refresh
+        if kind == SEI:
+            end = after if after >= 0 else len(data)
+            found = _recovery(data[place + 4 : end].replace(b"\0\0\3", b"\0\0"))
+            refresh = refresh if found is None else found
+        place = after
+    return False, refresh
+
+
+def _recovery(messages: bytes) -> int | None:
+    """Return recovery_frame_cnt of a unit's messages."""
+    place = 0
+    while place + 2 <= len(messages) and messages[place] != 0x80:
+        numbers = []
+        for _ in range(2):  # the kind and the size, each of bytes 255 and a last one
+            number = 0
+            while place < len(messages) and messages[place] == 0xFF:
+                number, place = number + 0xFF, place + 1
+            if place == len(messages):
+                return None
+            numbers.append(number + messages[place])
+            place += 1
+        kind, size = numbers
+        if kind == RECOVERY_POINT:
+            return _exp_golomb(messages[place : place + size])
+        place += size
+    return None
+
+
+def _exp_golomb(data: bytes) -> int | None:
+    bits = "".join(f"{byte:08b}" for byte in data[:8])
+    zeros = len(bits) - len(bits.lstrip("0"))
+    return int(bits[zeros : 2 * zeros + 1], 2) - 1 if len(bits) > 2 * zeros else None
+
+
+def _colours(video: Any) -> tuple[int, int]:
+    return int(video.color_range), int(video.colorspace)

@@ -1,0 +1,138 @@
+"""JPEG by libjpeg-turbo."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam._extras import load
+from smartcam.exceptions import FrameFormatError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+DAMAGE: Final = (
+    "premature end",
+    "bad huffman code",
+    "bad arithmetic code",
+    "instead of rst",
+    "inconsistent progression",
+    "too many scanlines",
+)
+"""Parts of libjpeg's warnings (``jerror.h``) behind which a part of the picture is grey or wrong.
+The others are of a whole picture: bytes that belong to nothing, a revision or a profile that is not
+known. Common webcams send such pictures, and other decoders show them."""
+
+_JFIF: Final = (b"JFIF\0\x01", b"JFXX\0\x10", b"JFXX\0\x11", b"JFXX\0\x13")
+
+_RESTART: Final = re.compile(rb"\xff([\xd0-\xd7])")
+
+
+class DecodedJpeg(NamedTuple):
+    """The pixels of a JPEG.
+
+    Attributes:
+        pixels: samples, (H, W, C).
+        remark: remark of the decoder on a picture that is whole all the same; mostly empty.
+    """
+
+    pixels: NDArray[np.uint8]
+    remark: str
+
+
+def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, int, bool]:
+    """Return width and height, and whether there are colours; nothing is decoded.
+
+    Raises:
+        FrameFormatError: it is no JPEG.
+        MissingExtraError: simplejpeg is not installed.
+    """
+    simplejpeg = load("simplejpeg")
+    try:
+        height, width, colours, _ = simplejpeg.decode_jpeg_header(data, strict=False)
+    except (ValueError, KeyError) as exc:  # the second of what has no known kind of colours
+        raise _wrong(what, data, exc) from exc
+    return width, height, colours != "Gray"
+
+
+def decode_jpeg(
+    data: bytes | bytearray | memoryview, colours: str, size: tuple[int, int], what: str
+) -> DecodedJpeg:
+    """Return the pixels, and a remark on what the decoder read past.
+
+    Args:
+        data: a JPEG; also without Huffman tables, as cameras on USB send it.
+        colours: ``GRAY`` for its luma as it stands, or ``RGB``.
+        size: width and height that it is expected to have; another costs no memory.
+        what: name of the picture for errors.
+
+    Raises:
+        FrameFormatError: it is cut off, damaged, of another size, or none.
+        MissingExtraError: simplejpeg is not installed.
+    """
+    width, height, _ = jpeg_header(data, what)
+    if (width, height) != size:
+        raise FrameFormatError(
+            f"{what} {size[0]}x{size[1]}: expected a JPEG of that size, got {width}x{height}"
+        )
+    decode = load("simplejpeg").decode_jpeg
+    try:
+        return DecodedJpeg(decode(data, colours), "")
+    except ValueError as exc:
+        remark = str(exc)
+        if not remark.strip() or any(one in remark.lower() for one in DAMAGE):
+            raise _wrong(what, data, exc) from exc
+        _check_restarts(data, what, exc)
+        return DecodedJpeg(_read_past(decode, data, colours, what), remark)
+
+
+def _read_past(decode: Any, data: bytes | bytearray | memoryview, colours: str, what: str) -> Any:
+    try:
+        return decode(_joined_segments(bytes(data)), colours, strict=False)
+    except ValueError as exc:
+        raise _wrong(what, data, exc) from exc
+
+
+def _joined_segments(data: bytes) -> bytes:
+    """Return a JPEG without the bytes between the segments before its first scan.
+
+    simplejpeg 1.9 refuses these even where it is not strict, and a JFIF segment of a revision that
+    it does not know, which says nothing on the pixels.
+    """
+    kept, place = [data[:2]], 2
+    while place + 4 <= len(data):
+        begin = data.find(b"\xff", place)
+        if begin < 0 or data[begin + 1 : begin + 2] in (b"", b"\xda"):
+            break
+        if data[begin + 1] in (0, 0xFF):  # a byte that belongs to nothing, or one that fills
+            place = begin + 1
+            continue
+        place = begin + 2 + int.from_bytes(data[begin + 2 : begin + 4], "big")
+        if not data[begin:].startswith(b"\xff\xe0") or data[begin + 4 : begin + 10] in _JFIF:
+            kept.append(data[begin:place])
+    scan = data.find(b"\xff\xda", place)
+    return b"".join([*kept, data[scan:]]) if scan >= 0 else data
+
+
+def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Exception) -> None:
+    """See that no restart mark is missing: libjpeg tells its last warning, not those before it.
+
+    Raises:
+        FrameFormatError: they do not follow each other, or the end mark is not there.
+    """
+    whole = bytes(data)
+    scan = whole.rfind(b"\xff\xda")
+    marks = [found[0] - 0xD0 for found in _RESTART.findall(whole, max(scan, 0))]
+    if scan < 0 or b"\xff\xd9" not in whole[scan:]:
+        raise _wrong(what, data, warning)
+    if marks != [place % 8 for place in range(len(marks))]:
+        raise _wrong(what, data, ValueError(f"a restart mark is missing; {warning}"))
+
+
+def _wrong(what: str, data: bytes | bytearray | memoryview, exc: Exception) -> FrameFormatError:
+    return FrameFormatError(
+        f"{what}: expected a whole JPEG, got {len(data)} bytes that are none "
+        f"(they begin with {bytes(data[:4]).hex(' ')}): {exc}"
+    )

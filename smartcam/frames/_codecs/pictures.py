@@ -1,0 +1,275 @@
+"""Pictures to JPEG, PNG and JPEG XL and back: functions of a frame that block."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames._codecs.jpeg import decode_jpeg, jpeg_header
+from smartcam.frames._pixels.formats import find_format
+from smartcam.frames._pixels.layouts import Planes, SampleLayout, YuvPairs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._pixels.formats import PixelFormat
+
+
+def with_pixels(frame: Frame, pixels: NDArray[Any], name: str) -> Frame:
+    """Return the frame with other pixels; all that is known of it stays."""
+    height, width = pixels.shape[:2]
+    kept = np.ascontiguousarray(pixels)
+    return replace(
+        frame,
+        data=kept.data.toreadonly().cast("B"),
+        format=find_format(name),
+        width=width,
+        height=height,
+        stride=kept.nbytes // height,
+    )
+
+
+def _with_bytes(frame: Frame, data: bytes, name: str) -> Frame:
+    return replace(frame, data=data, format=find_format(name), stride=0)
+
+
+def converted(frame: Frame, name: str) -> Frame:
+    """Return the frame as grey or in colours: ``Mono8``, ``Mono16``, ``RGB8`` or ``RGB16``."""
+    pixels = frame.rgb() if name.startswith("RGB") else frame.grey()
+    wanted = find_format(name)
+    if pixels.dtype.itemsize * 8 != wanted.depth:
+        depth = frame.format.depth
+        if wanted.depth == 8:
+            pixels = (pixels >> (depth - wanted.depth)).astype(np.uint8)
+        else:
+            pixels = pixels.astype(np.uint16)
+    return with_pixels(frame, pixels, name)
+
+
+# JPEG
+
+
+def to_jpeg(frame: Frame, quality: int) -> Frame:
+    """Return the frame as a JPEG."""
+    layout = frame.format.layout
+    if frame.format.depth != 8:
+        raise _no_way(frame, "JPEG, which has 8 bits a sample", "png, jpegxl or converted")
+    if isinstance(layout, YuvPairs | Planes):
+        data = _planes_to_jpeg(frame, layout.matrix, quality)
+    elif isinstance(layout, SampleLayout) and frame.format.name in _JPEG_COLOURS:
+        pixels = frame.array()
+        pixels = pixels if pixels.ndim == 3 else pixels[..., None]
+        data = _samples_to_jpeg(pixels, _JPEG_COLOURS[frame.format.name], quality)
+    elif frame.format.name == "MJPEG":
+        *_, coloured = jpeg_header(frame.data, "MJPEG")
+        pixels = frame.rgb() if coloured else frame.grey()[..., None]
+        data = _samples_to_jpeg(pixels, "RGB" if coloured else "GRAY", quality)
+    else:
+        raise _no_way(frame, "JPEG", "converted")
+    return _with_bytes(frame, data, "MJPEG")
+
+
+_JPEG_COLOURS: Final = {"Mono8": "GRAY", "RGB8": "RGB", "BGR8": "BGR"}
+
+
+def _samples_to_jpeg(pixels: NDArray[np.uint8], colours: str, quality: int) -> bytes:
+    if pixels.strides[1:] != (pixels.shape[2], 1):
+        pixels = np.ascontiguousarray(pixels)
+    shared = "Gray" if colours == "GRAY" else "420"
+    data: bytes = load("simplejpeg").encode_jpeg(pixels, quality, colours, shared)
+    return data
+
+
+def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
+    """Encode from Y, U and V, which JPEG wants in full range and of BT.601."""
+    if matrix.startswith("709"):
+        return _samples_to_jpeg(frame.rgb(), "RGB", quality)
+    planes = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
+    if matrix == "601":
+        y, chroma = _wideners()
+        ready = [y[planes[0]], chroma[planes[1]], chroma[planes[2]]]
+    else:
+        ready = [np.ascontiguousarray(plane) for plane in planes]
+    data: bytes = load("simplejpeg").encode_jpeg_yuv_planes(*ready, quality)
+    return data
+
+
+@lru_cache(maxsize=1)
+def _wideners() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return full range for each value of limited Y, and of limited U and V."""
+    value = np.arange(256.0)
+    wide = ((value - 16) * 255 / 219, (value - 128) * 255 / 224 + 128)
+    y, chroma = (np.clip(np.rint(one), 0, 255).astype(np.uint8) for one in wide)
+    return y, chroma
+
+
+# PNG and JPEG XL
+
+
+def to_png(frame: Frame) -> Frame:
+    """Return the frame as a PNG, without loss."""
+    samples = _lossless(frame, "PNG")
+    return _with_bytes(frame, load("imagecodecs").png_encode(samples, level=1), "PNG")
+
+
+def to_jpegxl(frame: Frame) -> Frame:
+    """Return the frame as a JPEG XL, without loss."""
+    samples = _lossless(frame, "JPEG XL")
+    data: bytes = load("imagecodecs").jpegxl_encode(samples, effort=1, lossless=True)
+    return _with_bytes(frame, data, "JPEGXL")
+
+
+def _lossless(frame: Frame, to: str) -> NDArray[Any]:
+    """Return the samples that are written."""
+    if not isinstance(frame.format.layout, SampleLayout):
+        raise _no_way(frame, to, "converted")
+    name, pixels = frame.format.name, frame.array()
+    if name.endswith("_limited"):
+        pixels = frame.rgb()  # files have no word for that range
+    elif name.startswith("BGR"):
+        pixels = pixels[..., [2, 1, 0, *range(3, pixels.shape[2])]]
+    return np.ascontiguousarray(pixels)
+
+
+def _no_way(frame: Frame, to: str, instead: str) -> FrameFormatError:
+    return FrameFormatError(
+        f"{frame.source}: {frame.format.name} cannot become {to} as it is; see Codecs.{instead}",
+        source=frame.source,
+    )
+
+
+# back
+
+
+def decoded(frame: Frame, name: str) -> Frame:
+    """Return a JPEG, PNG or JPEG XL as pixels of a format; "": what is in it."""
+    if frame.format.name not in _DECODERS:
+        readable = ", ".join(_DECODERS)
+        raise FrameFormatError(
+            f"{frame.source}: expected one of {readable}, got {frame.format.name}",
+            source=frame.source,
+            available=tuple(_DECODERS),
+        )
+    return _DECODERS[frame.format.name](frame, name)
+
+
+def _from_jpeg(frame: Frame, name: str) -> Frame:
+    *_, coloured = jpeg_header(frame.data, "MJPEG")
+    name = find_format(name or ("RGB8" if coloured else "Mono8")).name
+    colours = {"Mono8": "GRAY", "RGB8": "RGB", "BGR8": "BGR"}
+    if name not in colours:
+        raise _unfit(frame, "Mono8, RGB8 or BGR8", name)
+    size = (frame.width, frame.height)
+    pixels, remark = decode_jpeg(frame.data, colours[name], size, "MJPEG")
+    made = with_pixels(frame, pixels[..., 0] if name == "Mono8" else pixels, name)
+    return replace(made, remark=remark) if remark else made
+
+
+def _from_png(frame: Frame, name: str) -> Frame:
+    head = bytes(frame.data[:24])
+    if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
+        raise _unfit(frame, "a PNG", f"bytes that begin with {head[:8].hex(' ')}")
+    size = (int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big"))
+    return _lossless_back(frame, name, size, "png_decode")
+
+
+def _from_jpegxl(frame: Frame, name: str) -> Frame:
+    return _lossless_back(frame, name, _jpegxl_size(frame), "jpegxl_decode")
+
+
+def _lossless_back(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
+    """Decode what is of the size that it is said to have: another costs no memory."""
+    if size != (frame.width, frame.height):
+        raise _unfit(frame, f"{frame.width}x{frame.height}", f"{size[0]}x{size[1]}")
+    try:
+        pixels: NDArray[Any] = getattr(load("imagecodecs"), decoder)(frame.data)
+    except (ValueError, RuntimeError) as exc:
+        raise _unfit(frame, "a whole picture", f"{len(frame.data)} bytes: {exc}") from exc
+    if pixels.ndim == 3 and pixels.shape[2] == 2:  # grey with alpha, which we have with colours
+        pixels = pixels[..., [0, 0, 0, 1]]
+    wanted = _samples_named(name, pixels)
+    if wanted is None:
+        raise _unfit(frame, name or "grey or RGB", f"{pixels.dtype} of shape {pixels.shape}")
+    return with_pixels(frame, pixels[..., ::-1] if wanted.name == "BGR8" else pixels, wanted.name)
+
+
+def _samples_named(name: str, pixels: NDArray[Any]) -> PixelFormat | None:
+    """Return the format of that name, or the usual one, if such pixels can be of it."""
+    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
+    wanted = find_format(name or _USUAL.get((channels, pixels.dtype.itemsize), "RGB8"))
+    layout = wanted.layout
+    if not isinstance(layout, SampleLayout) or layout.packing is not None:
+        return None
+    fits = (layout.size_of, layout.channels) == (pixels.dtype.itemsize, channels)
+    return wanted if fits and pixels.dtype.kind == "u" else None
+
+
+_USUAL: Final = {
+    (1, 1): "Mono8",
+    (1, 2): "Mono16",
+    (3, 1): "RGB8",
+    (3, 2): "RGB16",
+    (4, 1): "RGBa8",
+    (4, 2): "RGBa16",
+}
+"""Formats by samples of a pixel and their bytes."""
+
+
+def _jpegxl_size(frame: Frame) -> tuple[int, int]:
+    """Return the width and height that a JPEG XL begins with (ISO/IEC 18181-1, SizeHeader)."""
+    stream = _jpegxl_stream(bytes(frame.data[:4096]))
+    if stream[:2] != b"\xff\x0a":
+        raise _unfit(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")
+    bits, place = int.from_bytes(stream[2:14], "little"), 0
+
+    def take(count: int) -> int:
+        nonlocal place
+        place += count
+        return bits >> (place - count) & ((1 << count) - 1)
+
+    small = take(1)
+
+    def side() -> int:
+        return (take(5) + 1) * 8 if small else take((9, 13, 18, 30)[take(2)]) + 1
+
+    height = side()
+    ratio = take(3)
+    if not ratio:
+        return side(), height
+    times, over = _JPEGXL_RATIOS[ratio]
+    return height * times // over, height
+
+
+_JPEGXL_RATIOS: Final = ((0, 0), (1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))
+
+
+def _jpegxl_stream(data: bytes) -> bytes:
+    """Return the code behind the boxes of a file (ISO/IEC 18181-2), or the bytes as they are."""
+    place = 0 if data[4:8] == b"JXL " else len(data)
+    while place + 8 <= len(data):
+        size, kind = int.from_bytes(data[place : place + 4], "big"), data[place + 4 : place + 8]
+        if kind in (b"jxlc", b"jxlp"):
+            return data[place + (8 if kind == b"jxlc" else 12) :]
+        place += max(size, 8)
+    return data
+
+
+def _unfit(frame: Frame, expected: str, got: str) -> FrameFormatError:
+    return FrameFormatError(
+        f"{frame.source}: {frame.format.name}: expected {expected}, got {got}", source=frame.source
+    )
+
+
+_DECODERS: Final[dict[str, Callable[[Frame, str], Frame]]] = {
+    "MJPEG": _from_jpeg,
+    "PNG": _from_png,
+    "JPEGXL": _from_jpegxl,
+}

@@ -1,0 +1,336 @@
+"""Features of a device by their names: exposure time, gain, trigger mode, commands, user sets.
+
+Source: GenICam SFNC 2.7 (names and units; ``UserSetSelector``, ``UserSetLoad``, ``UserSetSave``,
+``UserSetDefault``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+from smartcam._arguments import check_number, check_text, plain, wrong_argument
+from smartcam.exceptions import FrameSourceError, FrameTimeoutError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable
+
+FeatureValue: TypeAlias = "bool | int | float | str"
+"""Value of a feature; of an enumeration it is the name of the entry."""
+
+FeatureKind: TypeAlias = Literal["integer", "float", "boolean", "enumeration", "string", "command"]
+
+FEATURE_TIMEOUT: Final = 10.0
+"""Seconds for reading or setting a feature, unless the caller says otherwise."""
+
+MAX_FEATURE_TIMEOUT: Final = 3600.0
+
+MAX_VALUE_LENGTH: Final = 4096
+"""Characters of a feature's name or text."""
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """The description of a feature, with its range and its value as they are now.
+
+    Attributes:
+        name: name of the feature, mostly one of GenICam's SFNC, such as ``ExposureTime``.
+        kind: kind of the feature.
+        access: ``rw``, ``ro`` or ``wo``; ``""``: it is not available now, which another feature
+            may change.
+        value: value of the feature; None: it cannot be read now, or is a command.
+        minimum: smallest value; None: no number, or not known.
+        maximum: largest value; None: no number, or not known.
+        step: difference between two neighbouring values; None: no number, or any.
+        unit: unit of the value, such as ``us``; ``""``: none is told.
+        entries: names that an enumeration can have now.
+        selectors: features that choose which one this is, such as ``TriggerSelector``.
+        description: text of the device's maker.
+        problem: reason why value or range could not be read; ``""``: there was none.
+    """
+
+    name: str
+    kind: FeatureKind
+    access: Literal["rw", "ro", "wo", ""]
+    value: FeatureValue | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    step: float | None = None
+    unit: str = ""
+    entries: tuple[str, ...] = ()
+    selectors: tuple[str, ...] = ()
+    description: str = ""
+    problem: str = ""
+
+    @property
+    def range(self) -> str:
+        """Range of the feature for people, such as ``10 to 10000 us in steps of 5``."""
+        if self.kind == "boolean":
+            return "true or false"
+        if self.entries:
+            return ", ".join(self.entries)
+        if self.minimum is None and self.maximum is None:
+            return {"command": "a command", "string": "text"}.get(self.kind, "any number")
+        ends = f"{_number(self.minimum)} to {_number(self.maximum)}"
+        step = f" in steps of {_number(self.step)}" if self.step not in (None, 0, 1) else ""
+        return f"{ends}{f' {self.unit}' if self.unit else ''}{step}"
+
+    def __str__(self) -> str:
+        """Return the feature as a list shows it."""
+        now = "" if self.value is None else f" = {as_text(self.value)}"
+        now += f" {self.unit}" if self.value is not None and self.unit else ""
+        access = {"rw": "", "": "; not available now"}.get(self.access, f"; {self.access}")
+        problem = f"; {self.problem}" if self.problem else ""
+        return f"{self.name}{now} ({self.range}{access}{problem})"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "any"
+    return str(value) if isinstance(value, int) else f"{value:g}"
+
+
+def as_text(value: FeatureValue) -> str:
+    """Return a value as a URL or a list has it: ``true``, ``5000``, ``Mono8``."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+class DeviceFeatures(ABC):
+    """The features of one driver's device.
+
+    A name may be written in snake_case: ``exposure_time`` is ``ExposureTime``. A name that is
+    unknown is a :exc:`~smartcam.exceptions.FrameFeatureError` with the names that there are.
+    """
+
+    @abstractmethod
+    async def names(self) -> list[str]:
+        """Return the names of all features."""
+
+    @abstractmethod
+    async def describe(self, name: str) -> Feature:
+        """Return a feature with its value and range as they are now."""
+
+    async def describe_all(self) -> dict[str, Feature]:
+        """Return all features with their values and ranges as they are now."""
+        return {name: await self.describe(name) for name in await self.names()}
+
+    @abstractmethod
+    async def get(self, name: str) -> FeatureValue:
+        """Return the value of a feature."""
+
+    @abstractmethod
+    async def set(self, name: str, value: FeatureValue) -> FeatureValue:
+        """Set a feature; return the value that the device has then."""
+
+    @abstractmethod
+    async def execute(self, name: str) -> None:
+        """Execute a command, and wait until the device has done it."""
+
+
+def spelled(name: str) -> str:
+    """Return a name's letters and digits, by which two spellings of one name are the same."""
+    return "".join(one for one in name.lower() if one.isalnum())
+
+
+class FrameFeatures:
+    """The features of a source's device, by name: ``await source.features["Gain"].set(6.0)``.
+
+    Args:
+        device: function that returns the driver's features; it raises the error that explains why
+            there are none now.
+        changed: called after each change of a feature.
+    """
+
+    def __init__(
+        self, device: Callable[[], DeviceFeatures], changed: Callable[[], Awaitable[None]]
+    ) -> None:
+        self._device, self._changed = device, changed
+
+    def __getitem__(self, name: str) -> FrameFeature:
+        """Return the feature of a name; whether there is one, the device says when it is used.
+
+        Raises:
+            ConfigurationError: the name is no text.
+        """
+        given = check_text(name, "name", "features", most=MAX_VALUE_LENGTH)
+        return FrameFeature(given, self._device, self._changed)
+
+    async def names(self, *, timeout: float = FEATURE_TIMEOUT) -> list[str]:
+        """Return the names of all features.
+
+        Raises:
+            UnsupportedError: a source of this kind has no features.
+            FrameSourceError: the device does not tell them, or not within ``timeout``.
+
+        Cancellation: safe.
+        """
+        async with _within(timeout, "the list of features"):
+            return await self._device().names()
+
+    async def describe(self, *, timeout: float = 6 * FEATURE_TIMEOUT) -> dict[str, Feature]:
+        """Return all features with their values and ranges, by name; a large camera has hundreds.
+
+        Raises:
+            UnsupportedError: a source of this kind has no features.
+            FrameSourceError: the device does not tell them, or not within ``timeout``.
+
+        Cancellation: safe.
+        """
+        async with _within(timeout, "all features"):
+            return await self._device().describe_all()
+
+    async def load(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
+        """Have the device set its features as they are in a user set, such as ``UserSet1``.
+
+        Args:
+            user_set: entry of ``UserSetSelector``; ``Default`` is the maker's.
+            timeout: seconds for the device to do it.
+
+        Raises:
+            FrameFeatureError: there is no such set, or the device does not load it now.
+
+        Cancellation: the device may have loaded it.
+        """
+        await self._with_set(user_set, "UserSetLoad", timeout)
+
+    async def save(self, user_set: str, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
+        """Have the device keep its features, as they are now, in a user set.
+
+        Args:
+            user_set: entry of ``UserSetSelector`` that can be written.
+            timeout: seconds for the device to do it.
+
+        Raises:
+            FrameFeatureError: there is no such set, or the device does not save it.
+
+        Cancellation: the device may have saved it.
+        """
+        await self._with_set(user_set, "UserSetSave", timeout)
+
+    async def start_with(self, user_set: str, *, timeout: float = FEATURE_TIMEOUT) -> None:
+        """Have the device begin with a user set when it is switched on (``UserSetDefault``).
+
+        Raises:
+            FrameFeatureError: there is no such set, or the device cannot choose one.
+
+        Cancellation: the device may have done it.
+        """
+        given = check_text(user_set, "user_set", "start_with", most=MAX_VALUE_LENGTH)
+        found = {spelled(name): name for name in await self.names(timeout=timeout)}
+        name = found.get("usersetdefault", found.get("usersetdefaultselector", "UserSetDefault"))
+        await self[name].set(given, timeout=timeout)
+
+    async def _with_set(self, user_set: str, command: str, timeout: float) -> None:
+        given = check_text(user_set, "user_set", "features", most=MAX_VALUE_LENGTH)
+        await self["UserSetSelector"].set(given, timeout=timeout)
+        await self[command].execute(timeout=timeout)
+
+
+class FrameFeature:
+    """One feature of a source's device. Made by ``source.features[NAME]``.
+
+    Attributes:
+        name: name as it was given.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        device: Callable[[], DeviceFeatures],
+        changed: Callable[[], Awaitable[None]],
+    ) -> None:
+        self.name: str = name
+        self._device, self._changed = device, changed
+
+    async def get(self, *, timeout: float = FEATURE_TIMEOUT) -> FeatureValue:
+        """Return the value.
+
+        Raises:
+            FrameFeatureError: there is no such feature, or it cannot be read now.
+            FrameTimeoutError: the device did not answer within ``timeout``.
+            UnsupportedError: a source of this kind has no features.
+
+        Cancellation: safe.
+        """
+        async with _within(timeout, f"feature {self.name}"):
+            return await self._device().get(self.name)
+
+    async def describe(self, *, timeout: float = FEATURE_TIMEOUT) -> Feature:
+        """Return the feature with its value, range, unit, entries and access as they are now.
+
+        Raises:
+            FrameFeatureError: there is no such feature.
+            FrameTimeoutError: the device did not answer within ``timeout``.
+            UnsupportedError: a source of this kind has no features.
+
+        Cancellation: safe.
+        """
+        async with _within(timeout, f"feature {self.name}"):
+            return await self._device().describe(self.name)
+
+    async def set(self, value: FeatureValue, *, timeout: float = FEATURE_TIMEOUT) -> FeatureValue:
+        """Set the feature; return the value that the device has then, which it may have rounded.
+
+        Args:
+            value: value, or its text: an entry's name, ``true``, a number.
+            timeout: seconds for the device to do it.
+
+        Raises:
+            ConfigurationError: a value of no kind that a feature has.
+            FrameFeatureError: there is no such feature, it cannot be set now, or not to that value;
+                the text has its range.
+            FrameTimeoutError: the device did not answer within ``timeout``.
+            UnsupportedError: a source of this kind has no features.
+
+        Cancellation: the device may have it set.
+        """
+        given = checked_value(value)
+        async with _within(timeout, f"feature {self.name} to be set"):
+            has = await self._device().set(self.name, given)
+            await self._changed()
+            return has
+
+    async def execute(self, *, timeout: float = 3 * FEATURE_TIMEOUT) -> None:
+        """Execute the command, and return when the device says that it is done.
+
+        Raises:
+            FrameFeatureError: there is no such command, or the device refuses it now.
+            FrameTimeoutError: it was not done within ``timeout``.
+            UnsupportedError: a source of this kind has no features.
+
+        Cancellation: the device may have done it.
+        """
+        async with _within(timeout, f"command {self.name} to be done"):
+            await self._device().execute(self.name)
+            await self._changed()
+
+
+def checked_value(value: object) -> FeatureValue:
+    """Return a value that a feature may have, as a plain one.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    given = plain(value)
+    if isinstance(given, str):
+        return check_text(given, "value", "set", most=MAX_VALUE_LENGTH)
+    if isinstance(given, (bool, int)) or (isinstance(given, float) and math.isfinite(given)):
+        return given
+    raise wrong_argument("value", "a finite number, True or False, or a text", value, "set")
+
+
+@contextlib.asynccontextmanager
+async def _within(timeout: object, what: str) -> AsyncIterator[None]:
+    """Bound the time of a block; its end is a FrameTimeoutError that names what was waited for."""
+    seconds = check_number(timeout, "timeout", 0, MAX_FEATURE_TIMEOUT, unit="seconds")
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except FrameSourceError:
+        raise
+    except TimeoutError as exc:
+        raise FrameTimeoutError(f"expected {what} within {seconds:g} s, got no answer") from exc

@@ -1,0 +1,251 @@
+"""One frame on its way: which of its packets came, and where their bytes lie."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.exceptions import MessageError
+from smartcam.frames._gige.gvsp import (
+    EXTENDED_HEADER,
+    HEADER,
+    bits_of,
+    decode_leader,
+    decode_trailer,
+)
+
+if TYPE_CHECKING:
+    from smartcam.frames._gige.gvsp import Leader
+
+PAYLOAD: Final = 0x03000000
+"""Kind of a payload packet, above its id: the second word of its header."""
+
+WITH_CHUNKS: Final = 0x4000
+"""Bit of a payload type: chunk data follows."""
+
+PACKET: Final = 0xFFFFFF
+"""The id in that word."""
+
+
+class WholePicture(NamedTuple):
+    """A frame all of whose packets came.
+
+    Attributes:
+        number: number of the block, counted on where the ids begin anew.
+        lost: frames lost before this one that no earlier picture counts.
+        leader: contents of the first packet.
+        rows: number of rows that the camera sent.
+        stride: bytes of a row.
+        data: ``stride * rows`` bytes, which nobody else holds.
+        arrived: time that the caller gave with the first packet.
+        payload: all bytes of a picture that chunk data follows; else None.
+        block_id: id of the block on the wire.
+    """
+
+    number: int
+    lost: int
+    leader: Leader
+    rows: int
+    stride: int
+    data: memoryview
+    arrived: float
+    payload: memoryview | None = None
+    block_id: int = 0
+
+
+def picture_bytes(leader: Leader, rows: int) -> int:
+    """Return the bytes that ``rows`` rows of a picture have."""
+    bits = bits_of(leader.pixel_format)
+    if leader.padding_x:
+        return ((leader.width * bits + 7) // 8 + leader.padding_x) * rows
+    return (leader.width * rows * bits + 7) // 8
+
+
+class Block:
+    """The packets that came of one block. Memory is taken with its first packet.
+
+    Args:
+        number: number of the block, counted on past the ids' wrap.
+        block_id: on the wire.
+        extended: whether the ids have 64 bits.
+        datagram: bytes of a full packet with its header.
+        most: bytes of the largest payload.
+        now: seconds.
+    """
+
+    __slots__ = (
+        "arrived",
+        "asked",
+        "block_id",
+        "buffer",
+        "complete",
+        "dead",
+        "evident",
+        "expected",
+        "extended",
+        "full",
+        "got",
+        "header",
+        "highest",
+        "last_size",
+        "leader",
+        "number",
+        "over",
+        "packets",
+        "progress",
+        "rows",
+        "seen",
+        "short",
+        "trailer",
+        "tries",
+    )
+
+    def __init__(
+        self, number: int, block_id: int, *, extended: bool, datagram: int, most: int, now: float
+    ) -> None:
+        self.number, self.block_id, self.extended = number, block_id, extended
+        self.header = EXTENDED_HEADER if extended else HEADER
+        self.full = datagram - self.header
+        self.packets = -(-most // self.full)
+        self.buffer: memoryview | None = None
+        self.seen = bytearray(self.packets + 2)
+        self.got = self.highest = 0
+        self.expected = PAYLOAD | 1  # the header's word that the next packet in order has
+        self.leader: Leader | None = None
+        self.trailer: int | None = None
+        self.rows = 0
+        self.short: int | None = None
+        self.last_size = self.full
+        self.arrived: float | None = None
+        self.progress = now
+        self.evident = math.inf  # since when it is seen that packets are missing
+        self.asked, self.tries = -math.inf, 0
+        self.over = False  # the camera is past it, or silent in the middle of it
+        self.complete = self.dead = False
+
+    def take_next(self, packet: int, data: memoryview, now: float) -> bool:
+        """Take the packet that is next in order, full and not the last one; whether it is that.
+
+        It is what nearly all packets are, so it is short; :meth:`take_payload` does it for all.
+        """
+        buffer = self.buffer
+        if (
+            buffer is None
+            or not self.highest < packet < self.packets
+            or self.trailer is not None
+            or self.short is not None
+        ):
+            return False
+        begin = (packet - 1) * self.full
+        buffer[begin : begin + self.full] = data
+        self.seen[packet] = 1
+        self.got += 1
+        self.highest = packet
+        self.expected += 1
+        self.progress = now
+        return True
+
+    def take_payload(self, packet: int, data: memoryview) -> bool:
+        """Take a payload packet's bytes; whether they fit where they belong."""
+        size = len(data)
+        past = self.trailer if self.trailer is not None else self.packets + 1
+        if not (0 < packet < past and 0 < size <= self.full):
+            return False
+        if size < self.full:
+            least = self.highest if self.trailer is None else self.trailer - 1
+            if self.short not in (None, packet) or packet < least:
+                return False  # only the last one may be short
+            self.short, self.last_size = packet, size
+        elif self.short is not None and packet > self.short:
+            return False
+        if self.buffer is None:
+            # of memory that is taken as it is written: one packet does not cost a whole frame
+            self.buffer = np.empty(self.packets * self.full, np.uint8).data
+        begin = (packet - 1) * self.full
+        self.buffer[begin : begin + size] = data
+        self.got += 1
+        return True
+
+    def take_leader(self, payload: bytes) -> None:
+        """Take the leader.
+
+        Raises:
+            MessageError: it is none of a picture, or of one that is larger than said.
+        """
+        leader = decode_leader(payload)
+        need = picture_bytes(leader, leader.height)
+        if need > self.packets * self.full:
+            raise MessageError(
+                f"leader: a picture of {leader.width}x{leader.height} pixels has {need} bytes, "
+                f"the camera's PayloadSize has room for {self.packets * self.full}",
+                data=payload,
+            )
+        self.leader = leader
+
+    def take_trailer(self, packet: int, payload: bytes) -> bool:
+        """Take the trailer; whether it stands behind all that came."""
+        if not self.highest < packet <= self.packets + 1:
+            return False
+        if self.short is not None and packet != self.short + 1:
+            return False
+        self.rows = decode_trailer(payload)
+        self.trailer = packet
+        return True
+
+    def mark(self, packet: int) -> None:
+        """Note that a packet is there."""
+        self.seen[packet] = 1
+        if packet == self.expected & PACKET or (packet == 0 and self.highest == 0):
+            following = self.seen.find(0, packet + 1 if packet else 1)
+            self.expected = PAYLOAD | (max(0, following))
+        self.complete = (
+            self.trailer is not None and self.leader is not None and self.got == self.trailer - 1
+        )
+
+    def holes(self, most: int) -> list[tuple[int, int]]:
+        """Return the packets that should be there and are not, as (first, last), ``most`` such."""
+        end = self.highest
+        if self.trailer is not None:
+            end = self.trailer
+        elif self.over:
+            end = self._expected_packets() + 1
+        found: list[tuple[int, int]] = []
+        first = self.seen.find(0, 0, end + 1)
+        while first >= 0 and len(found) < most:
+            past = self.seen.find(1, first, end + 1)
+            last = end if past < 0 else past - 1
+            found.append((first, last))
+            first = self.seen.find(0, last + 1, end + 1)
+        return found
+
+    def _expected_packets(self) -> int:
+        if self.short is not None:
+            return self.short
+        if (
+            self.leader is None or self.leader.payload_type & WITH_CHUNKS
+        ):  # chunks follow the pixels
+            return self.packets
+        need = picture_bytes(self.leader, self.leader.height) + self.leader.padding_y
+        return max(self.highest, min(self.packets, -(-need // self.full)))
+
+    def picture(self, lost: int) -> WholePicture | None:
+        """Return the frame, once it is complete; None where its bytes are too few for it."""
+        leader = self.leader
+        if leader is None or self.trailer is None:
+            return None
+        rows = min(self.rows or leader.height, leader.height)
+        need = picture_bytes(leader, rows)
+        there = (self.trailer - 1) * self.full
+        if self.trailer > 1 and self.seen[self.trailer - 1]:
+            there += self.last_size - self.full
+        if need > there or not rows or not leader.width or self.buffer is None:
+            return None
+        stride = (leader.width * bits_of(leader.pixel_format) + 7) // 8 + leader.padding_x
+        data = self.buffer[:need]
+        arrived = self.arrived if self.arrived is not None else 0.0
+        payload = self.buffer[:there] if leader.payload_type & WITH_CHUNKS else None
+        return WholePicture(
+            self.number, lost, leader, rows, stride, data, arrived, payload, self.block_id
+        )

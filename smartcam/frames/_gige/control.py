@@ -1,0 +1,331 @@
+"""The control channel of one camera: requests and their answers, and the heartbeat.
+
+One request is under way at a time. One without an answer is sent again with the same id, by which
+the camera knows it; an answer that comes late, or of another id, is dropped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from typing import TYPE_CHECKING, Final, cast
+
+from smartcam.exceptions import FrameSourceError, FrameTimeoutError, MessageError
+from smartcam.frames._gige.gvcp import (
+    CONTROL,
+    EXCLUSIVE,
+    MAX_BYTES_PER_REQUEST,
+    Ack,
+    GvcpCommand,
+    GvcpStatus,
+    Register,
+    decode_ack,
+    encode,
+    encode_resend,
+    read_memory,
+    read_registers,
+    status_text,
+    write_memory,
+    write_registers,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.frames._gige.assembler import Resend
+
+ANSWER_TIMEOUT: Final = 0.3
+"""Seconds for an answer: the standard lets a camera take 200 ms before it says "pending"."""
+
+TRIES: Final = 3
+
+IP_MTU: Final = 14
+"""linux/in.h: what the system knows of the way that a connected socket's packets go."""
+
+MAX_PENDING_TIME: Final = 30.0
+"""Seconds that a camera may put a request off altogether."""
+
+
+class ControlChannel(asyncio.DatagramProtocol):
+    """Requests to one camera.
+
+    Args:
+        source: the camera's name, for errors.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self._transport: asyncio.DatagramTransport | None = None
+        self._lock = asyncio.Lock()
+        self._id = 0
+        self._expected = 0  # id of the request that is under way; 0: none is
+        self._answers: asyncio.Queue[Ack | OSError] = asyncio.Queue(maxsize=16)
+        self.dropped = 0
+        """Datagrams that answered nothing."""
+
+    @classmethod
+    async def connect(cls, host: str, port: int, source: str) -> ControlChannel:
+        """Return a channel to a camera; nothing is sent.
+
+        Raises:
+            FrameSourceError: the host's name is unknown, or no way leads there.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(5):
+                _, channel = await loop.create_datagram_endpoint(
+                    lambda: cls(source), remote_addr=(host, port), family=socket.AF_INET
+                )
+        except OSError as exc:  # of which TimeoutError is one
+            raise FrameSourceError(
+                f"{source}: no way to {host}:{port}: {exc or 'the name has no answer'}",
+                source=source,
+            ) from exc
+        return channel
+
+    @property
+    def local_address(self) -> str:
+        """The address by which the camera reaches us."""
+        return str(self._name("sockname")[0])
+
+    @property
+    def camera_address(self) -> str:
+        """The camera's."""
+        return str(self._name("peername")[0])
+
+    @property
+    def path_mtu(self) -> int:
+        """Bytes of the largest IP packet on the way, as far as the system knows; 1500: unknown."""
+        if self._transport is None or sys.platform != "linux":
+            return 1500
+        inside = self._transport.get_extra_info("socket")
+        return int(inside.getsockopt(socket.IPPROTO_IP, IP_MTU))
+
+    def close(self) -> None:
+        """Close the socket. Idempotent."""
+        if self._transport is not None:
+            self._transport.abort()
+            self._transport = None
+
+    async def read_register(self, address: int) -> int:
+        """Return a register's number.
+
+        Raises:
+            FrameSourceError: the camera refuses, or does not answer.
+        """
+        payload = await self.request(
+            GvcpCommand.READREG, read_registers(address), 4, f"{address:#06x}"
+        )
+        return int.from_bytes(payload[:4], "big")
+
+    async def write_register(self, address: int, value: int) -> None:
+        """Write a register; the errors are the same."""
+        what = f"{address:#06x} = {value:#x}"
+        await self.request(GvcpCommand.WRITEREG, write_registers((address, value)), 0, what)
+
+    async def read(self, address: int, length: int) -> bytes:
+        """Return bytes of the camera's memory; the errors are the same."""
+        if length == 4 and address % 4 == 0:
+            return (await self.read_register(address)).to_bytes(4, "big")
+        begin = address & ~3
+        end = (address + length + 3) & ~3
+        parts = []
+        for place in range(begin, end, MAX_BYTES_PER_REQUEST):
+            count = min(MAX_BYTES_PER_REQUEST, end - place)
+            payload = await self.request(
+                GvcpCommand.READMEM, read_memory(place, count), 4 + count, f"{place:#06x}, {count}"
+            )
+            parts.append(payload[4 : 4 + count])
+        return b"".join(parts)[address - begin :][:length]
+
+    async def write(self, address: int, data: bytes) -> None:
+        """Write into the camera's memory; the errors are the same."""
+        if len(data) == 4 and address % 4 == 0:
+            await self.write_register(address, int.from_bytes(data, "big"))
+            return
+        begin = address & ~3
+        end = (address + len(data) + 3) & ~3
+        if end - begin != len(data):  # only whole words can be written
+            before = await self.read(begin, end - begin)
+            data = before[: address - begin] + data + before[address - begin + len(data) :]
+        for place in range(begin, end, MAX_BYTES_PER_REQUEST):
+            part = data[place - begin :][:MAX_BYTES_PER_REQUEST]
+            await self.request(
+                GvcpCommand.WRITEMEM, write_memory(place, part), 0, f"{place:#06x}, {len(part)}"
+            )
+
+    def resend(self, wanted: Resend) -> None:
+        """Ask for packets once more; nothing answers that but the packets."""
+        if self._transport is not None and not self._transport.is_closing():
+            data = encode_resend(
+                self._next_id(), wanted.block, wanted.first, wanted.last, extended=wanted.extended
+            )
+            self._transport.sendto(data)
+
+    async def request(self, command: GvcpCommand, payload: bytes, least: int, what: str) -> bytes:
+        """Send a request and return the payload of the answer.
+
+        Args:
+            command: command of the request.
+            payload: payload of the request.
+            least: bytes that the payload of the answer has at least.
+            what: subject of the request, for errors.
+
+        Raises:
+            FrameSourceError: the camera refuses, answers too briefly, or the channel is closed.
+            FrameTimeoutError: the camera does not answer.
+
+        Cancellation: safe; the camera may have carried out the request, its answer is dropped.
+        """
+        async with self._lock:
+            request_id = self._next_id()
+            datagram = encode(command, request_id, payload)
+            try:
+                self._expected = request_id
+                for _ in range(TRIES):
+                    ack = await self._tried(datagram, command, what)
+                    if ack is not None:
+                        return self._checked(ack, command, least, what)
+            finally:
+                self._expected = 0
+                self._emptied()
+        raise FrameTimeoutError(
+            f"{self.source}: no answer to {command.name} {what} in {TRIES} x {ANSWER_TIMEOUT:g} s",
+            source=self.source,
+        )
+
+    async def _tried(self, datagram: bytes, command: GvcpCommand, what: str) -> Ack | None:
+        """Send a request; return its answer, None where none comes in time."""
+        if self._transport is None or self._transport.is_closing():
+            raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
+        loop = asyncio.get_running_loop()
+        self._transport.sendto(datagram)
+        begun = loop.time()
+        try:
+            async with asyncio.timeout(ANSWER_TIMEOUT) as limit:
+                while True:
+                    ack = await self._answers.get()
+                    if isinstance(ack, OSError):
+                        raise FrameSourceError(
+                            f"{self.source}: {command.name} {what}: nothing listens there that "
+                            f"speaks GVCP: {ack}",
+                            source=self.source,
+                        ) from ack
+                    if ack.command != GvcpCommand.PENDING_ACK:
+                        return ack
+                    wait = int.from_bytes(ack.payload[2:4], "big") / 1e3 + ANSWER_TIMEOUT
+                    limit.reschedule(min(loop.time() + wait, begun + MAX_PENDING_TIME))
+        except TimeoutError:
+            return None
+
+    def _checked(self, ack: Ack, command: GvcpCommand, least: int, what: str) -> bytes:
+        if ack.status != GvcpStatus.SUCCESS:
+            raise RequestRefusedError(
+                f"{self.source}: {command.name} {what}: the camera answers "
+                f"{status_text(ack.status)}",
+                source=self.source,
+                status=ack.status,
+            )
+        if ack.command != command + 1 or len(ack.payload) < least:
+            raise FrameSourceError(
+                f"{self.source}: {command.name} {what}: expected an answer {command + 1:#06x} of "
+                f"{least} bytes, got {ack.command:#06x} of {len(ack.payload)}",
+                source=self.source,
+            )
+        return ack.payload
+
+    def _next_id(self) -> int:
+        self._id = self._id % 0xFFFF + 1
+        return self._id
+
+    def _emptied(self) -> None:
+        while not self._answers.empty():
+            self._answers.get_nowait()
+
+    def _name(self, kind: str) -> tuple[str, int]:
+        if self._transport is None:
+            raise FrameSourceError(f"{self.source}: it is closed", source=self.source)
+        return cast("tuple[str, int]", self._transport.get_extra_info(kind))
+
+    def _take(self, answer: Ack | OSError) -> None:
+        if self._expected and not self._answers.full():
+            self._answers.put_nowait(answer)
+        else:
+            self.dropped += 1
+
+    # asyncio calls these
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the transport."""
+        self._transport = cast("asyncio.DatagramTransport", transport)
+
+    def datagram_received(self, data: bytes, addr: object) -> None:
+        """Take an answer, where it is one to what was asked."""
+        try:
+            ack = decode_ack(data)
+        except MessageError:
+            self.dropped += 1
+            return
+        if ack.request_id == self._expected:
+            self._take(ack)
+        else:
+            self.dropped += 1
+
+    def error_received(self, exc: Exception) -> None:
+        """Note that nothing listens at the address."""
+        if isinstance(exc, OSError):
+            self._take(exc)
+
+
+class RequestRefusedError(FrameSourceError):
+    """The camera answered with an error.
+
+    Attributes:
+        status: of :class:`~smartcam.frames._gige.gvcp.GvcpStatus`.
+    """
+
+    def __init__(
+        self, message: str, *, source: str = "", available: tuple[str, ...] = (), status: int = 0
+    ) -> None:
+        super().__init__(message, source=source, available=available)
+        self.status = status
+
+
+async def heartbeat(
+    control: ControlChannel, timeout: float, source: str, lost: Callable[[FrameSourceError], None]
+) -> None:
+    """Keep the control of a camera until it is lost, then call ``lost``.
+
+    Args:
+        control: control channel of the camera.
+        timeout: seconds after which the camera gives up an application that is silent.
+        source: name of the camera, for errors.
+        lost: called once with the error, as the last thing.
+    """
+    loop = asyncio.get_running_loop()
+    heard = loop.time()
+    while True:
+        await asyncio.sleep(timeout / 3)
+        try:
+            privilege = await control.read_register(Register.CONTROL_PRIVILEGE)
+        except FrameSourceError as exc:
+            if loop.time() - heard >= timeout:
+                error = FrameSourceError(
+                    f"{source}: it has not answered for {loop.time() - heard:.1f} s: {exc}",
+                    source=source,
+                )
+                error.__cause__ = exc
+                lost(error)
+                return
+            continue
+        if not privilege & (CONTROL | EXCLUSIVE):
+            lost(
+                FrameSourceError(
+                    f"{source}: control of it was lost: it restarted, or heard no heartbeat for "
+                    f"{timeout:g} s",
+                    source=source,
+                )
+            )
+            return
+        heard = loop.time()

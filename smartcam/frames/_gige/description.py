@@ -1,0 +1,220 @@
+"""The GenICam description of a camera: where it lies, unpacked, and read into elements.
+
+It comes over the wire: sizes and depth are bounded, and a document type, without which there are no
+entities, is refused.
+
+Source: GigE Vision 2.0, chapter 12.1 (URLs, ZIP); GenApi 2.0, chapter 2.8 (XML).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+import zlib
+from typing import Final, NamedTuple
+from xml.parsers import expat
+
+from smartcam.exceptions import MessageError
+
+LARGEST: Final = 16 << 20
+"""Bytes of a description that is not packed; those of large cameras have 2 MB."""
+
+LARGEST_PACKED: Final = 4 << 20
+"""Bytes of a description's ZIP archive: 2 MB of XML have 0.2 MB. Each 46 bytes can be one more file
+in it, which takes 8 us."""
+
+DEEPEST: Final = 32
+"""Levels of its elements."""
+
+MAX_ELEMENTS: Final = 400_000
+"""Elements of a description; an element of a ``StructReg`` counts once more for each entry."""
+
+
+class Location(NamedTuple):
+    """The place of a description in the camera's memory.
+
+    Attributes:
+        name: name of the file, which ends in ``.zip`` where the file is packed.
+        address: address of the first byte.
+        length: bytes.
+    """
+
+    name: str
+    address: int
+    length: int
+
+
+class Element:
+    """An element of a description.
+
+    Attributes:
+        kind: tag of the element.
+        name: value of the attribute ``Name``, or "".
+        attributes: all attributes by name.
+        children: elements inside, in document order.
+        text: text inside, without blanks at its ends.
+    """
+
+    __slots__ = ("attributes", "children", "kind", "name", "text")
+
+    def __init__(self, kind: str, attributes: dict[str, str]) -> None:
+        self.kind, self.attributes = kind, attributes
+        self.name = attributes.get("Name", "")
+        self.children: list[Element] = []
+        self.text = ""
+
+    def all(self, *kinds: str) -> list[Element]:
+        """Return the children of these kinds."""
+        return [one for one in self.children if one.kind in kinds]
+
+    def first(self, *kinds: str) -> Element | None:
+        """Return the first child of these kinds."""
+        return next((one for one in self.children if one.kind in kinds), None)
+
+    def text_of(self, kind: str, default: str = "") -> str:
+        """Return the text of the first child of a kind."""
+        found = self.first(kind)
+        return default if found is None else found.text
+
+
+def locate(url: str) -> Location:
+    """Read a URL as a camera has it: ``Local:name.zip;ADDRESS;LENGTH``, both hexadecimal.
+
+    Raises:
+        MessageError: it is another one, or has impossible numbers.
+    """
+    found = re.fullmatch(
+        r"local:/*([^;]*);\s*(?:0x)?([0-9a-f]{1,8});\s*(?:0x)?([0-9a-f]{1,8})(?:\?.*)?",
+        url.strip(),
+        re.IGNORECASE,
+    )
+    if found is None:
+        raise MessageError(f"expected 'Local:NAME;ADDRESS;LENGTH', got {url[:80]!r}")
+    place = Location(found[1], int(found[2], 16), int(found[3], 16))
+    if not 0 < place.length <= LARGEST:
+        raise MessageError(f"{url[:80]!r}: expected 1 to {LARGEST} bytes, got {place.length}")
+    return place
+
+
+def unpack(data: bytes) -> bytes:
+    """Return a description's text; ZIP archives are unpacked, of several files the first XML.
+
+    Raises:
+        MessageError: it cannot be unpacked, or to more than :data:`LARGEST`; or it is packed in
+            another way than by DEFLATE, of which a few bytes may stand for gigabytes.
+    """
+    if not data.startswith(b"PK"):
+        return data.rstrip(b"\0")
+    if len(data) > LARGEST_PACKED:
+        raise MessageError(
+            f"the description's ZIP archive: expected at most {LARGEST_PACKED} bytes, got "
+            f"{len(data)}"
+        )
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = sorted(archive.namelist(), key=lambda name: not name.lower().endswith(".xml"))
+            if not names:
+                raise MessageError("the description's ZIP archive is empty")
+            how = archive.getinfo(names[0]).compress_type
+            if how not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise MessageError(
+                    f"the description's ZIP archive: expected DEFLATE (8) or no compression (0), "
+                    f"got method {how}"
+                )
+            with archive.open(names[0]) as file:
+                text = file.read(LARGEST + 1)
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+        OSError,
+        ValueError,
+    ) as exc:
+        raise MessageError(f"the description's ZIP archive cannot be read: {exc}") from exc
+    if len(text) > LARGEST:
+        raise MessageError(f"the description unpacks to more than {LARGEST} bytes")
+    return text
+
+
+def parse(text: bytes) -> dict[str, Element]:
+    """Return a description's nodes by their names.
+
+    Raises:
+        MessageError: it is no XML, has a document type, or is larger than any.
+    """
+    reader = _XmlReader()
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    parser.StartElementHandler = reader.start
+    parser.EndElementHandler = reader.end
+    parser.CharacterDataHandler = reader.characters
+    parser.StartDoctypeDeclHandler = reader.doctype
+    try:
+        parser.Parse(text, True)
+    except (expat.ExpatError, ValueError, LookupError) as exc:
+        raise MessageError(f"the description is no XML: {exc}", data=text) from exc
+    if reader.root.kind != "RegisterDescription":
+        raise MessageError(
+            f"the description: expected <RegisterDescription>, got <{reader.root.kind[:40]}>"
+        )
+    return _nodes(reader.root)
+
+
+class _XmlReader:
+    def __init__(self) -> None:
+        self.root = Element("", {})
+        self._open: list[Element] = []
+        self._texts: list[list[str]] = []  # the pieces of each open element's text
+        self._count = 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        if len(self._open) >= DEEPEST or self._count > MAX_ELEMENTS:
+            raise MessageError(
+                f"the description: expected at most {MAX_ELEMENTS} elements in {DEEPEST} levels"
+            )
+        element = Element(tag.rpartition(":")[2], attributes)
+        if self._open:
+            self._open[-1].children.append(element)
+        else:
+            self.root = element
+        self._open.append(element)
+        self._texts.append([])
+
+    def end(self, _: str) -> None:
+        self._open.pop().text = "".join(self._texts.pop()).strip()
+
+    def characters(self, text: str) -> None:
+        if self._texts:
+            self._texts[-1].append(text)
+
+    def doctype(self, *_: object) -> None:
+        raise MessageError("the description has a document type, which is not read")
+
+
+def _nodes(root: Element) -> dict[str, Element]:
+    """Return the named elements; an entry of a StructReg also gets the register's elements."""
+    found: dict[str, Element] = {}
+    waiting, copies = [root], 0
+    while waiting:
+        element = waiting.pop()
+        if element.kind in ("RegisterDescription", "Group"):
+            waiting += element.children
+        elif element.kind == "StructReg":
+            shared = [one for one in element.children if one.kind != "StructEntry"]
+            for entry in element.all("StructEntry"):
+                copies += len(shared)
+                if copies > MAX_ELEMENTS:
+                    raise MessageError(
+                        f"the description: expected at most {MAX_ELEMENTS} elements, those of a "
+                        f"StructReg counted for each entry, got {copies} such ones"
+                    )
+                own = {one.kind for one in entry.children}
+                entry.children += [one for one in shared if one.kind not in own]
+                found[entry.name] = entry
+        elif element.name:
+            found[element.name] = element
+    return found

@@ -1,0 +1,66 @@
+"""The features of a GigE Vision camera, for users: of the session that is open."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.frames._gige.features import GenicamFeatures
+
+DONE_INTERVAL: Final = 0.02
+"""Seconds between two questions whether a command is done."""
+
+
+class GigEFeatures(DeviceFeatures):
+    """The features that the camera's GenICam description lists.
+
+    Args:
+        present: coroutine function that returns the features of the session that is open.
+        changed: coroutine function that is called after a feature was set.
+        lock: lock of what sets several features that belong together.
+    """
+
+    def __init__(
+        self,
+        present: Callable[[], Awaitable[GenicamFeatures]],
+        changed: Callable[[], Awaitable[None]],
+        lock: asyncio.Lock,
+    ) -> None:
+        self._present, self._changed, self._lock = present, changed, lock
+
+    async def names(self) -> list[str]:
+        """Return the names of all features, as the description's categories list them."""
+        return (await self._present()).names()
+
+    async def describe(self, name: str) -> Feature:
+        """Return a feature with its value and range as they are now."""
+        return await (await self._present()).describe(name)
+
+    async def get(self, name: str) -> FeatureValue:
+        """Return the value of a feature."""
+        return await (await self._present()).get(name)
+
+    async def set(self, name: str, value: FeatureValue) -> FeatureValue:
+        """Set a feature; return the value that the camera has then."""
+        async with self._lock:
+            features = await self._present()
+            features.check_command(name, expected=False)
+            await features.set(name, value)
+            await self._changed()
+        described = await features.describe(name)
+        return value if described.value is None else described.value
+
+    async def execute(self, name: str) -> None:
+        """Execute a command, and wait until the camera has done it."""
+        async with self._lock:
+            features = await self._present()
+            features.check_command(name)
+            await features.execute(name)
+            while not await features.is_done(name):  # noqa: ASYNC110 - the camera has to be asked
+                await asyncio.sleep(DONE_INTERVAL)
+            await self._changed()

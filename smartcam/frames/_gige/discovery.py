@@ -1,0 +1,156 @@
+"""Find the GigE Vision cameras on each network of this machine, by a broadcast."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import ipaddress
+import socket
+import struct
+from collections import Counter
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam.exceptions import MessageError
+from smartcam.frames._gige.gvcp import (
+    ACK_REQUIRED,
+    BROADCAST_ACK,
+    PORT,
+    DeviceInfo,
+    GvcpCommand,
+    decode_ack,
+    encode,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+WAIT: Final = 0.5
+"""Seconds for answers; the standard has cameras answer within 200 ms."""
+
+MAX_CAMERAS: Final = 256
+
+MAX_ANSWERS_OF_ONE_ADDRESS: Final = 16
+"""Answers that are taken from one address, so that one cannot stand for all."""
+
+_REQUEST_ID: Final = 1
+_SIOCGIFADDR: Final = 0x8915
+_SIOCGIFBRDADDR: Final = 0x8919
+_SIOCGIFNETMASK: Final = 0x891B  # linux/sockios.h
+
+
+class Network(NamedTuple):
+    """One of this machine's networks.
+
+    Attributes:
+        address: this machine's address in the network.
+        targets: addresses that the question is sent to.
+        network: range of addresses; None: not known.
+    """
+
+    address: str
+    targets: tuple[str, ...]
+    network: ipaddress.IPv4Network | None = None
+
+
+class AnsweringCamera(NamedTuple):
+    """A camera that answered.
+
+    Attributes:
+        info: what it says of itself.
+        address: where the answer came from.
+        reachable: whether its address is one of the network that the answer came by.
+    """
+
+    info: DeviceInfo
+    address: str
+    reachable: bool
+
+
+def networks() -> list[Network]:
+    """Return this machine's IPv4 networks; where they cannot be listed, the one that leads out."""
+    try:
+        import fcntl
+    except ImportError:
+        return [Network("0.0.0.0", ("255.255.255.255",))]  # noqa: S104 - any address of its own
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            request = struct.pack("256s", name.encode()[:15])
+            with contextlib.suppress(OSError):  # an interface without an IPv4 address
+                address, broadcast, mask = (
+                    socket.inet_ntoa(fcntl.ioctl(asking.fileno(), number, request)[20:24])
+                    for number in (_SIOCGIFADDR, _SIOCGIFBRDADDR, _SIOCGIFNETMASK)
+                )
+                network = ipaddress.IPv4Network(f"{address}/{mask}", strict=False)
+                own = broadcast if broadcast != "0.0.0.0" else str(network.broadcast_address)  # noqa: S104
+                targets = (own, address if network.is_loopback else "255.255.255.255")
+                found.append(Network(address, targets, network))
+    return found
+
+
+async def find(
+    places: Iterable[Network], *, port: int = PORT, wait: float = WAIT
+) -> list[AnsweringCamera]:
+    """Ask for cameras.
+
+    Args:
+        places: networks to ask in; a target may be a camera's own address.
+        port: UDP port that cameras listen at.
+        wait: seconds to wait for answers.
+
+    Cancellation: safe.
+    """
+    loop = asyncio.get_running_loop()
+    asked: list[_Asking] = []
+    transports: list[asyncio.DatagramTransport] = []
+    try:
+        for place in places:
+            with contextlib.suppress(OSError):  # an interface that is just going down
+                transport, asking = await loop.create_datagram_endpoint(
+                    functools.partial(_Asking, place),
+                    local_addr=(place.address, 0),
+                    allow_broadcast=True,
+                )
+                transports.append(transport)
+                asked.append(asking)
+                flags = ACK_REQUIRED | BROADCAST_ACK
+                for target in place.targets:
+                    transport.sendto(
+                        encode(GvcpCommand.DISCOVERY, _REQUEST_ID, flags=flags), (target, port)
+                    )
+        await asyncio.sleep(wait)
+    finally:
+        for opened in transports:
+            opened.close()
+    answers = sorted((one for it in asked for one in it.found), key=lambda one: one.reachable)
+    found = {(one.info.mac, one.info.serial, one.address): one for one in answers}
+    return sorted(found.values(), key=lambda one: (one.info.label, one.address))
+
+
+class _Asking(asyncio.DatagramProtocol):
+    def __init__(self, place: Network) -> None:
+        self._place = place
+        self.found: list[AnsweringCamera] = []
+        self._answers = Counter[str]()  # by the address that they come from
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        try:
+            ack = decode_ack(data)
+            if (
+                ack.command != GvcpCommand.DISCOVERY + 1
+                or ack.request_id != _REQUEST_ID
+                or ack.status
+            ):
+                return
+            info = DeviceInfo.decode(ack.payload)
+        except MessageError:
+            return
+        network = self._place.network
+        reachable = network is None or ipaddress.IPv4Address(info.address) in network
+        self._answers[addr[0]] += 1
+        if len(self.found) < MAX_CAMERAS and self._answers[addr[0]] <= MAX_ANSWERS_OF_ONE_ADDRESS:
+            self.found.append(AnsweringCamera(info, addr[0], reachable))
+
+    def error_received(self, exc: Exception) -> None:
+        """Ignore that nobody listens at one of the targets."""

@@ -1,0 +1,418 @@
+"""Formulas of GenICam descriptions: read into a tree, and worked out with numbers only.
+
+A description comes from the camera, so its formulas are bounded in length and depth, nothing of
+Python's is reached by them, and whole numbers stay within 64 bits.
+
+Source: GenApi 2.0, section 2.8.13 (SwissKnife: operators and functions).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+import re
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+from smartcam.exceptions import MessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+Number: TypeAlias = "int | float"
+Tree: TypeAlias = "tuple[str, tuple[Tree, ...]] | int | float | str"
+
+LONGEST: Final = 8192
+"""Characters of a formula."""
+
+MAX_NAMES_SHOWN: Final = 20
+"""Names of variables that an error shows."""
+
+DEEPEST: Final = 150
+"""Levels of a formula's tree."""
+
+_TOKEN: Final = re.compile(
+    r"\s*(?:(?P<hex>0[xX][0-9a-fA-F]+)"
+    r"|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_.]*)"
+    r"|(?P<operator>\*\*|<<|>>|<=|>=|<>|!=|&&|\|\||[-+*/%&|^~<>=?:(),!]))"
+)
+
+_LEVELS_OF_C: Final = (
+    ("||",),
+    ("&&",),
+    ("|",),
+    ("^",),
+    ("&",),
+    ("=", "<>", "!="),
+    ("<", ">", "<=", ">="),
+    ("<<", ">>"),
+    ("+", "-"),
+    ("*", "/", "%"),
+)
+"""Operators of two operands, the loosest first, as C has them; ``**`` is tighter than all."""
+
+_LEVELS_OF_EMVA: Final = (
+    ("||", "&&", "=", "<>", "!=", "<", ">", "<=", ">="),
+    ("+", "-"),
+    ("*", "/", "%"),
+    ("**",),
+    ("<<", ">>"),
+    ("&", "|", "^"),
+)
+"""Operators of two operands, the loosest first, as EMVA's own GenApi has them: found out by its
+values (genicam 1.6.0)."""
+
+
+_TIGHTER_THAN_NOT: Final = frozenset({"&", "|", "^", "<<", ">>", "**"})
+"""Operators behind which EMVA's GenApi misreads ``~``."""
+
+
+def _strength(levels: tuple[tuple[str, ...], ...]) -> dict[str, int]:
+    return {sign: level for level, signs in enumerate(levels) for sign in signs}
+
+
+_OF_C, _OF_EMVA = _strength(_LEVELS_OF_C), _strength(_LEVELS_OF_EMVA)
+
+
+def _wrapped(value: Number) -> int:
+    """Return a whole number of 64 bits with a sign."""
+    whole = int(value) & 0xFFFFFFFFFFFFFFFF
+    return whole - (1 << 64) if whole >> 63 else whole
+
+
+def _divided(left: Number, right: Number) -> Number:
+    if isinstance(left, int) and isinstance(right, int):  # whole numbers: towards zero, as in C
+        quotient = abs(left) // abs(right)
+        return quotient if (left < 0) == (right < 0) else -quotient
+    return left / right
+
+
+def _rest(left: Number, right: Number) -> Number:
+    if isinstance(left, int) and isinstance(right, int):
+        rest = abs(left) % abs(right)
+        return -rest if left < 0 else rest
+    return math.fmod(left, right)
+
+
+def _power(left: Number, right: Number) -> Number:
+    if isinstance(left, int) and isinstance(right, int) and right >= 0:
+        if abs(left) > 1 and right * math.log2(abs(left)) >= 63:
+            raise OverflowError("a power past 64 bits")
+        return int(left**right)
+    power = float(left) ** float(right)
+    if isinstance(power, complex):
+        raise ValueError("a root of a negative number")  # noqa: TRY004 - as math's functions say it
+    return float(power)
+
+
+def _rounded(value: Number, places: Number = 0) -> Number:
+    scale = 10.0 ** max(-15, min(int(places), 15))
+    return math.copysign(math.floor(abs(value) * scale + 0.5) / scale, value)
+
+
+_BINARY: Final[Mapping[str, Callable[[Number, Number], Number]]] = {
+    "|": lambda left, right: int(left) | int(right),
+    "^": lambda left, right: int(left) ^ int(right),
+    "&": lambda left, right: int(left) & int(right),
+    "<<": lambda left, right: int(left) << (int(right) & 63),
+    ">>": lambda left, right: int(left) >> (int(right) & 63),
+    "=": operator.eq,
+    "<>": operator.ne,
+    "!=": operator.ne,
+    "<": operator.lt,
+    ">": operator.gt,
+    "<=": operator.le,
+    ">=": operator.ge,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": _divided,
+    "%": _rest,
+    "**": _power,
+}
+
+_UNARY: Final[Mapping[str, Callable[[Number], Number]]] = {
+    "-": operator.neg,
+    "+": operator.pos,
+    "~": lambda value: ~int(value),
+    "!": lambda value: int(not value),
+}
+
+_FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
+    "ABS": (1, abs),
+    "ACOS": (1, math.acos),
+    "ASIN": (1, math.asin),
+    "ATAN": (1, math.atan),
+    "CEIL": (1, math.ceil),
+    "COS": (1, math.cos),
+    "EXP": (1, math.exp),
+    "FLOOR": (1, math.floor),
+    "LG": (1, math.log10),
+    "LN": (1, math.log),
+    "NEG": (1, operator.neg),
+    "ROUND": (2, _rounded),
+    "SGN": (1, lambda value: (value > 0) - (value < 0)),
+    "SIN": (1, math.sin),
+    "SQRT": (1, math.sqrt),
+    "TAN": (1, math.tan),
+    "TRUNC": (1, math.trunc),
+}
+"""Functions of formulas by name: the most arguments of each, and its body."""
+
+_CONSTANTS: Final = {"E": math.e, "PI": math.pi}
+
+
+def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> Number:
+    """Work a formula out.
+
+    EMVA's GenApi, by which makers test their descriptions, reads operators without parentheses in
+    another order than C, as which other programs read them. Where the two have different values
+    nobody knows which one the maker means.
+
+    Args:
+        formula: as the description has it.
+        variables: value of each name in it.
+        whole: whether all is whole numbers, as in an ``IntSwissKnife``.
+
+    Raises:
+        MessageError: it is none, has a name that is not known, or no value: a division by zero,
+            a number past its bounds, or two values by two readings.
+    """
+    tree, other = _parsed(formula)
+    value = _worked_out(formula, tree, variables, whole)
+    if other != tree:
+        second = _worked_out(formula, other, variables, whole)
+        if second != value:
+            raise MessageError(
+                f"formula {formula[:80]!r}: expected one value, got {value:g} in C's order of "
+                f"operators and {second:g} in that of EMVA's GenApi"
+            )
+    return value
+
+
+def _worked_out(formula: str, tree: Tree, variables: Mapping[str, Number], whole: bool) -> Number:
+    try:
+        value = _value(tree, variables, whole)
+        if not math.isfinite(value):
+            raise OverflowError("not a finite number")
+    except RecursionError as exc:
+        raise MessageError(f"formula {formula[:80]!r}: too many levels") from exc
+    except (ArithmeticError, ValueError) as exc:
+        raise MessageError(f"formula {formula[:80]!r}: no value: {exc}") from exc
+    return value
+
+
+def _value(tree: Tree, variables: Mapping[str, Number], whole: bool) -> Number:
+    if isinstance(tree, str):
+        value = variables.get(tree, _CONSTANTS.get(tree))
+        if value is None:
+            raise MessageError(
+                f"formula: unknown name {tree[:80]!r}; known are "
+                f"{', '.join([*variables][:MAX_NAMES_SHOWN]) or 'none'}"
+            )
+        return _bounded(value, whole)
+    if not isinstance(tree, tuple):
+        return _bounded(tree, whole)
+    sign, parts = tree
+    if sign == "?":
+        return _value(parts[1 if _value(parts[0], variables, whole) else 2], variables, whole)
+    first = _value(parts[0], variables, whole)
+    if sign in ("||", "&&"):
+        if bool(first) == (sign == "||"):
+            return int(bool(first))
+        return int(bool(_value(parts[1], variables, whole)))
+    values = [first, *(_value(part, variables, whole) for part in parts[1:])]
+    if sign in _FUNCTIONS:
+        return _bounded(_FUNCTIONS[sign][1](*values), whole)
+    return _bounded(_UNARY[sign](*values) if len(values) == 1 else _BINARY[sign](*values), whole)
+
+
+def _bounded(value: Number, whole: bool) -> Number:
+    return _wrapped(value) if whole else float(value)
+
+
+@functools.lru_cache(maxsize=1024)
+def _parsed(formula: str) -> tuple[Tree, Tree]:
+    """Return a formula as C reads it, and as EMVA's GenApi does."""
+    try:
+        return _FormulaParser(formula).parsed(), _EmvaParser(formula).parsed()
+    except RecursionError as exc:
+        raise MessageError(f"formula {formula[:80]!r}: too many levels") from exc
+
+
+class _FormulaParser:
+    """Reads a formula in C's order of operators."""
+
+    strength = _OF_C
+
+    def __init__(self, formula: str) -> None:
+        if len(formula) > LONGEST:
+            raise MessageError(
+                f"formula: expected at most {LONGEST} characters, got {len(formula)}"
+            )
+        self._formula = formula
+        self._tokens = self._cut(formula)
+        self._at = self._depth = 0
+
+    def parsed(self) -> Tree:
+        tree = self._choice()
+        if self._at < len(self._tokens):
+            raise self._wrong("an operator or the end")
+        return tree
+
+    def _cut(self, formula: str) -> list[tuple[str, str]]:
+        tokens, at = [], 0
+        end = len(formula.rstrip())
+        while at < end:
+            found = _TOKEN.match(formula, at)
+            if found is None:
+                raise MessageError(f"formula {formula[:80]!r}: unexpected {formula[at]!r} at {at}")
+            kind = str(found.lastgroup)
+            tokens.append((kind, found[kind]))
+            at = found.end()
+        return tokens
+
+    def _wrong(self, expected: str) -> MessageError:
+        got = repr(self._tokens[self._at][1]) if self._at < len(self._tokens) else "its end"
+        return MessageError(f"formula {self._formula[:80]!r}: expected {expected}, got {got}")
+
+    def _next(self, *signs: str) -> str | None:
+        """Step over one of these operators, where one is next."""
+        if self._at < len(self._tokens):
+            kind, sign = self._tokens[self._at]
+            if kind == "operator" and sign in signs:
+                self._at += 1
+                return sign
+        return None
+
+    def _expect(self, sign: str) -> None:
+        if self._next(sign) is None:
+            raise self._wrong(repr(sign))
+
+    def _choice(self) -> Tree:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise MessageError(f"formula: expected at most {DEEPEST} levels")
+        tree = self._operation(0)
+        if self._next("?"):
+            first = self._choice()
+            self._expect(":")
+            tree = ("?", (tree, first, self._choice()))
+        self._depth -= 1
+        return tree
+
+    def _operation(self, level: int) -> Tree:
+        tree = self._unary()
+        depth = 0
+        while self._at < len(self._tokens):
+            kind, sign = self._tokens[self._at]
+            strength = self.strength.get(sign, -1) if kind == "operator" else -1
+            if strength < level:
+                break
+            depth += 1
+            if depth > DEEPEST:
+                raise MessageError(f"formula: expected at most {DEEPEST} operators in a row")
+            self._at += 1
+            self._depth += 1
+            tree = (sign, (tree, self._operation(strength + 1)))
+            self._depth -= 1
+        return tree
+
+    def _unary(self) -> Tree:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise MessageError(f"formula: expected at most {DEEPEST} levels")
+        sign = self._next("-", "+", "~", "!")
+        tree = (sign, (self._unary(),)) if sign else self._power()
+        self._depth -= 1
+        return tree
+
+    def _power(self) -> Tree:
+        tree = self._atom()
+        if self._next("**"):
+            tree = ("**", (tree, self._unary()))
+        return tree
+
+    def _atom(self) -> Tree:
+        if self._next("("):
+            tree = self._choice()
+            self._expect(")")
+            return tree
+        if self._at == len(self._tokens) or self._tokens[self._at][0] == "operator":
+            raise self._wrong("a number, a name or '('")
+        kind, token = self._tokens[self._at]
+        self._at += 1
+        if kind == "hex":
+            return int(token, 16)
+        if kind == "number":
+            return int(token) if token.isdigit() and len(token) <= 20 else float(token)
+        if token in _FUNCTIONS and self._next("("):
+            return self._call(token)
+        return token
+
+    def _call(self, name: str) -> Tree:
+        parts = [self._choice()]
+        while self._next(","):
+            parts.append(self._choice())
+        self._expect(")")
+        if len(parts) > _FUNCTIONS[name][0]:
+            raise MessageError(f"formula: {name} has {len(parts)} arguments")
+        return (name, tuple(parts))
+
+
+class _EmvaParser(_FormulaParser):
+    """Reads a formula as EMVA's GenApi does.
+
+    A sign before a name or a number is tighter than any operator. A minus before a parenthesis or a
+    function stands for all that follows, and is misread elsewhere than at the start. Of several
+    choices the first one's value decides.
+    """
+
+    strength = _OF_EMVA
+
+    def _choice(self) -> Tree:
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise MessageError(f"formula: expected at most {DEEPEST} levels")
+        tree = self._operation(0)
+        for _ in range(DEEPEST):
+            if not self._next("?"):
+                break
+            first = self._choice()
+            self._expect(":")
+            tree = ("?", (tree, first, self._operation(0)))
+        self._depth -= 1
+        return tree
+
+    def _unary(self) -> Tree:
+        at = self._at
+        before = self._tokens[at - 1][1] if at else "("
+        if before in _TIGHTER_THAN_NOT and self._next("~"):
+            raise self._misread(before, "~")
+        if self._next("-"):
+            if self._at < len(self._tokens) and self._is_whole(self._at):
+                if at:
+                    raise self._misread(before, "-(")
+                self._depth += 1
+                if self._depth > DEEPEST:
+                    raise MessageError(f"formula: expected at most {DEEPEST} levels")
+                tree: Tree = ("-", (self._operation(0),))
+                self._depth -= 1
+                return tree
+            self._at = at
+        return super()._unary()
+
+    def _misread(self, before: str, sign: str) -> MessageError:
+        return MessageError(
+            f"formula {self._formula[:80]!r}: expected a value behind {before}, got {sign}, which "
+            "EMVA's GenApi misreads there"
+        )
+
+    def _is_whole(self, at: int) -> bool:
+        """Return True if a parenthesis or a function begins there."""
+        following = self._tokens[at + 1] if at + 1 < len(self._tokens) else ("", "")
+        return self._tokens[at][1] == "(" or following == ("operator", "(")
+
+    def _power(self) -> Tree:
+        return self._atom()

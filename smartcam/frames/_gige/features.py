@@ -1,0 +1,784 @@
+"""A camera's features by their names, as its GenICam description tells how to reach them.
+
+Source: GenApi 2.0, chapter 2.8 (kinds of nodes and what their elements mean); SFNC (names).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+import sys
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, TypeVar
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import FrameFeatureError, FrameSourceError, MessageError
+from smartcam.frames._features import Feature, spelled
+from smartcam.frames._gige.expressions import evaluate
+from smartcam.frames._gige.gvcp import text
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Mapping
+
+    from smartcam.frames._features import FeatureKind, FeatureValue
+    from smartcam.frames._gige.description import Element
+
+DEEPEST: Final = 64
+"""Nodes that lead to each other: beyond that it is a circle."""
+
+MAX_NODES_VISITED: Final = 5000
+"""Nodes that are looked at for one value."""
+
+MAX_ELEMENTS_VISITED: Final = 500_000
+"""Elements of nodes and characters of formulas that are looked at for one value: about a second. A
+node may be asked for again and again, and each time all of it is looked at."""
+
+LONGEST: Final = 4096
+"""Bytes of a register."""
+
+_REGISTERS: Final = ("IntReg", "MaskedIntReg", "StructEntry")
+_KNIVES: Final = ("SwissKnife", "IntSwissKnife")
+_CONVERTERS: Final = ("Converter", "IntConverter")
+_HOLDERS: Final = ("Integer", "Float", "Boolean", "Enumeration", "String", "Command")
+_WHOLE: Final = ("Integer", "IntSwissKnife", "IntConverter", "Enumeration", "Boolean", *_REGISTERS)
+_TEXTS: Final = ("String", "StringReg")
+_KINDS: Final[Mapping[str, FeatureKind]] = {
+    **dict.fromkeys(("Integer", "IntSwissKnife", "IntConverter", *_REGISTERS), "integer"),
+    **dict.fromkeys(("Float", "FloatReg", "SwissKnife", "Converter"), "float"),
+    **dict.fromkeys(_TEXTS, "string"),
+    "Boolean": "boolean",
+    "Enumeration": "enumeration",
+    "Command": "command",
+}
+"""The kind of feature that a node is to users."""
+
+LONGEST_TEXT: Final = 1000
+"""Characters of a feature's description that are kept."""
+
+T = TypeVar("T")
+
+
+class NoLimitError(MessageError):
+    """The description says neither of a node nor of its value's node how large it may be."""
+
+
+class DeviceMemory(Protocol):
+    """The camera's memory."""
+
+    async def read(self, address: int, length: int) -> bytes:
+        """Return ``length`` bytes from an address on."""
+        ...
+
+    async def write(self, address: int, data: bytes) -> None:
+        """Write bytes from an address on."""
+        ...
+
+
+class GenicamFeatures:
+    """The features of a camera that can be read, and set.
+
+    Nothing is kept between two calls but what the description itself holds.
+
+    Args:
+        nodes: named elements of the camera's description.
+        port: memory of the camera.
+        source: name of the camera, for errors.
+    """
+
+    def __init__(self, nodes: Mapping[str, Element], port: DeviceMemory, source: str) -> None:
+        self._nodes, self._port, self._source = nodes, port, source
+        self._held: dict[str, FeatureValue] = {}  # what nodes with a <Value> were set to
+        self._read: dict[tuple[str, int, int], bytes] = {}
+        self._steps = self._work = 0
+        self._writing: Callable[[], None] | None = None
+        self._lock = asyncio.Lock()  # of the fields that one call fills
+        self._spellings = {spelled(name): name for name in nodes}
+        self._selectors: dict[str, tuple[str, ...]] | None = None
+
+    def share(self, other: GenicamFeatures) -> None:
+        """Have the same description as another one, and what was set in that."""
+        GenicamFeatures.__init__(self, other._nodes, other._port, other._source)
+        self._held = other._held
+
+    def __contains__(self, name: object) -> bool:
+        """Return True if the description has a node of this name."""
+        return name in self._nodes
+
+    def names(self) -> list[str]:
+        """Return the features, as the description's categories list them."""
+        listed = [
+            one.text
+            for node in self._nodes.values()
+            if node.kind == "Category"
+            for one in node.all("pFeature")
+        ]
+        return sorted({name for name in listed if self._kind(name) not in ("", "Category")})
+
+    def find(self, name: str) -> str:
+        """Return the description's spelling of a name; an unknown name as it is."""
+        return name if name in self._nodes else self._spellings.get(spelled(name), name)
+
+    async def get(self, name: str) -> FeatureValue:
+        """Return a feature's value: of an enumeration the entry's name.
+
+        Raises:
+            FrameFeatureError: there is none of that name, it is not available now, or has no value.
+        """
+        async with self._lock:
+            node = await self._begin(name)
+            try:
+                return await self._shown(node)
+            except MessageError as exc:
+                raise self._wrong(name, str(exc)) from exc
+
+    async def number(self, name: str) -> float | None:
+        """Return a feature's number; None: it has none, or it is not to be had now."""
+        if name not in self._nodes:
+            return None
+        async with self._lock:
+            try:
+                value = await self._get(await self._begin(name), 0)
+            except (FrameSourceError, MessageError):
+                return None
+        return None if isinstance(value, str) else value
+
+    async def entries(self, name: str) -> dict[str, int]:
+        """Return the entries of an enumeration that the camera has now, by name.
+
+        Raises:
+            FrameFeatureError: there is no such enumeration.
+        """
+        async with self._lock:
+            node = await self._begin(name)
+            try:
+                return await self._entries_now(node)
+            except MessageError as exc:
+                raise self._wrong(name, str(exc)) from exc
+
+    async def set(
+        self, name: str, value: FeatureValue, *, writing: Callable[[], None] | None = None
+    ) -> None:
+        """Set a feature; a command is executed, whatever the value.
+
+        Args:
+            name: name of the feature.
+            value: value of the feature, or its text: an entry's name, ``true``, a number.
+            writing: called right before the camera's register is written.
+
+        Raises:
+            FrameFeatureError: there is no such feature, or it cannot be set, or not to that value.
+        """
+        async with self._lock:
+            node = await self._begin(name)
+            self._writing = writing
+            try:
+                if await self._condition(node, "pIsLocked", False, 0):
+                    raise self._wrong(name, "it is locked now")
+                await self._set(node, await self._meant(node, value), 0)
+            except MessageError as exc:
+                raise self._wrong(name, str(exc)) from exc
+            finally:
+                self._writing = None
+
+    async def execute(self, name: str, *, writing: Callable[[], None] | None = None) -> None:
+        """Execute a command; the camera may still be at it afterwards.
+
+        Args:
+            name: name of the command.
+            writing: called right before the camera's register is written.
+
+        Raises:
+            FrameFeatureError: there is none of that name, or the camera refuses.
+        """
+        await self.set(name, 1, writing=writing)
+
+    def check_command(self, name: str, *, expected: bool = True) -> None:
+        """Raise unless a name is that of a command; with ``expected`` False, if it is.
+
+        Raises:
+            FrameSourceError: it is not, or there is no feature of that name.
+        """
+        node = self._named(name)
+        if (node.kind == "Command") != expected:
+            is_not = "a command: it is executed" if not expected else "no command: it is set"
+            raise self._wrong(node.name, f"it is {is_not}")
+
+    async def is_done(self, name: str) -> bool:
+        """Return True if a command is done: its register no longer has the command's value.
+
+        Of one that cannot be read the camera's answer to the write was its end.
+
+        Raises:
+            FrameSourceError: the camera does not answer.
+        """
+        async with self._lock:
+            node = await self._begin(name)
+            try:
+                command = await self._field(node, "CommandValue", 0, 1)
+                return await self._get_held(node, 0) != command
+            except MessageError:
+                return True
+
+    async def describe(self, name: str) -> Feature:
+        """Return a feature with its value, range and access as they are now.
+
+        Raises:
+            FrameFeatureError: there is none of that name, or the camera does not answer.
+        """
+        async with self._lock:
+            node = self._named(name)
+            return await self._described(node)
+
+    # helpers
+
+    def _kind(self, name: str) -> str:
+        node = self._nodes.get(name)
+        return "" if node is None else node.kind
+
+    def _wrong(self, name: str, text: str, available: tuple[str, ...] = ()) -> FrameFeatureError:
+        return FrameFeatureError(
+            f"{self._source}: feature {name}: {text}", source=self._source, available=available
+        )
+
+    def _named(self, name: str) -> Element:
+        self._steps = self._work = 0
+        self._read.clear()
+        node = self._nodes.get(self.find(name))
+        if node is None or node.kind in ("Category", "Port"):
+            names = self.names()
+            raise FrameFeatureError(
+                f"{self._source}: it has no feature {name!r}{did_you_mean(name, names)}; it has "
+                f"{', '.join(names)}",
+                source=self._source,
+                available=tuple(names),
+            )
+        return node
+
+    async def _begin(self, name: str) -> Element:
+        node = self._named(name)
+        try:
+            there = await self._there(node, 0)
+        except MessageError as exc:
+            raise self._wrong(name, str(exc)) from exc
+        if not there:
+            raise self._wrong(name, "it is not available now")
+        return node
+
+    async def _there(self, node: Element, depth: int) -> bool:
+        implemented = await self._condition(node, "pIsImplemented", True, depth)
+        return implemented and await self._condition(node, "pIsAvailable", True, depth)
+
+    async def _condition(self, node: Element, kind: str, default: bool, depth: int) -> bool:
+        found = node.first(kind)
+        return default if found is None else bool(await self._numbered(found.text, depth + 1))
+
+    async def _entries_now(self, node: Element) -> dict[str, int]:
+        return {
+            entry.name: _whole(entry.text_of("Value"))
+            for entry in node.all("EnumEntry")
+            if await self._there(entry, 0)
+        }
+
+    async def _shown(self, node: Element) -> FeatureValue:
+        """Return a node's value as users have it."""
+        value = await self._get(node, 0)
+        if node.kind == "Enumeration":
+            return next((name for name, one in _entries(node).items() if one == value), value)
+        if node.kind == "Boolean":
+            return value == _on(node)
+        return value
+
+    async def _meant(self, node: Element, value: FeatureValue) -> FeatureValue:
+        """Return the node's own form of a given value, after checking that the node can have it."""
+        if node.kind == "Command":
+            return int(await self._field(node, "CommandValue", 0, 1))
+        if node.kind in _TEXTS:
+            return str(value)
+        if node.kind == "Boolean":
+            said = str(value).lower()
+            if said not in ("0", "1", "true", "false", "on", "off"):
+                raise self._wrong(node.name, f"expected true or false, got {value!r}")
+            return _on(node) if said in ("1", "true", "on") else _off(node)
+        if node.kind == "Enumeration":
+            entries = await self._entries_now(node)
+            if str(value) not in entries:
+                raise self._wrong(
+                    node.name,
+                    f"expected {', '.join(entries)}, got {str(value)!r}"
+                    f"{did_you_mean(str(value), entries)}",
+                    tuple(entries),
+                )
+            return entries[str(value)]
+        number = _number(str(value)) if isinstance(value, str) else value
+        if node.kind in _WHOLE and number != int(number):
+            raise self._wrong(node.name, f"expected a whole number, got {value!r}")
+        await self._within(node, number)
+        return number
+
+    async def _within(self, node: Element, number: float) -> None:
+        least = await self._field(node, "Min", 0, -math.inf)
+        most = await self._field(node, "Max", 0, math.inf)
+        step = await self._field(node, "Inc", 0, 0) if node.kind == "Integer" else 0
+        wrong_step = step > 1 and math.isfinite(least) and (number - least) % step
+        if not least <= number <= most or wrong_step:
+            steps = f" in steps of {step:g}" if step > 1 else ""
+            raise self._wrong(
+                node.name,
+                f"expected {least:g} to {most:g}{steps}, got {number:g}",
+                (f"{least:g} to {most:g}{steps}",),
+            )
+
+    # values
+
+    async def _numbered(self, name: str, depth: int) -> int | float:
+        """Return the number of the node of a name."""
+        node = self._nodes.get(name)
+        if node is None:
+            raise MessageError(f"the description has no node {name[:80]!r}")
+        value = await self._get(node, depth)
+        if isinstance(value, str):
+            raise MessageError(f"node {name}: expected a number, got text")
+        return value
+
+    async def _field(
+        self, node: Element, kind: str, depth: int, default: float | None = None
+    ) -> int | float:
+        """Return the number of ``<kind>``, or of the node that ``<pkind>`` names."""
+        for one in node.children:
+            if one.kind == kind:
+                return _number(one.text)
+            if one.kind == "p" + kind:
+                return await self._numbered(one.text, depth + 1)
+        if default is None:
+            raise MessageError(f"{node.kind} {node.name}: it has no <{kind}>")
+        return default
+
+    def _step(self, node: Element, depth: int) -> None:
+        """Count a node that is looked at; MessageError: it is too deep, or one too many."""
+        self._steps += 1
+        if depth > DEEPEST or self._steps > MAX_NODES_VISITED:
+            raise MessageError(f"node {node.name}: its description goes in a circle")
+        self._spend(node, len(node.children))
+
+    def _spend(self, node: Element, work: int) -> None:
+        """Count elements or characters that are looked at; MessageError: too many."""
+        self._work += work
+        if self._work > MAX_ELEMENTS_VISITED:
+            raise MessageError(
+                f"node {node.name}: expected at most {MAX_ELEMENTS_VISITED} elements and "
+                "characters of formulas for one value, got more"
+            )
+
+    async def _get(self, node: Element, depth: int) -> FeatureValue:
+        self._step(node, depth)
+        if "WO" in _access(node):
+            raise MessageError(f"{node.kind} {node.name} can only be written")
+        if node.kind in _KNIVES:
+            formula = node.text_of("Formula")
+            return await self._worked_out(node, formula, {}, depth)
+        if node.kind in _CONVERTERS:
+            raw = await self._field(node, "Value", depth)
+            return await self._worked_out(node, node.text_of("FormulaFrom"), {"TO": raw}, depth)
+        if node.kind in _HOLDERS:
+            return await self._get_held(node, depth)
+        data = await self._bytes(node, *await self._place(node, depth))
+        if node.kind == "StringReg":
+            return text(data)
+        if node.kind == "FloatReg":
+            return _float(node, data)
+        return _bits(node, data)
+
+    async def _get_held(self, node: Element, depth: int) -> FeatureValue:
+        if node.name in self._held:
+            return self._held[node.name]
+        target = await self._target(node, depth)
+        if target is not None:
+            value = await self._get(target, depth + 1)
+            if node.kind == "Integer" and target.kind not in (*_WHOLE, "Command"):
+                raise MessageError(
+                    f"Integer {node.name}: expected a node of whole numbers as its pValue, got the "
+                    f"{target.kind} {target.name}"
+                )
+        elif node.kind == "String":
+            value = node.text_of("Value")
+        elif node.first("pIndex") is not None:
+            value = await self._indexed(node, depth)
+        else:
+            value = await self._field(node, "Value", depth)
+        if node.kind in _WHOLE and isinstance(value, float):
+            return int(value)
+        return value
+
+    async def _indexed(self, node: Element, depth: int) -> int | float:
+        """Return the number that stands in the description for the value of an index."""
+        wanted = await self._numbered(node.text_of("pIndex"), depth + 1)
+        for one in node.all("ValueIndexed"):
+            if _number(one.attributes.get("Index", "-1")) == wanted:
+                return _number(one.text)
+        return await self._field(node, "ValueDefault", depth)
+
+    async def _target(self, node: Element, depth: int) -> Element | None:
+        """Return the node that has a node's value; None: it has it itself."""
+        found = node.first("pValue")
+        index = node.first("pIndex")
+        if index is not None and node.kind in ("Integer", "Float"):
+            wanted = await self._numbered(index.text, depth + 1)
+            for one in node.all("pValueIndexed"):
+                if _number(one.attributes.get("Index", "-1")) == wanted:
+                    found = one
+                    break
+            else:
+                chosen = wanted in [
+                    _number(one.attributes.get("Index", "-1")) for one in node.all("ValueIndexed")
+                ]
+                found = None if chosen else node.first("pValueDefault") or found
+        if found is None:
+            return None
+        target = self._nodes.get(found.text)
+        if target is None:
+            raise MessageError(f"{node.kind} {node.name}: there is no node {found.text[:80]!r}")
+        return target
+
+    async def _worked_out(
+        self, node: Element, formula: str, variables: dict[str, int | float], depth: int
+    ) -> int | float:
+        """Return the value of a formula with the node's variables."""
+        whole = node.kind.startswith("Int")
+        self._spend(node, len(formula))
+        for one in node.children:
+            if one.kind == "pVariable":
+                variables[one.name] = await self._variable(one, depth)
+            elif one.kind == "Constant":
+                variables[one.name] = _number(one.text)
+            elif one.kind == "Expression":
+                self._spend(node, len(one.text))
+                variables[one.name] = evaluate(one.text, variables, whole=whole)
+        return evaluate(formula, variables, whole=whole)
+
+    async def _variable(self, variable: Element, depth: int) -> int | float:
+        """Return the value of a formula's variable: that of its node, or of the part ``.NAME``."""
+        _, _, what = variable.name.partition(".")
+        if what in ("", "Value"):
+            return await self._numbered(variable.text, depth + 1)
+        node = self._nodes.get(variable.text)
+        if node is None:
+            raise MessageError(f"the description has no node {variable.text[:80]!r}")
+        if what in ("Min", "Max", "Inc"):
+            return await self._limit(node, what, depth + 1)
+        kind, _, entry = what.partition(".")
+        if kind == "Entry":
+            entries = _entries(node)
+            if entry not in entries:
+                raise MessageError(
+                    f"{node.kind} {node.name}: it has no entry {entry[:40]!r}"
+                    f"{did_you_mean(entry, entries)}"
+                )
+            return entries[entry]
+        raise MessageError(
+            f"variable {variable.name[:80]!r}: expected .Value, .Min, .Max, .Inc or .Entry.NAME "
+            "behind its name"
+        )
+
+    async def _limit(self, node: Element, what: str, depth: int) -> int | float:
+        """Return the least or the most that a node can have, or its step.
+
+        A node that says nothing has those of the node that holds its value; one of the last kind
+        those of its bits (GenApi 2.0, 2.8.4 and 2.8.6).
+        """
+        self._step(node, depth)
+        if node.first(what, "p" + what) is not None:
+            return await self._field(node, what, depth)
+        held = node.kind in ("Integer", "Float", "Enumeration")
+        target = await self._target(node, depth) if held else None
+        if target is not None:
+            return await self._limit(target, what, depth + 1)
+        if what == "Inc" and node.kind in _WHOLE:
+            return 1
+        if node.kind in ("Float", "FloatReg") and what != "Inc":
+            return -sys.float_info.max if what == "Min" else sys.float_info.max
+        if node.kind in ("Integer", "IntSwissKnife", "Enumeration") and what != "Inc":
+            return -(1 << 63) if what == "Min" else (1 << 63) - 1
+        if node.kind in _REGISTERS and what != "Inc":
+            _, length = await self._place(node, depth)
+            _, bits = _span(node, length)
+            signed = int(_signed(node))
+            return -(1 << bits - 1) * signed if what == "Min" else (1 << bits - signed) - 1
+        raise NoLimitError(f"{node.kind} {node.name}: it has no <{what}>")
+
+    async def _set(self, node: Element, value: FeatureValue, depth: int) -> None:
+        self._step(node, depth)
+        if node.kind in _KNIVES or "RO" in _access(node):
+            raise MessageError(f"{node.kind} {node.name} can only be read")
+        if node.kind in _CONVERTERS:
+            if isinstance(value, str):
+                raise MessageError(f"{node.kind} {node.name}: expected a number, got text")
+            formula = node.text_of("FormulaTo")
+            value = await self._worked_out(node, formula, {"FROM": value}, depth)
+        elif node.kind not in _HOLDERS:
+            await self._write(node, value, depth)
+            return
+        target = await self._target(node, depth)
+        if target is None:
+            self._held[node.name] = value
+            return
+        if target.kind in _WHOLE and isinstance(value, float):
+            value = round(value)
+        if depth and target.kind in ("Integer", "Float") and not isinstance(value, str):
+            await self._within(target, value)
+        await self._set(target, value, depth + 1)
+        for copy in node.all("pValueCopy"):
+            other = self._nodes.get(copy.text)
+            if other is None:
+                raise MessageError(f"{node.kind} {node.name}: there is no node {copy.text[:80]!r}")
+            await self._set(other, value, depth + 1)
+
+    # descriptions
+
+    async def _described(self, node: Element) -> Feature:
+        kind = _KINDS.get(node.kind)
+        if kind is None:
+            raise self._wrong(node.name, f"a {node.kind} is nothing to read or set")
+        more = node.text_of("Description") or node.text_of("ToolTip")
+        basis = Feature(
+            node.name,
+            kind,
+            "",
+            selectors=self._selected_by(node.name),
+            description=" ".join(more.split())[:LONGEST_TEXT],
+        )
+        problems: list[str] = []
+        try:
+            access = await self._access_now(node)
+            if not access:
+                return basis
+        except MessageError as exc:
+            return replace(basis, problem=str(exc))
+        parts: dict[str, Any] = {"access": access, "unit": await self._unit(node, problems)}
+        if kind == "enumeration":
+            parts["entries"] = tuple(await self._told(self._entries_now(node), problems) or ())
+        elif kind in ("integer", "float"):
+            for part, what in (("minimum", "Min"), ("maximum", "Max"), ("step", "Inc")):
+                if what == "Inc" and kind == "float":
+                    continue
+                limit = await self._told(self._limit(node, what, 0), problems)
+                endless = limit is None or abs(limit) >= (
+                    sys.float_info.max if kind == "float" else (1 << 63) - 1
+                )
+                parts[part] = None if endless else limit
+        if kind != "command" and access != "wo":
+            parts["value"] = await self._told(self._shown(node), problems)
+        return replace(basis, **parts, problem="; ".join(dict.fromkeys(problems)))
+
+    async def _told(self, work: Coroutine[Any, Any, T], problems: list[str]) -> T | None:
+        """Return the value of some work; None: it failed, and the reason is noted."""
+        self._steps = self._work = 0
+        try:
+            return await work
+        except NoLimitError:
+            return None
+        except (MessageError, FrameSourceError) as exc:
+            if isinstance(exc, TimeoutError):
+                raise
+            problems.append(str(exc))
+            return None
+
+    async def _access_now(self, node: Element) -> Literal["rw", "ro", "wo", ""]:
+        """Return the access to a feature as it is now."""
+        if not await self._there(node, 0):
+            return ""
+        readable, writable = True, not await self._condition(node, "pIsLocked", False, 0)
+        for depth in range(DEEPEST):
+            modes = _access(node)
+            readable = readable and "WO" not in modes
+            writable = writable and "RO" not in modes and node.kind not in _KNIVES
+            found = None
+            if node.kind in (*_HOLDERS, *_CONVERTERS):
+                found = await self._target(node, depth)
+            if found is None:
+                break
+            node = found
+            if not await self._there(node, depth):
+                return ""
+            writable = writable and not await self._condition(node, "pIsLocked", False, depth)
+        return ("rw" if writable else "ro") if readable else "wo" if writable else ""
+
+    async def _unit(self, node: Element, problems: list[str]) -> str:
+        """Return the unit of a node, or of the node that holds its value."""
+        for depth in range(DEEPEST):
+            unit = node.text_of("Unit")
+            if unit or node.kind not in ("Integer", "Float"):
+                return unit
+            found = await self._told(self._target(node, depth), problems)
+            if found is None:
+                return ""
+            node = found
+        return ""
+
+    def _selected_by(self, name: str) -> tuple[str, ...]:
+        """Return the features that choose which one a feature is."""
+        if self._selectors is None:
+            found: dict[str, list[str]] = {}
+            for node in self._nodes.values():
+                for one in node.all("pSelected"):
+                    found.setdefault(one.text, []).append(node.name)
+            self._selectors = {selected: tuple(names) for selected, names in found.items()}
+        return self._selectors.get(name, ())
+
+    # registers
+
+    async def _place(self, node: Element, depth: int) -> tuple[int, int]:
+        """Return a register's address and its length."""
+        if node.first("pPort") is None:
+            raise MessageError(f"{node.kind} {node.name} is no register of the camera")
+        length = int(await self._field(node, "Length", depth, 4))
+        if not 0 < length <= LONGEST:
+            raise MessageError(f"{node.kind} {node.name}: impossible length {length}")
+        address = 0
+        for one in node.children:
+            if one.kind == "Address":
+                address += _whole(one.text)
+            elif one.kind == "pAddress":
+                address += int(await self._numbered(one.text, depth + 1))
+            elif one.kind == "IntSwissKnife":
+                address += int(await self._get(one, depth + 1))
+            elif one.kind == "pIndex":
+                address += await self._index(one, length, depth)
+        if not 0 <= address <= 0xFFFFFFFF - length:
+            raise MessageError(f"{node.kind} {node.name}: impossible address {address:#x}")
+        return address, length
+
+    async def _index(self, index: Element, length: int, depth: int) -> int:
+        offset: int | float = length
+        if "Offset" in index.attributes:
+            offset = _whole(index.attributes["Offset"])
+        elif "pOffset" in index.attributes:
+            offset = await self._numbered(index.attributes["pOffset"], depth + 1)
+        return int(offset * await self._numbered(index.text, depth + 1))
+
+    def _memory(self, node: Element) -> DeviceMemory:
+        """Return the memory that a register is read from."""
+        port = self._nodes.get(node.text_of("pPort"))
+        if port is not None and port.first("ChunkID", "pChunkID") is not None:
+            raise MessageError(f"{node.name} is sent with each frame only")
+        if port is not None and port.first("EventID") is not None:
+            raise MessageError(f"{node.name} is sent with an event only")
+        return self._port
+
+    async def _bytes(self, node: Element, address: int, length: int) -> bytes:
+        """Read a register, once for each call from outside."""
+        key = node.text_of("pPort"), address, length
+        if key not in self._read:
+            self._read[key] = await self._memory(node).read(address, length)
+        return self._read[key]
+
+    async def _write(self, node: Element, value: FeatureValue, depth: int) -> None:
+        address, length = await self._place(node, depth)
+        if node.kind == "StringReg":
+            data = str(value).encode()
+            if len(data) > length:
+                raise MessageError(f"expected at most {length} bytes, got {len(data)}")
+            data = data.ljust(length, b"\0")
+        elif isinstance(value, str):
+            raise MessageError(f"{node.kind} {node.name}: expected a number, got text")
+        elif node.kind == "FloatReg":
+            data = struct.pack(_float_format(node, length), value)
+        else:
+            whole = round(value)
+            shift, bits = _span(node, length)
+            least = -(1 << bits - 1) if _signed(node) else 0
+            if not least <= whole < least + (1 << bits):
+                raise MessageError(f"{whole} has no room in {bits} bits")
+            order = _order(node)
+            if bits < 8 * length:
+                before = int.from_bytes(await self._bytes(node, address, length), order)
+                mask = (1 << bits) - 1 << shift
+                whole = before & ~mask | whole << shift & mask
+            data = (whole & (1 << 8 * length) - 1).to_bytes(length, order)
+        memory = self._memory(node)
+        self._read.clear()
+        if self._writing is not None:
+            self._writing()
+        await memory.write(address, data)
+
+
+def _number(said: str) -> int | float:
+    try:
+        return _whole(said)
+    except MessageError:
+        pass
+    try:
+        number = float(said)
+    except ValueError:
+        number = math.nan
+    if math.isnan(number):
+        raise MessageError(f"expected a number, got {said[:40]!r}")
+    return number
+
+
+def _whole(said: str) -> int:
+    digits = said.strip()
+    try:
+        if len(digits) > 24:
+            raise ValueError("too long")
+        number = int(digits, 16 if digits.lower().startswith("0x") else 10)
+    except ValueError as exc:
+        raise MessageError(f"expected a whole number, got {said[:40]!r}") from exc
+    return number
+
+
+def _entries(node: Element) -> dict[str, int]:
+    return {entry.name: _whole(entry.text_of("Value")) for entry in node.all("EnumEntry")}
+
+
+def _access(node: Element) -> tuple[str, str]:
+    """Return the access mode of a node itself, and the one that the description imposes on it."""
+    return node.text_of("AccessMode"), node.text_of("ImposedAccessMode")
+
+
+def _on(node: Element) -> int:
+    return _whole(node.text_of("OnValue", "1"))
+
+
+def _off(node: Element) -> int:
+    return _whole(node.text_of("OffValue", "0"))
+
+
+def _signed(node: Element) -> bool:
+    return node.text_of("Sign") == "Signed"
+
+
+def _order(node: Element) -> Literal["big", "little"]:
+    return "big" if node.text_of("Endianess") == "BigEndian" else "little"
+
+
+def _span(node: Element, length: int) -> tuple[int, int]:
+    """Return the place of the lowest bit of a node, and the number of its bits."""
+    if node.kind == "IntReg":
+        return 0, 8 * length
+    bit = node.text_of("Bit")
+    ends = [_whole(bit or node.text_of(kind)) for kind in ("LSB", "MSB")]
+    low, high = min(ends), max(ends)
+    if not 0 <= low <= high < 8 * length:
+        raise MessageError(f"{node.kind} {node.name}: impossible bits {low} to {high}")
+    if _order(node) == "big":  # where bit 0 is the highest one
+        low = 8 * length - 1 - high
+    return low, abs(ends[1] - ends[0]) + 1
+
+
+def _bits(node: Element, data: bytes) -> int:
+    shift, bits = _span(node, len(data))
+    value = int.from_bytes(data, _order(node)) >> shift & (1 << bits) - 1
+    return value - (1 << bits) if _signed(node) and value >> bits - 1 else value
+
+
+def _float_format(node: Element, length: int) -> str:
+    kinds = {4: "f", 8: "d"}
+    if length not in kinds:
+        raise MessageError(f"FloatReg {node.name}: expected 4 or 8 bytes, got {length}")
+    return (">" if _order(node) == "big" else "<") + kinds[length]
+
+
+def _float(node: Element, data: bytes) -> float:
+    value: float = struct.unpack(_float_format(node, len(data)), data)[0]
+    return value

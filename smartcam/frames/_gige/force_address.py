@@ -1,0 +1,223 @@
+"""Give a GigE Vision camera another IP address until it is switched off, by its hardware address.
+
+A camera whose address is of no network here can be found and given one, but not opened. The camera
+carries it out only while nobody controls it.
+
+Source: GigE Vision 2.0, chapter 14.2 (FORCEIP).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import ipaddress
+import re
+import struct
+from typing import TYPE_CHECKING, Final
+
+from smartcam._arguments import check_text
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameSourceError,
+    FrameTimeoutError,
+    MessageError,
+)
+from smartcam.frames._gige.discovery import find, networks
+from smartcam.frames._gige.gvcp import (
+    ACK_REQUIRED,
+    PORT,
+    GvcpCommand,
+    decode_ack,
+    encode,
+    status_text,
+)
+from smartcam.frames._gige.places import found
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.frames._driver import FoundSource
+    from smartcam.frames._gige.discovery import AnsweringCamera, Network
+
+ANSWER_TIMEOUT: Final = 1.0
+"""Seconds for the answer to one request."""
+
+TRIES: Final = 3
+
+APPEAR_TIMEOUT: Final = 5.0
+"""Seconds until the camera answers a search by its new address."""
+
+_REQUEST_ID: Final = 2
+_REQUEST: Final = struct.Struct(">2x6s12x4s12x4s12x4s")
+
+
+async def force_address(
+    mac: str,
+    address: str,
+    *,
+    gateway: str = "0.0.0.0",  # noqa: S104 - no gateway
+    places: Sequence[Network] | None = None,
+    port: int = PORT,
+) -> FoundSource:
+    """Give a camera an IP address until it is switched off; return it as a search finds it then.
+
+    Args:
+        mac: hardware address of the camera, ``00:11:22:33:44:55``.
+        address: IP address with the length of its network's prefix, ``192.168.0.20/24``.
+        gateway: default gateway of the camera; ``0.0.0.0``: none.
+        places: networks to look in; None: all of this machine.
+        port: UDP port that cameras listen at.
+
+    Raises:
+        ConfigurationError: an address that is none, or that another camera has.
+        FrameSourceError: there is no such camera, it refuses, or does not answer by its new
+            address.
+
+    Cancellation: the camera may have the new address.
+    """
+    wanted = checked_mac(mac)
+    interface = _interface(address)
+    way_out = _ip(gateway, "gateway")
+    asked = networks() if places is None else places
+    there = await find(asked, port=port)
+    camera = _of_mac(there, wanted)
+    taken = [one for one in there if one.info.address == str(interface.ip)]
+    if taken and taken[0].info.mac != wanted:
+        raise ConfigurationError(
+            f"address: {interface.ip} is the address of {taken[0].info.label} "
+            f"({taken[0].info.mac}) already"
+        )
+    payload = _REQUEST.pack(
+        bytes.fromhex(wanted.replace(":", "")),
+        interface.ip.packed,
+        interface.netmask.packed,
+        way_out.packed,
+    )
+    await _sent(payload, asked, port, camera)
+    return await _appeared(wanted, str(interface.ip), asked, port)
+
+
+def checked_mac(mac: str) -> str:
+    """Return a hardware address with small letters and colons.
+
+    Raises:
+        ConfigurationError: it is none.
+    """
+    given = check_text(mac, "mac", "force_address", most=100)
+    digits = re.sub(r"[:.\-]", "", given.strip().lower())
+    if not re.fullmatch(r"[0-9a-f]{12}", digits):
+        raise ConfigurationError(
+            f"mac: expected a hardware address such as 00:11:22:33:44:55, got {given[:60]!r}"
+        )
+    return bytes.fromhex(digits).hex(":")
+
+
+def _interface(address: str) -> ipaddress.IPv4Interface:
+    given = check_text(address, "address", "force_address", most=100)
+    expected = f"address: expected an IPv4 address such as 192.168.0.20/24, got {given[:60]!r}"
+    if "/" not in given:
+        raise ConfigurationError(f"{expected}: the length of the network's prefix is missing")
+    try:
+        interface = ipaddress.IPv4Interface(given.strip())
+    except ValueError as exc:
+        raise ConfigurationError(f"{expected}: {exc}") from exc
+    network = interface.network
+    ends = (network.network_address, network.broadcast_address)
+    if network.prefixlen < 31 and interface.ip in ends:
+        raise ConfigurationError(f"{expected}: it is the network's own, or its broadcast address")
+    if interface.ip.is_multicast or interface.ip.is_unspecified or interface.ip.is_reserved:
+        raise ConfigurationError(f"{expected}: no device can have it")
+    return interface
+
+
+def _ip(text: str, what: str) -> ipaddress.IPv4Address:
+    given = check_text(text, what, "force_address", most=100)
+    try:
+        return ipaddress.IPv4Address(given.strip())
+    except ValueError as exc:
+        raise ConfigurationError(f"{what}: expected an IPv4 address, got {given[:60]!r}") from exc
+
+
+def _of_mac(there: list[AnsweringCamera], mac: str) -> AnsweringCamera:
+    for camera in there:
+        if camera.info.mac == mac:
+            return camera
+    known = tuple(f"{one.info.mac} {one.info.label} at {one.info.address}" for one in there)
+    raise FrameSourceError(
+        f"no camera with the hardware address {mac} answers; there are "
+        f"{', '.join(known) or 'none'}",
+        available=known,
+    )
+
+
+async def _sent(
+    payload: bytes, places: Sequence[Network], port: int, camera: AnsweringCamera
+) -> None:
+    """Send the request in all networks, until it is answered.
+
+    Raises:
+        FrameSourceError: it is refused.
+        FrameTimeoutError: nothing answers.
+    """
+    loop = asyncio.get_running_loop()
+    answered: asyncio.Future[int] = loop.create_future()
+    opened: list[tuple[asyncio.DatagramTransport, Network]] = []
+    datagram = encode(GvcpCommand.FORCEIP, _REQUEST_ID, payload, flags=ACK_REQUIRED)
+    try:
+        for place in places:
+            with contextlib.suppress(OSError):  # an interface that is just going down
+                transport, _ = await loop.create_datagram_endpoint(
+                    functools.partial(_ForceAnswers, answered),
+                    local_addr=(place.address, 0),
+                    allow_broadcast=True,
+                )
+                opened.append((transport, place))
+        for _ in range(TRIES):
+            for transport, place in opened:
+                for target in place.targets:
+                    transport.sendto(datagram, (target, port))
+            done, _ = await asyncio.wait([answered], timeout=ANSWER_TIMEOUT)
+            if done:
+                break
+        else:
+            raise FrameTimeoutError(
+                f"{camera.info.label}: no answer to FORCEIP in {TRIES} x {ANSWER_TIMEOUT:g} s: a "
+                "camera that somebody controls does not answer"
+            )
+    finally:
+        for transport, _ in opened:
+            transport.close()
+    if status := answered.result():
+        raise FrameSourceError(f"{camera.info.label}: FORCEIP: it answers {status_text(status)}")
+
+
+async def _appeared(mac: str, address: str, places: Sequence[Network], port: int) -> FoundSource:
+    loop = asyncio.get_running_loop()
+    end = loop.time() + APPEAR_TIMEOUT
+    while True:
+        for camera in await find(places, port=port):
+            if camera.info.mac == mac and camera.info.address == address:
+                return found(camera._replace(address=address))
+        if loop.time() >= end:
+            raise FrameTimeoutError(
+                f"{mac}: it took the address {address}, and does not answer a search by it within "
+                f"{APPEAR_TIMEOUT:g} s"
+            )
+
+
+class _ForceAnswers(asyncio.DatagramProtocol):
+    def __init__(self, answered: asyncio.Future[int]) -> None:
+        self._answered = answered
+
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        try:
+            ack = decode_ack(data)
+        except MessageError:
+            return
+        fits = ack.command == GvcpCommand.FORCEIP + 1 and ack.request_id == _REQUEST_ID
+        if fits and not self._answered.done():
+            self._answered.set_result(ack.status)
+
+    def error_received(self, exc: Exception) -> None:
+        """Ignore that nobody listens at one of the targets."""

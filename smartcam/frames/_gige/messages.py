@@ -1,0 +1,173 @@
+"""Values that a camera sends by itself: chunk data behind each picture, and the data of events.
+
+A description has a port for each chunk and each event; a feature whose registers are read through
+such a port has its value in the bytes of the message. Nothing here asks the camera.
+
+Source: GigE Vision 2.0, chapter 24.6 (chunks: data, id, length, from the end of the payload on);
+GenApi 2.0, chapter 2.8.16 (``ChunkID`` and ``EventID`` of a Port).
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from smartcam.exceptions import MessageError
+from smartcam.frames._gige.features import GenicamFeatures
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Mapping
+
+    from smartcam.frames._features import FeatureValue
+    from smartcam.frames._gige.description import Element
+    from smartcam.frames._gige.features import DeviceMemory
+
+T = TypeVar("T")
+
+MAX_CHUNKS: Final = 256
+"""Chunks behind one picture."""
+
+MAX_MESSAGE_FEATURES: Final = 256
+"""Features that are read from one message."""
+
+MAX_REFERENCES: Final = 32
+"""Nodes between a feature and the port of its message."""
+
+_ENDING: Final = struct.Struct(">II")
+_LEADS_TO_VALUE: Final = ("pValue", "pPort", "pVariable")
+
+
+def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
+    """Return the chunks of a payload by their ids; the picture itself is one of them.
+
+    Raises:
+        MessageError: the lengths do not fit, or there are more chunks than any camera sends.
+    """
+    found: dict[int, memoryview] = {}
+    end = len(payload)
+    while end:
+        if end < _ENDING.size or len(found) >= MAX_CHUNKS:
+            raise MessageError(
+                f"chunk data: expected at most {MAX_CHUNKS} chunks that fill {len(payload)} bytes, "
+                f"{end} are left"
+            )
+        number, length = _ENDING.unpack_from(payload, end - _ENDING.size)
+        begin = end - _ENDING.size - length
+        if begin < 0 or number in found:
+            raise MessageError(
+                f"chunk data: chunk {number:#x} of {length} bytes, which is there "
+                f"{'twice' if number in found else f'before byte {end}'}"
+            )
+        found[number] = payload[begin : end - _ENDING.size]
+        end = begin
+    return found
+
+
+class MessageFeatures(GenicamFeatures):
+    """The features whose values come with messages of one kind.
+
+    Args:
+        features: features of the camera, whose description this shares.
+        kind: ``ChunkID`` or ``EventID``.
+    """
+
+    def __init__(self, features: GenicamFeatures, kind: str) -> None:
+        self.share(features)
+        self._ports = _port_numbers(self._nodes, kind)
+        self._parts: Mapping[int, memoryview] = {}
+        self._by_number: dict[int, list[str]] = {}
+        """Names of the features by the number of their port."""
+        for name in features.names():
+            number = self._number_of(name)
+            if number is not None:
+                self._by_number.setdefault(number, []).append(name)
+
+    def number_of(self, beginning: str) -> int | None:
+        """Return the number of the message whose features begin with a name."""
+        for number, names in self._by_number.items():
+            if any(name.startswith(beginning) for name in names):
+                return number
+        return None
+
+    def read(self, parts: Mapping[int, memoryview]) -> tuple[dict[str, FeatureValue], list[str]]:
+        """Return the values in a message by their features, and what could not be read.
+
+        Args:
+            parts: bytes of the chunks or of the event, by their numbers.
+        """
+        values: dict[str, FeatureValue] = {}
+        problems: list[str] = []
+        self._parts = parts
+        try:
+            names = [name for number in parts for name in self._by_number.get(number, ())]
+            for name in names[:MAX_MESSAGE_FEATURES]:
+                try:
+                    values[name] = _at_once(self._shown(self._named(name)))
+                except MessageError as exc:
+                    problems.append(f"{name}: {exc}")
+        finally:
+            self._parts = {}
+        return values, problems
+
+    def _memory(self, node: Element) -> DeviceMemory:
+        number = self._ports.get(node.text_of("pPort"))
+        if number is None:
+            raise MessageError(f"{node.kind} {node.name} is a register of the camera")
+        if number not in self._parts:
+            raise MessageError(f"{node.kind} {node.name}: its message {number:#x} did not come")
+        return _MessageBytes(self._parts[number])
+
+    def _number_of(self, name: str) -> int | None:
+        """Return the number of the message that a feature's value comes with."""
+        waiting, seen = [name], set[str]()
+        while waiting and len(seen) < MAX_REFERENCES:
+            one = waiting.pop()
+            node = self._nodes.get(one)
+            if node is None or one in seen:
+                continue
+            seen.add(one)
+            if one in self._ports:
+                return self._ports[one]
+            waiting += [child.text for child in node.all(*_LEADS_TO_VALUE)]
+        return None
+
+
+class _MessageBytes:
+    """The bytes of a message, as registers."""
+
+    def __init__(self, data: memoryview) -> None:
+        self._data = data
+
+    async def read(self, address: int, length: int) -> bytes:
+        if address + length > len(self._data):
+            raise MessageError(
+                f"expected {length} bytes at {address:#x}, its message has {len(self._data)}"
+            )
+        return bytes(self._data[address : address + length])
+
+    async def write(self, address: int, data: bytes) -> None:
+        raise MessageError(f"{len(data)} bytes at {address:#x} of a message cannot be written")
+
+
+def _port_numbers(nodes: Mapping[str, Element], kind: str) -> dict[str, int]:
+    """Return the number of each port that has one of that kind."""
+    found: dict[str, int] = {}
+    for node in nodes.values():
+        text = node.text_of(kind) if node.kind == "Port" else ""
+        if text:
+            try:
+                found[node.name] = int(text, 16)
+            except ValueError as exc:
+                raise MessageError(f"Port {node.name}: {kind} {text[:40]!r} is no number") from exc
+    return found
+
+
+def _at_once(work: Coroutine[Any, Any, T]) -> T:
+    """Return the result of a coroutine that never waits."""
+    try:
+        work.send(None)
+    except StopIteration as done:
+        result: T = done.value
+        return result
+    work.close()
+    raise MessageError("its value cannot be read from the message alone")

@@ -1,0 +1,91 @@
+"""Find the camera that a URL names, and read the options of the URL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+from urllib.parse import parse_qsl
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._driver import FoundSource
+from smartcam.frames._gige.discovery import find, networks
+from smartcam.frames._gige.gvcp import PORT
+from smartcam.frames._gige.setup import FEATURE, PACKETS, WantedStream
+
+if TYPE_CHECKING:
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._gige.discovery import AnsweringCamera
+
+_PARAMETERS: Final = (
+    "serial",
+    "format",
+    "size",
+    "fps",
+    "packet_size",
+    "resend",
+    "trigger",
+    "feature.NAME",
+)
+
+
+def wanted(address: FrameAddress) -> WantedStream:
+    """Read a URL's parameters.
+
+    Raises:
+        ConfigurationError: one is wrong; the text says what is known.
+    """
+    names = [name for name, _ in parse_qsl(address.query, keep_blank_values=True)]
+    features = [name for name in names if name.startswith(FEATURE) and name != FEATURE]
+    said = address.parameters([*_PARAMETERS, *features])
+    if address.path not in ("", "/"):
+        raise address.wrong("path", "gige://HOST", address.path)
+    if "serial" in said and address.host:
+        raise address.wrong("serial", "none beside an address", said["serial"])
+    resend = said.get("resend", "on")
+    if resend not in ("on", "off"):
+        raise address.wrong("resend", "on or off", resend)
+    packet_size = said.get("packet_size", "auto")
+    asked = 0.0
+    if packet_size != "auto":
+        asked = address.number("packet_size", packet_size, *PACKETS)
+    return WantedStream(
+        said,
+        address.size(said["size"]) if "size" in said else None,
+        address.number("fps", said["fps"], 0.001, 100_000) if "fps" in said else None,
+        int(asked) & ~3,
+        resend == "on",
+        said.get("trigger"),
+    )
+
+
+async def place(address: FrameAddress, what: WantedStream) -> tuple[str, int]:
+    """Return the address and the port of a camera.
+
+    Raises:
+        FrameSourceError: the address names no host, and not exactly one camera was found.
+    """
+    if address.host:
+        return address.host, address.port or PORT
+    serial = what.said.get("serial")
+    there = await find(networks())
+    fitting = [one for one in there if serial in (None, one.info.serial)]
+    if len(fitting) != 1:
+        known = tuple(f"{found(one).url} {one.info.label}" for one in there)
+        which = "" if serial is None else f" with the serial number {serial}"
+        raise FrameSourceError(
+            f"{address.shown}: expected one camera{which}, found {len(fitting)}; there "
+            f"are {', '.join(known) or 'none'}",
+            source=address.shown,
+            available=known,
+        )
+    return fitting[0].address, PORT
+
+
+def found(camera: AnsweringCamera) -> FoundSource:
+    """Return a camera as it is listed."""
+    remark = ""
+    if not camera.reachable:
+        remark = (
+            f"its address {camera.info.address} is not of the network that it answered by: "
+            f"smartcam frames force-address {camera.info.mac} ADDRESS/PREFIX gives it another"
+        )
+    return FoundSource(f"gige://{camera.address}", camera.info.label, (), remark)

@@ -1,0 +1,245 @@
+"""One camera under our control: its description read, its features set, its heartbeat kept."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final, cast
+
+from smartcam.exceptions import FrameSourceError, FrameTimeoutError, MessageError
+from smartcam.frames._gige.control import ControlChannel, RequestRefusedError, heartbeat
+from smartcam.frames._gige.description import locate, parse, unpack
+from smartcam.frames._gige.event_channel import EventChannel
+from smartcam.frames._gige.features import GenicamFeatures
+from smartcam.frames._gige.gvcp import CONTROL, EXCLUSIVE, LATCH, GvcpStatus, Register, text
+from smartcam.frames._gige.messages import MessageFeatures, cut_chunks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from smartcam.frames._features import FeatureValue
+    from smartcam.frames._gige.block import WholePicture
+    from smartcam.frames._gige.description import Element
+
+OPEN_TIMEOUT: Final = 60.0
+"""Seconds until a camera is opened; most of it is its description, 512 bytes at a time."""
+
+RESEND_CAPABILITY: Final = 0x4
+"""Bit of the register CAPABILITIES: the camera can send packets again."""
+
+MAX_REMARK_LENGTH: Final = 1000
+"""Characters of what a frame says of chunk data that could not be read."""
+
+CAPABILITIES: Final = 0x0934
+URL_SIZE: Final = 512
+HEARTBEAT_TIMEOUTS: Final = (0.5, 60.0)
+"""Seconds between which a camera's own heartbeat timeout is taken as it is."""
+
+
+class GigESession:
+    """A camera that is ours until :meth:`close`.
+
+    Args:
+        control: control channel to the camera, closed with the session.
+        label: name of the camera until it says one itself.
+    """
+
+    def __init__(self, control: ControlChannel, label: str) -> None:
+        self.control = control
+        self.label = label
+        self.lost: FrameSourceError | None = None
+        self.on_lost: Callable[[FrameSourceError], None] = lambda _: None
+        self.ticks_per_second = 0
+        self.can_resend = False
+        self.streamed = False
+        """Whether it has streamed before."""
+        self.watches_exposures = False
+        """Whether events were asked for that tell what becomes of triggers."""
+        self.ids_agree = False
+        """Whether an event has named the block of a picture that came."""
+        self.events = EventChannel(self)
+        self._features: GenicamFeatures | None = None
+        self._chunks: MessageFeatures | None = None
+        self._latches, self._latched = True, cast("int | None", None)
+        self._ours = False
+        self._heart: asyncio.Task[None] | None = None
+
+    @classmethod
+    async def open(cls, host: str, port: int, label: str) -> GigESession:
+        """Take control of a camera and read its description.
+
+        Raises:
+            FrameSourceError: it is not there, another application has it, or its description
+                cannot be read.
+        """
+        control = await ControlChannel.connect(host, port, label)
+        session = cls(control, label)
+        try:
+            async with asyncio.timeout(OPEN_TIMEOUT):
+                await session._begin()
+        except TimeoutError as exc:
+            await session.close()
+            if isinstance(exc, FrameSourceError):
+                raise
+            raise FrameTimeoutError(
+                f"{label}: it was not opened in {OPEN_TIMEOUT:g} s", source=label
+            ) from exc
+        except BaseException:
+            await session.close()
+            raise
+        return session
+
+    @property
+    def features(self) -> GenicamFeatures:
+        """Features of the camera that can be read and set."""
+        if self._features is None:
+            raise FrameSourceError(f"{self.label}: it is not open", source=self.label)
+        return self._features
+
+    def read_chunks(self, picture: WholePicture) -> tuple[Mapping[str, FeatureValue], str]:
+        """Return the values that came with a picture, and what could not be read of them."""
+        if picture.payload is None:
+            return {}, ""
+        try:
+            if self._chunks is None:
+                self._chunks = MessageFeatures(self.features, "ChunkID")
+            values, problems = self._chunks.read(cut_chunks(picture.payload))
+        except MessageError as exc:
+            return {}, str(exc)
+        return values, "; ".join(problems)[:MAX_REMARK_LENGTH]
+
+    async def close(self) -> None:
+        """Give the camera back. Idempotent.
+
+        Cancellation: the socket is closed all the same; the camera frees itself after its
+        heartbeat's timeout.
+        """
+        heart, self._heart = self._heart, None
+        ours, self._ours = self._ours, False
+        try:
+            await self.events.close()
+            if heart is not None:
+                heart.cancel()
+                await asyncio.wait([heart])
+            if ours and self.lost is None:
+                with contextlib.suppress(FrameSourceError):
+                    await self.control.write_register(Register.CONTROL_PRIVILEGE, 0)
+        finally:
+            self.control.close()
+
+    async def _begin(self) -> None:
+        names = await self.control.read(Register.MANUFACTURER_NAME, 176)
+        model, serial, user = text(names[32:64]), text(names[144:160]), text(names[160:176])
+        self.label = user or " ".join(part for part in (model, serial) if part) or self.label
+        self.control.source = self.label
+        await self._take_control()
+        timeout = await self.control.read_register(Register.HEARTBEAT_TIMEOUT) / 1e3
+        timeout = min(max(timeout, HEARTBEAT_TIMEOUTS[0]), HEARTBEAT_TIMEOUTS[1])
+        self._heart = asyncio.create_task(
+            heartbeat(self.control, timeout, self.label, self._on_lost),
+            name=f"heartbeat of {self.label}",
+        )
+        self.ticks_per_second = await self._register_or_0(
+            Register.TICK_FREQUENCY_HIGH
+        ) << 32 | await self._register_or_0(Register.TICK_FREQUENCY_LOW)
+        self.can_resend = bool(await self._register_or_0(CAPABILITIES) & RESEND_CAPABILITY)
+        self._features = GenicamFeatures(
+            await read_description(self.control, self.label), self.control, self.label
+        )
+
+    async def latched_clock(self) -> int | None:
+        """Return the reading of the camera's clock now, ticks; None: it cannot be read.
+
+        A reading that does not go on counts as none: so it is with a camera that keeps whatever is
+        written into the register, and latches nothing.
+
+        Raises:
+            FrameSourceError: the camera does not answer.
+        """
+        if not self.ticks_per_second or not self._latches:
+            return None
+        try:
+            await self.control.write_register(Register.TIMESTAMP_CONTROL, LATCH)
+            high = await self.control.read_register(Register.LATCHED_TIMESTAMP_HIGH)
+            low = await self.control.read_register(Register.LATCHED_TIMESTAMP_LOW)
+        except RequestRefusedError:
+            self._latches = False
+            return None
+        before, self._latched = self._latched, high << 32 | low
+        if before is None:
+            return await self.latched_clock()
+        return self._latched if self._latched > before else None
+
+    async def _register_or_0(self, address: int) -> int:
+        """Return a register that a camera need not have."""
+        try:
+            return await self.control.read_register(address)
+        except RequestRefusedError:
+            return 0
+
+    def _on_lost(self, error: FrameSourceError) -> None:
+        self.lost = error
+        self.on_lost(error)
+        self.events.end(error)
+
+    async def _take_control(self) -> None:
+        try:
+            await self.control.write_register(Register.CONTROL_PRIVILEGE, CONTROL)
+        except FrameSourceError as exc:
+            if not await self._is_taken(exc):
+                raise
+            other = await self._register_or_0(Register.PRIMARY_APPLICATION_ADDRESS)
+            where = ".".join(str(part) for part in other.to_bytes(4, "big"))
+            raise FrameSourceError(
+                f"{self.label} is controlled by another application"
+                f"{f' at {where}' if other else ''}: it has to give the camera back first",
+                source=self.label,
+            ) from exc
+        self._ours = True
+
+    async def _is_taken(self, error: FrameSourceError) -> bool:
+        """Return True if taking control failed because another application has it.
+
+        A camera should refuse with ACCESS_DENIED; the fake camera of Aravis does not answer at all.
+        """
+        if isinstance(error, RequestRefusedError):
+            return error.status == GvcpStatus.ACCESS_DENIED
+        if isinstance(error, FrameTimeoutError):
+            privilege = await self.control.read_register(Register.CONTROL_PRIVILEGE)
+            return bool(privilege & (CONTROL | EXCLUSIVE))
+        return False
+
+
+async def read_description(control: ControlChannel, label: str) -> dict[str, Element]:
+    """Read a camera's description; the second URL is tried where the first one leads nowhere.
+
+    Raises:
+        FrameSourceError: neither leads to one.
+    """
+    tried = []
+    for address in (Register.FIRST_URL, Register.FIRST_URL + URL_SIZE):
+        url = text(await control.read(address, URL_SIZE))
+        try:
+            lies = locate(url)
+            data = await control.read(lies.address, lies.length)
+            return await _in_thread(functools.partial(_nodes, data), label)
+        except (MessageError, RequestRefusedError) as exc:
+            tried.append(str(exc))
+    raise FrameSourceError(
+        f"{label}: its description cannot be read: {'; '.join(tried)}", source=label
+    )
+
+
+def _nodes(data: bytes) -> dict[str, Element]:
+    return parse(unpack(data))
+
+
+async def _in_thread(work: Callable[[], dict[str, Element]], label: str) -> dict[str, Element]:
+    """Do work beside the loop: 2 MB of XML take a quarter of a second."""
+    pool = ThreadPoolExecutor(1, thread_name_prefix=f"description of {label}")
+    try:
+        return await asyncio.get_running_loop().run_in_executor(pool, work)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,303 @@
+"""Set a camera's features to what a URL asks for, and the registers of its stream channel."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._driver import StreamFormat
+from smartcam.frames._gige.gvcp import (
+    DO_NOT_FRAGMENT,
+    FIRE_TEST_PACKET,
+    PACKET_SIZE_MASK,
+    Register,
+)
+from smartcam.frames._gige.gvsp import EXTENDED_HEADER, IP_UDP, bits_of
+from smartcam.frames._gige.triggering import set_trigger
+from smartcam.frames._pixels.formats import find_format
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.frames._gige.features import GenicamFeatures
+    from smartcam.frames._gige.session import GigESession
+    from smartcam.frames._gige.stream import StreamSocket
+    from smartcam.frames._pixels.formats import PixelFormat
+
+FEATURE: Final = "feature."
+"""Prefix of the URL's parameters of features."""
+
+PACKETS: Final = (576, 16384)
+"""Bytes of the stream's IP packets: each network carries the first; the second is the most."""
+
+TEST_WAIT: Final = 0.1
+"""Seconds for a test packet."""
+
+LARGEST_FRAME: Final = 1 << 30
+"""Bytes of the largest frame."""
+
+MAX_NUMBER: Final = 1e12
+"""Frames a second, or microseconds, below which a number is believed."""
+
+_RATES: Final = ("AcquisitionFrameRate", "AcquisitionFrameRateAbs")
+_RATE_SWITCHES: Final = ("AcquisitionFrameRateEnable", "AcquisitionFrameRateEnabled")
+_EXPOSURES: Final = ("ExposureTime", "ExposureTimeAbs")
+"""Names of the exposure time, microseconds: in the SFNC of today, then in its first editions."""
+
+
+class WantedStream(NamedTuple):
+    """The stream that a URL asks for.
+
+    Attributes:
+        said: parameters of the URL, in their order.
+        size: width and height, pixels; None: as the camera has it.
+        rate: frames a second; None: as the camera has it.
+        packet_size: bytes of an IP packet; 0: the largest that comes through.
+        resend: whether missing packets are asked for.
+        trigger: source of the triggers, or ``off``; None: as the camera has it.
+    """
+
+    said: Mapping[str, str]
+    size: tuple[int, int] | None
+    rate: float | None
+    packet_size: int
+    resend: bool
+    trigger: str | None = None
+
+
+class Exposure(NamedTuple):
+    """The longest time that a frame takes, as far as the camera tells it.
+
+    Attributes:
+        duration: seconds of the longest exposure and of the readout.
+        readout: seconds of the readout.
+        is_auto: whether the camera chooses the exposure time.
+    """
+
+    duration: float
+    readout: float
+    is_auto: bool
+
+
+class StreamShape(NamedTuple):
+    """The properties of a camera's stream once it is set.
+
+    Attributes:
+        format: format of the frames.
+        number: PFNC's, of the pixel format.
+        payload: bytes of a frame at most.
+        exposure: longest time of a frame.
+    """
+
+    format: StreamFormat
+    number: int
+    payload: int
+    exposure: Exposure
+
+
+async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
+    """Set a camera, in the order in which the URL says it; return what it streams then.
+
+    Raises:
+        FrameSourceError: it has no such feature or value; the text says what it has.
+    """
+    features = session.features
+    with contextlib.suppress(FrameSourceError):  # it does not stream, which may be an error
+        await features.execute("AcquisitionStop")
+    await lock(features, False)
+    mode = "AcquisitionMode"
+    if mode in features and "Continuous" in await features.entries(mode):
+        await features.set(mode, "Continuous")
+    for name, value in wanted.said.items():
+        if name == "format":
+            await _set_format(session, value)
+        elif name == "size" and wanted.size is not None:
+            await _set_size(features, wanted.size)
+        elif name == "fps" and wanted.rate is not None:
+            await _set_rate(session, wanted.rate)
+        elif name.startswith(FEATURE):
+            await features.set(name.removeprefix(FEATURE), value)
+    if wanted.trigger is not None:
+        await set_trigger(features, wanted.trigger)
+    return await read_shape(session)
+
+
+async def lock(features: GenicamFeatures, locked: bool) -> None:
+    """Tell the camera that its stream's shape is fixed, or no longer; not all want to know."""
+    if "TLParamsLocked" in features:
+        with contextlib.suppress(FrameSourceError):  # of some it is read-only
+            await features.set("TLParamsLocked", int(locked))
+
+
+async def _set_format(session: GigESession, name: str) -> None:
+    entries = await session.features.entries("PixelFormat")
+    for entry, number in entries.items():
+        known = _known(number)
+        names = [entry] if known is None else [entry, known.name, known.fourcc]
+        if name.upper() in (one.upper() for one in names):
+            await session.features.set("PixelFormat", entry)
+            return
+    raise FrameFormatError(
+        f"{session.label}: it has no format {name!r}{did_you_mean(name, entries)}; it has "
+        f"{', '.join(entries)}",
+        source=session.label,
+        available=tuple(entries),
+    )
+
+
+async def _set_size(features: GenicamFeatures, size: tuple[int, int]) -> None:
+    for name in ("OffsetX", "OffsetY"):  # a width has only room up to the offset
+        if name in features:
+            with contextlib.suppress(FrameSourceError):
+                await features.set(name, 0)
+    for name, value in zip(("Width", "Height"), size, strict=True):
+        try:
+            await features.set(name, value)
+        except FrameSourceError as exc:
+            if isinstance(exc, TimeoutError):
+                raise
+            raise FrameFormatError(str(exc), source=exc.source, available=exc.available) from exc
+
+
+async def _set_rate(session: GigESession, rate: float) -> None:
+    features = session.features
+    for name in _RATE_SWITCHES:
+        if name in features:
+            with contextlib.suppress(FrameSourceError):
+                await features.set(name, "true")
+    for name in _RATES:
+        if name in features:
+            await features.set(name, rate)
+            return
+    raise FrameSourceError(
+        f"{session.label}: it has no frame rate to set; it has {', '.join(features.names())}",
+        source=session.label,
+        available=tuple(features.names()),
+    )
+
+
+async def read_shape(session: GigESession) -> StreamShape:
+    """Return the shape of the stream as the camera is set now.
+
+    Raises:
+        FrameSourceError: it does not tell, or a format that is not known here.
+    """
+    features = session.features
+    entry = await features.get("PixelFormat")
+    entries = await features.entries("PixelFormat")
+    number = int(await features.number("PixelFormat") or 0)
+    pixels = _known(number)
+    if pixels is None:
+        fitting = tuple(name for name, one in entries.items() if _known(one) is not None)
+        raise FrameFormatError(
+            f"{session.label}: it is set to {entry}, {number:#010x}, which is not known here; of "
+            f"its formats are {', '.join(fitting) or 'none'}",
+            source=session.label,
+            available=fitting,
+        )
+    width, height = (
+        int(await features.number("Width") or 0),
+        int(await features.number("Height") or 0),
+    )
+    least = (width * height * bits_of(number) + 7) // 8
+    payload = int(await features.number("PayloadSize") or least)
+    if not 0 < least <= payload <= LARGEST_FRAME:
+        raise FrameSourceError(
+            f"{session.label}: expected a PayloadSize of {least} to {LARGEST_FRAME} bytes for "
+            f"{width}x{height} pixels of {entry}, got {payload}",
+            source=session.label,
+        )
+    rate = await _first_number(features, _RATES)
+    form = StreamFormat(pixels, width, height, (rate,) if rate else ())
+    return StreamShape(form, number, payload, await read_exposure(features))
+
+
+async def read_exposure(features: GenicamFeatures) -> Exposure:
+    """Return the longest time of a frame, as the camera is set now."""
+    rate = await _first_number(features, _RATES)
+    exposure = await _first_number(features, _EXPOSURES) or 0.0
+    is_auto = False
+    if "ExposureAuto" in features:
+        with contextlib.suppress(FrameSourceError):
+            is_auto = await features.get("ExposureAuto") != "Off"
+            for name in (one for one in _EXPOSURES if is_auto and one in features):
+                longest = (await features.describe(name)).maximum
+                if longest is not None and longest < MAX_NUMBER:
+                    exposure = max(exposure, longest)
+    readout = 1 / rate if rate else 0.0
+    return Exposure(exposure / 1e6 + readout, readout, is_auto)
+
+
+def _known(number: int) -> PixelFormat | None:
+    """Return the format of a number; names differ: cameras have older ones than PFNC's."""
+    with contextlib.suppress(FrameFormatError):
+        return find_format(number)
+    return None
+
+
+async def _first_number(features: GenicamFeatures, names: tuple[str, ...]) -> float | None:
+    for name in names:
+        if (number := await features.number(name)) is not None and 0 < number < MAX_NUMBER:
+            return float(number)
+    return None
+
+
+# the stream channel
+
+
+async def connect(session: GigESession, where: StreamSocket, asked: int) -> int:
+    """Have the camera's stream channel send to a socket.
+
+    Args:
+        session: the camera.
+        where: socket that receives the packets.
+        asked: bytes of a packet; 0: the largest that comes through.
+
+    Returns:
+        Bytes of an IP packet of the stream.
+
+    Raises:
+        FrameSourceError: the camera refuses to send there, or refuses the packet size.
+    """
+    control = session.control
+    address = int(ipaddress.IPv4Address(control.local_address))
+    await control.write_register(Register.STREAM_DESTINATION, address)
+    await control.write_register(Register.STREAM_PORT, where.port)
+    size = await (_given(session, asked) if asked else _tested(session, where))
+    if not size > IP_UDP + EXTENDED_HEADER:
+        raise FrameSourceError(
+            f"{session.label}: packet_size: expected {PACKETS[0]} bytes or more, the camera says "
+            f"{size}",
+            source=session.label,
+        )
+    return size
+
+
+async def _given(session: GigESession, asked: int) -> int:
+    control = session.control
+    await control.write_register(Register.STREAM_PACKET_SIZE, asked | DO_NOT_FRAGMENT)
+    size = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
+    if size > asked:
+        raise FrameSourceError(
+            f"{session.label}: packet_size: asked for {asked} bytes, the camera sends {size}",
+            source=session.label,
+        )
+    return size
+
+
+async def _tested(session: GigESession, where: StreamSocket) -> int:
+    """Return the largest size of which a test packet came; without any the camera's own."""
+    control = session.control
+    own = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
+    way = min(control.path_mtu, 9000)
+    for size in sorted({way, min(way, 1500), PACKETS[0]}, reverse=True):
+        value = size | DO_NOT_FRAGMENT | FIRE_TEST_PACKET
+        with contextlib.suppress(FrameSourceError):  # it does not send test packets, or not such
+            await control.write_register(Register.STREAM_PACKET_SIZE, value)
+            set_to = await control.read_register(Register.STREAM_PACKET_SIZE) & PACKET_SIZE_MASK
+            if set_to <= size and await where.test_packet(set_to, TEST_WAIT):
+                return set_to
+    return await _given(session, min(own or 1500, way, 1500))

@@ -1,0 +1,258 @@
+"""Triggers of a GigE Vision camera: how it is set to be triggered, and which picture is whose.
+
+A picture belongs to the trigger that waits for it if none of these speaks against it: it was
+exposed before the trigger was sent, by the camera's clock, which is read (latched) right before;
+a picture was lost meanwhile; an event of the camera names another block. Where the camera has no
+clock that can be read, it rests on this stream alone: each picture before it was accounted for.
+
+Source: SFNC 2.7, chapter 5 (``TriggerSelector``, ``TriggerMode``, ``TriggerSource``,
+``TriggerSoftware``); GigE Vision 2.0, chapter 28 (timestamp latch).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam.exceptions import FrameSourceError, NotRunningError, UnsupportedError
+from smartcam.frames._frame import FrameTrigger
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from smartcam.frames._events import FrameEvent
+    from smartcam.frames._gige.block import WholePicture
+    from smartcam.frames._gige.features import GenicamFeatures
+    from smartcam.frames._trigger import AwaitedTrigger
+
+EXPOSED: Final = "ExposureEnd"
+MISSED: Final = "FrameTriggerMissed"
+"""Events that tell what became of a trigger."""
+
+MAX_EXPOSURES: Final = 16
+"""Exposures of one trigger that are remembered."""
+
+SOFTWARE: Final = "Software"
+FRAME_START: Final = "FrameStart"
+
+
+class TriggerSetting(NamedTuple):
+    """One kind of trigger that is switched on.
+
+    Attributes:
+        selector: entry of TriggerSelector; ``""``: the camera has only one kind.
+        source: entry of TriggerSource; ``""``: the camera does not say.
+    """
+
+    selector: str
+    source: str
+
+    def __str__(self) -> str:
+        """Return the setting as errors show it."""
+        which = f" for {self.selector}" if self.selector else ""
+        source = f", TriggerSource {self.source}" if self.source else ""
+        return f"its TriggerMode is On{which}{source}"
+
+
+async def read_settings(features: GenicamFeatures) -> list[TriggerSetting]:
+    """Return the kinds of triggers that are switched on; TriggerSelector is as before afterwards.
+
+    Raises:
+        FrameSourceError: the camera does not answer.
+    """
+    if "TriggerMode" not in features:
+        return []
+    if "TriggerSelector" not in features:
+        return await _setting(features, "")
+    chosen = await features.get("TriggerSelector")
+    found: list[TriggerSetting] = []
+    try:
+        for selector in await features.entries("TriggerSelector"):
+            await features.set("TriggerSelector", selector)
+            found += await _setting(features, selector)
+    finally:
+        await features.set("TriggerSelector", chosen)
+    return found
+
+
+async def _setting(features: GenicamFeatures, selector: str) -> list[TriggerSetting]:
+    if await _said(features, "TriggerMode") != "On":
+        return []
+    return [TriggerSetting(selector, await _said(features, "TriggerSource"))]
+
+
+async def _said(features: GenicamFeatures, name: str) -> str:
+    """Return a feature's text; "" where it is not to be had now."""
+    if name not in features:
+        return ""
+    try:
+        return str(await features.get(name))
+    except FrameSourceError as exc:
+        if isinstance(exc, TimeoutError):
+            raise
+        return ""
+
+
+async def set_trigger(features: GenicamFeatures, source: str) -> None:
+    """Have each picture wait for a trigger of a source; ``off``: for none.
+
+    Raises:
+        FrameSourceError: the camera has no such source; the text says which.
+    """
+    if "TriggerSelector" in features:
+        for selector in await features.entries("TriggerSelector"):
+            if selector != FRAME_START:
+                await features.set("TriggerSelector", selector)
+                if await _said(features, "TriggerMode") == "On":
+                    await features.set("TriggerMode", "Off")
+        await features.set("TriggerSelector", FRAME_START)
+    if source.lower() == "off":
+        await features.set("TriggerMode", "Off")
+        return
+    sources = await features.entries("TriggerSource")
+    meant = {one.lower(): one for one in sources}.get(source.lower(), source)
+    await features.set("TriggerMode", "On")  # some have a source only then
+    await features.set("TriggerSource", meant)
+
+
+async def one_setting(
+    settings: list[TriggerSetting], features: GenicamFeatures, by_line: bool, name: str
+) -> TriggerSetting:
+    """Return the trigger that causes exactly one picture, and is fired so.
+
+    Raises:
+        NotRunningError: no trigger is switched on, or one from elsewhere.
+        UnsupportedError: a trigger causes several pictures, or several triggers are needed for one.
+    """
+    if not settings:
+        raise NotRunningError(
+            f"{name}: its TriggerMode is Off, so it takes no trigger: open it with "
+            "?trigger=Software, or set TriggerSelector, TriggerMode and TriggerSource"
+        )
+    setting = settings[0]
+    if len(settings) > 1 or setting.selector not in ("", FRAME_START):
+        said = "; ".join(map(str, settings))
+        raise UnsupportedError(
+            f"{name}: expected one trigger for each picture, TriggerMode On for {FRAME_START} "
+            f"alone, got: {said}"
+        )
+    is_software = setting.source == SOFTWARE or not (setting.source or by_line)
+    if by_line and is_software:
+        raise NotRunningError(
+            f"{name}: `fire` sets a line, but {setting}: set TriggerSource to that line"
+        )
+    if not by_line and not is_software:
+        raise NotRunningError(
+            f"{name}: {setting}: set TriggerSource to {SOFTWARE}, or pass `fire`, a function that "
+            "sets that line; after(time.monotonic()) waits for a picture that others trigger"
+        )
+    return setting
+
+
+@contextlib.asynccontextmanager
+async def selected(features: GenicamFeatures, setting: TriggerSetting) -> AsyncIterator[None]:
+    """Have TriggerSelector at a trigger meanwhile; it is as before afterwards.
+
+    Raises:
+        FrameSourceError: the camera does not answer.
+    """
+    chosen = await features.get("TriggerSelector") if setting.selector else ""
+    if chosen == setting.selector:
+        yield
+        return
+    await features.set("TriggerSelector", setting.selector)
+    try:
+        yield
+    finally:
+        await features.set("TriggerSelector", chosen)
+
+
+class ArmedTrigger:
+    """A trigger that waits for its picture.
+
+    Args:
+        pending: the trigger of the source.
+        latched: the camera's clock right before it, ticks; None: it cannot be read.
+        setting: kind of the trigger.
+        delay: seconds from the trigger to its exposure (``TriggerDelay``).
+        is_first: whether no picture of the stream has come yet.
+    """
+
+    def __init__(
+        self,
+        pending: AwaitedTrigger,
+        latched: int | None,
+        setting: TriggerSetting,
+        *,
+        delay: float,
+        is_first: bool,
+    ) -> None:
+        self.pending, self.delay = pending, delay
+        self._latched, self._setting, self._is_first = latched, setting, is_first
+        self.exposed: list[int] = []
+        """Blocks that the camera's events say it exposed since."""
+
+    def is_older(self, picture: WholePicture) -> bool:
+        """Return True if a picture was exposed before the trigger, by the camera's clock."""
+        ticks = picture.leader.ticks
+        older = self._latched is not None and 0 < ticks < self._latched
+        if older:
+            self._note(f"block {picture.block_id} came, which was exposed before it")
+        return older
+
+    def doubt(self, picture: WholePicture, *, ids_agree: bool) -> str:
+        """Return the reason why a picture may not be that of the trigger, or ``""``.
+
+        Args:
+            picture: picture that came first.
+            ids_agree: whether events and pictures of this camera are known to have the same ids.
+        """
+        if picture.lost > 0 and not self._is_first:
+            return f"{picture.lost} right before it came incomplete, or not at all"
+        if ids_agree and self.exposed and picture.block_id not in self.exposed:
+            return f"the camera exposed block {self.exposed[0]} for it, which did not come"
+        return ""
+
+    def take_event(self, event: FrameEvent, ticks: float | None) -> bool:
+        """Take an event of the camera; return True if it says that the trigger was missed.
+
+        Args:
+            event: event that the camera told.
+            ticks: reading of the camera's clock that came with the event; None: none did.
+        """
+        if ticks is not None and self._latched is not None and ticks < self._latched:
+            return False
+        if event.name == MISSED:
+            return True
+        if event.block and len(self.exposed) < MAX_EXPOSURES:
+            self.exposed.append(event.block)
+            self._note(f"its event {event.name} says that it exposed block {event.block}")
+        return False
+
+    def _note(self, text: str) -> None:
+        if len(self.pending.notes) < MAX_EXPOSURES:
+            self.pending.notes.append(text)
+
+    def record(self, picture: WholePicture, ticks_per_second: int) -> FrameTrigger:
+        """Return the record of the trigger for its picture."""
+        evidence: list[str] = []
+        if picture.block_id in self.exposed:
+            evidence.append(f"the camera's event {EXPOSED} names its block {picture.block_id}")
+        if self._latched is not None and picture.leader.ticks:
+            delay = (picture.leader.ticks - self._latched) / ticks_per_second
+            evidence.append(
+                f"by the camera's clock exposed {1e3 * delay:.3f} ms after its clock was read, "
+                "right before the trigger"
+            )
+        if self._setting.source == SOFTWARE:
+            evidence.append(
+                "only this program may trigger it by software, and no picture of an earlier "
+                "trigger was still to come"
+            )
+        else:
+            evidence.append(
+                f"the first picture of {self._setting.source} after `fire` was called; any other "
+                "pulse on that line would count as well"
+            )
+        fired = self.pending.fired or 0.0
+        return FrameTrigger(self.pending.number, fired, tuple(evidence))

@@ -1,0 +1,83 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.frames._clocks import MAX_DRIFT, MIN_DRIFT_DURATION
+    from smartcam.frames._codecs.bitmap import read_bitmap
+    from smartcam.frames._codecs.h264 import entry_point
+    from smartcam.frames._codecs.jpeg import jpeg_header
+    from smartcam.frames._codecs.pictures import converted, decoded, to_jpeg, with_pixels
+    from smartcam.frames._features import FEATURE_TIMEOUT
+    from smartcam.frames._gige import discovery, places
+    from smartcam.frames._gige.assembler import PacketCounts
+    from smartcam.frames._gige.control import ControlChannel
+    from smartcam.frames._gige.driver import GigEDriver
+    from smartcam.frames._gige.features import GenicamFeatures
+    from smartcam.frames._gige.force_address import checked_mac, force_address
+    from smartcam.frames._gige.gvcp import Register
+    from smartcam.frames._gige.session import GigESession
+    from smartcam.frames._pixels.layouts import Planes, YuvPairs
+    from smartcam.frames._reader import FRAME_TIMEOUT, FrameTap
+    from smartcam.frames._synthetic import read_stamp
+    from smartcam.frames._video.frames import colour_properties, format_of, to_lossless_video
+
+__all__ = [
+    "FEATURE_TIMEOUT",
+    "FRAME_TIMEOUT",
+    "MAX_DRIFT",
+    "MIN_DRIFT_DURATION",
+    "ControlChannel",
+    "FrameTap",
+    "GenicamFeatures",
+    "GigEDriver",
+    "GigESession",
+    "PacketCounts",
+    "Planes",
+    "Register",
+    "YuvPairs",
+    "checked_mac",
+    "colour_properties",
+    "converted",
+    "decoded",
+    "discovery",
+    "entry_point",
+    "force_address",
+    "format_of",
+    "jpeg_header",
+    "places",
+    "read_bitmap",
+    "read_stamp",
+    "to_jpeg",
+    "to_lossless_video",
+    "with_pixels",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_clocks": "MIN_DRIFT_DURATION MAX_DRIFT",
+            "_codecs.bitmap": "read_bitmap",
+            "_codecs.h264": "entry_point",
+            "_codecs.jpeg": "jpeg_header",
+            "_codecs.pictures": "converted decoded to_jpeg with_pixels",
+            "_features": "FEATURE_TIMEOUT",
+            "_gige.force_address": "checked_mac force_address",
+            "_gige.": "discovery places",
+            "_gige.assembler": "PacketCounts",
+            "_gige.control": "ControlChannel",
+            "_gige.driver": "GigEDriver",
+            "_gige.features": "GenicamFeatures",
+            "_gige.gvcp": "Register",
+            "_gige.session": "GigESession",
+            "_pixels.layouts": "Planes YuvPairs",
+            "_reader": "FRAME_TIMEOUT FrameTap",
+            "_synthetic": "read_stamp",
+            "_video.frames": "colour_properties format_of to_lossless_video",
+        },
+    )

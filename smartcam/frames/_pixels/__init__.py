@@ -1,0 +1,1 @@
+"""Pixel formats: their layouts in bytes and their conversion to colours."""

@@ -1,0 +1,96 @@
+"""Pixels of 10 and 12 bits that share bytes, and how each gets two of its own.
+
+PFNC packs ``10p`` and ``12p`` as one stream of bits, the lowest first. GigE Vision's older
+``10Packed`` and ``12Packed`` lay two pixels into three bytes: the high bits of each into the outer
+ones, what is left of both into the one between.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class PixelBits(NamedTuple):
+    """Some bits of a pixel: ``(byte >> right & mask) << left``."""
+
+    byte: int
+    right: int
+    mask: int
+    left: int
+
+
+class Packing(NamedTuple):
+    """The places of some pixels' bits in some bytes, a pattern that repeats.
+
+    Attributes:
+        size: bytes.
+        pixels: parts of each of the pixels in them.
+    """
+
+    size: int
+    pixels: tuple[tuple[PixelBits, ...], ...]
+
+
+PACKINGS: Final = {
+    "10p": Packing(
+        5,
+        (
+            (PixelBits(0, 0, 0xFF, 0), PixelBits(1, 0, 0x03, 8)),
+            (PixelBits(1, 2, 0x3F, 0), PixelBits(2, 0, 0x0F, 6)),
+            (PixelBits(2, 4, 0x0F, 0), PixelBits(3, 0, 0x3F, 4)),
+            (PixelBits(3, 6, 0x03, 0), PixelBits(4, 0, 0xFF, 2)),
+        ),
+    ),
+    "12p": Packing(
+        3,
+        (
+            (PixelBits(0, 0, 0xFF, 0), PixelBits(1, 0, 0x0F, 8)),
+            (PixelBits(1, 4, 0x0F, 0), PixelBits(2, 0, 0xFF, 4)),
+        ),
+    ),
+    "10Packed": Packing(
+        3,
+        (
+            (PixelBits(0, 0, 0xFF, 2), PixelBits(1, 0, 0x03, 0)),
+            (PixelBits(2, 0, 0xFF, 2), PixelBits(1, 4, 0x03, 0)),
+        ),
+    ),
+    "12Packed": Packing(
+        3,
+        (
+            (PixelBits(0, 0, 0xFF, 4), PixelBits(1, 0, 0x0F, 0)),
+            (PixelBits(2, 0, 0xFF, 4), PixelBits(1, 4, 0x0F, 0)),
+        ),
+    ),
+}
+"""By the end of a format's name. Source: PFNC, "packed pixel formats"; GigE Vision 1.2."""
+
+
+def unpack(rows: NDArray[np.uint8], width: int, packing: Packing) -> NDArray[np.uint16]:
+    """Return the pixels of rows of bytes.
+
+    Args:
+        rows: (H, bytes of ``width`` pixels, or more).
+        width: pixels in a row.
+        packing: how they lie.
+
+    Returns:
+        (H, width).
+    """
+    height, pixels = rows.shape[0], len(packing.pixels)
+    groups = -(-width // pixels)
+    missing = groups * packing.size - rows.shape[1]
+    if missing > 0:  # the row ends within a group
+        rows = np.pad(rows, ((0, 0), (0, missing)))
+    grouped = rows[:, : groups * packing.size].reshape(height, groups, packing.size)
+    taken = np.zeros((height, groups, pixels), np.uint16)
+    for place, parts in enumerate(packing.pixels):
+        for part in parts:
+            bits = (grouped[..., part.byte] >> part.right) & part.mask
+            taken[..., place] |= bits.astype(np.uint16) << part.left
+    return taken.reshape(height, -1)[:, :width]

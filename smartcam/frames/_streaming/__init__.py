@@ -1,0 +1,1 @@
+"""Send and receive streams: the shared stream, bit rate control, RTP and RTSP."""

@@ -1,0 +1,302 @@
+"""Choose quality and rate of pictures for a bit rate or a latency; nothing is sent here."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from smartcam._arguments import check_number, wrong_argument
+from smartcam.exceptions import ConfigurationError
+
+logger: logging.Logger = logging.getLogger("smartcam.frames")
+
+CHANGE_AVERAGING_TIME: Final = 0.3
+"""Seconds over which the bytes of a frame are averaged after a change of the scene."""
+
+STEADY_AVERAGING_TIME: Final = 1.0
+"""Seconds over which the bytes of a frame are averaged otherwise: no two frames are alike."""
+
+COUNTED_SECONDS: Final = 2.0
+"""Seconds over which frames and bytes are counted."""
+
+CHANGE_FACTOR: Final = 1.4
+"""Factor by which a value must differ from its mean to count as a change."""
+
+MAX_RISE_PER_SECOND: Final = 1.3
+"""Factor by which the bit rate may rise in a second, after the start."""
+
+MAX_FIRST_RISE_PER_SECOND: Final = 8.0
+"""Factor by which the bit rate may rise in a second until its first drop."""
+
+MIN_DEVIATION_SHARE: Final = 0.03
+"""Share of a value below which a deviation is not corrected."""
+
+BUSY_SHARE: Final = 0.7
+"""Share of the time with frames on the way, above which the link bounds the frame rate."""
+
+SLOW_SOURCE_FACTOR: Final = 1.15
+"""Factor of the pause between two frames, above which the source bounds the frame rate."""
+
+FREE_SHARE: Final = 0.5
+"""Share of the time with frames on the way, below which fewer frames arrive no sooner."""
+
+LOGGED_CHANGE_FACTOR: Final = 1.25
+"""Factor by which the frame rate must change before it is logged again."""
+
+STEEP: Final = 0.7
+"""Bytes of a JPEG go with its steps to this power, near enough: what is off is corrected after."""
+
+
+@dataclass(frozen=True, slots=True)
+class RateStatistics:
+    """The quality and rates that a rate control has set, and the reason.
+
+    Attributes:
+        quality: of JPEG, that frames are to have.
+        fps: frames a second at most.
+        why: what these follow: "bit rate", "latency" or "the best quality"; "" before the first
+            frame. Behind it stands "at the lowest quality" where there are fewer frames, too, and
+            "no frame may be smaller, nor fewer" where that is not enough.
+        bitrate: bits a second of late.
+        latency: seconds from a frame's capture to its arrival, of late.
+    """
+
+    quality: int
+    fps: float
+    why: str
+    bitrate: float
+    latency: float
+
+
+class _Mean:
+    """A mean of what came of late, weighted by time."""
+
+    def __init__(self) -> None:
+        self.value = self._weight = 0.0
+
+    def add(self, value: float, seconds: float) -> None:
+        alike = self.value / CHANGE_FACTOR < value < self.value * CHANGE_FACTOR
+        over = STEADY_AVERAGING_TIME if alike else CHANGE_AVERAGING_TIME
+        keeps = self._weight * math.exp(-seconds / over)
+        new = -math.expm1(-seconds / over)
+        self._weight = keeps + new
+        if self._weight:
+            self.value += (value - self.value) * new / self._weight
+
+
+class _Flow:
+    """The number of frames and bytes that came of late, and the seconds that they took."""
+
+    def __init__(self) -> None:
+        self.frames = self.bytes = self.seconds = 0.0
+
+    def add(self, size: int, seconds: float) -> None:
+        keeps = math.exp(-seconds / COUNTED_SECONDS)
+        self.frames = self.frames * keeps + 1
+        self.bytes = self.bytes * keeps + size
+        self.seconds = self.seconds * keeps + seconds
+
+
+class RateControl:
+    """Holds a bit rate or a latency: by the quality of JPEGs first, by the frame rate then.
+
+    ::
+
+        control = RateControl(bitrate=4e6)
+        ...  # send a frame of control.quality, control.rest seconds after the last one at least
+        control.sent(size, went, took)
+
+    It lowers the quality as far as it may, and only then the frame rate; upwards the frame rate
+    comes back first. It follows a drop within a second, and rises by no more than 30 % in one, so
+    that it does not swing. With both, the lower one counts.
+
+    Args:
+        bitrate: bits a second on average.
+        latency: seconds from capture to arrival.
+        quality: of JPEG, the lowest and the best, 1 to 100.
+        fps: frames a second, the fewest and the most.
+
+    Raises:
+        ConfigurationError: neither of them is said, or one is out of its range.
+    """
+
+    def __init__(
+        self,
+        bitrate: float | None = None,
+        latency: float | None = None,
+        quality: tuple[int, int] = (10, 90),
+        fps: tuple[float, float] = (1.0, 30.0),
+    ) -> None:
+        _check(bitrate, latency, quality, fps)
+        self._bitrate, self._latency = bitrate, latency
+        self._qualities, self._rates = quality, fps
+        self._quality, self._fps = float(quality[0]), float(fps[1])
+        self._rise = MAX_FIRST_RISE_PER_SECOND
+        self._why: str = ""
+        self._told_fps = self._fps
+        self._went: float | None = None
+        self._comes = 0.0  # frames a second that the source gives, as far as is known; 0: unknown
+        self._flow = _Flow()
+        self._weight = _Mean()  # bytes that a frame would have with steps of 1
+        self._way = _Mean()  # seconds that a byte took
+        self._age, self._took = _Mean(), _Mean()
+
+    @property
+    def quality(self) -> int:
+        """Quality that the next frame is to have."""
+        return round(self._quality)
+
+    @property
+    def fps(self) -> float:
+        """Frames a second at most."""
+        return self._fps
+
+    @property
+    def rest(self) -> float:
+        """Seconds from one frame to the next at least."""
+        return 1 / self._fps
+
+    def statistics(self) -> RateStatistics:
+        """Return the quality and rate that the control has set, and the reason."""
+        flow = self._flow
+        return RateStatistics(
+            self.quality,
+            self._fps,
+            self._why,
+            8 * flow.bytes / flow.seconds if flow.seconds else 0.0,
+            self._age.value + self._took.value,
+        )
+
+    def sent(
+        self, size: int, went: float, took: float, *, age: float = 0.0, quality: int | None = None
+    ) -> None:
+        """Record a frame that has arrived, and adjust quality and frame rate.
+
+        Args:
+            size: bytes of the frame.
+            went: time at which the frame was sent, in seconds of any clock.
+            took: seconds until the frame arrived.
+            age: seconds from the frame's capture until it was sent.
+            quality: quality of the frame; None: the present one.
+        """
+        size, took = max(1, size), max(1e-6, took)
+        if self._went is None or went <= self._went:
+            seconds = self.rest
+        else:
+            seconds = went - self._went
+            self._flow.add(size, seconds)
+            self._learn(took / seconds)
+        self._went = went
+        had = self.quality if quality is None else quality
+        # a frame that was long on its way has told of all that time
+        of_late = max(seconds, took)
+        self._weight.add(size * _steps(had) ** STEEP, of_late)
+        self._way.add(took / size, of_late)
+        self._age.add(age, of_late)
+        self._took.add(took, of_late)
+        self._follow(seconds)
+
+    def _learn(self, busy: float) -> None:
+        """See how many frames the source gives, where neither the way nor this is the bound."""
+        came = self._flow.frames / self._flow.seconds
+        if busy < BUSY_SHARE and (
+            self._fps >= self._rates[1] or came * SLOW_SOURCE_FACTOR < self._fps
+        ):
+            self._comes = came
+
+    def _follow(self, seconds: float) -> None:
+        """Go to where the frames are to be: down at once, up slowly."""
+        least, best = self._qualities
+        wanted, wanted_fps, why = self._wanted()
+        quality = min(best, max(least, _quality(self._weight.value / wanted)))
+        grows = self._rise ** min(seconds, STEADY_AVERAGING_TIME)
+        if wanted_fps < self._fps * (1 - MIN_DEVIATION_SHARE):
+            self._fps, self._rise = wanted_fps, MAX_RISE_PER_SECOND
+        elif wanted_fps > self._fps:
+            self._fps = min(wanted_fps, self._fps * grows)
+        has = self._bytes(self._quality)
+        if wanted < has * (1 - MIN_DEVIATION_SHARE) and quality < self._quality:
+            self._quality, self._rise = quality, MAX_RISE_PER_SECOND
+        elif wanted > has * (1 + MIN_DEVIATION_SHARE) and self._fps >= self._rates[1]:
+            slowly = _quality(self._weight.value / (has * grows))
+            self._quality = max(self._quality, min(quality, slowly))
+        if why in {"bit rate", "latency"}:
+            if self._fps < self._rates[1]:  # on its way back
+                why = f"{why}, at the lowest quality"
+            elif self._quality >= best:
+                why = "the best quality"
+        self._why = why
+        self._tell()
+
+    def _wanted(self) -> tuple[float, float, str]:
+        """Return the bytes of a frame, frames a second, and why."""
+        fewest, most = self._rates
+        smallest = self._bytes(self._qualities[0])
+        found: list[tuple[float, float, str]] = []
+        if self._bitrate is not None:
+            comes = min(most, max(fewest, self._comes or most))
+            found.append((self._bitrate / 8 / comes, self._bitrate / 8 / smallest, "bit rate"))
+        if self._latency is not None:
+            size = max(1.0, (self._latency - self._age.value) / self._way.value)
+            found.append(
+                (size, max(most * size / smallest, FREE_SHARE / self._took.value), "latency")
+            )
+        size, _, name = min(found)
+        if size >= smallest:
+            return size, most, name
+        fps = min(fps for one, fps, _ in found if one < smallest)
+        if fps < fewest:
+            return size, fewest, f"{name}: no frame may be smaller, nor fewer"
+        return size, min(most, fps), f"{name}, at the lowest quality"
+
+    def _bytes(self, quality: float) -> float:
+        return self._weight.value / float(_steps(quality) ** STEEP)
+
+    def _tell(self) -> None:
+        back = self._fps == self._rates[1] != self._told_fps
+        if back or not 1 / LOGGED_CHANGE_FACTOR < self._fps / self._told_fps < LOGGED_CHANGE_FACTOR:
+            self._told_fps = self._fps
+            logger.info("frames: %.3g a second at most: %s", self._fps, self._why)
+
+
+def _steps(quality: float) -> float:
+    """Return the coarseness of a JPEG's steps, 1 at quality 50 (as libjpeg defines it)."""
+    return 50 / quality if quality < 50 else max(0.02, (100 - quality) / 50)
+
+
+def _quality(weight: float) -> float:
+    """Return the quality whose steps, to the power that bytes go with, are ``weight``."""
+    steps = float(max(1e-3, weight) ** (1 / STEEP))
+    return 50 / steps if steps > 1 else 100 - 50 * steps
+
+
+def _check(
+    bitrate: float | None,
+    latency: float | None,
+    quality: tuple[int, int],
+    fps: tuple[float, float],
+) -> None:
+    if bitrate is None and latency is None:
+        raise ConfigurationError("RateControl: expected a bit rate or a latency, got neither")
+    _check_pair(quality, "quality")
+    _check_pair(fps, "fps")
+    for name, value, least, most in (
+        ("bitrate", bitrate, 1e3, 1e11),
+        ("latency", latency, 1e-3, 60.0),
+        ("quality", quality[0], 1, quality[1]),
+        ("quality", quality[1], 1, 100),
+        ("fps", fps[0], 0.01, fps[1]),
+        ("fps", fps[1], 0.01, 1000.0),
+    ):
+        if value is not None:
+            check_number(value, name, least, most, "RateControl")
+
+
+def _check_pair(value: tuple[float, float], name: str) -> None:
+    """Check that both are numbers; which range they have says who calls."""
+    if not isinstance(value, tuple) or len(value) != 2:
+        raise wrong_argument(name, "the least and the most, a pair", value, "RateControl")
+    for one in value:
+        check_number(one, name, 0, 1e9, "RateControl")

@@ -1,0 +1,180 @@
+"""Encoded frames of payloads: whole ones, or none."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+START, END = 0x80, 0x40
+"""Bits of a part's head: the first part of a unit, and the last one."""
+
+START_CODE: Final = b"\0\0\0\1"
+
+MAX_ACCESS_UNIT_BYTES: Final = 16 << 20
+"""Bytes of an access unit: one that is larger is damaged."""
+
+
+class AccessUnit(NamedTuple):
+    """One encoded frame that came whole.
+
+    Attributes:
+        data: as in a file (annex B, or a JPEG).
+        timestamp: ticks of 90 kHz.
+        lost: packets that were lost since the last one that came whole.
+        damaged: frames since then that did not come whole, as far as one saw something of them.
+        arrived: when its first packet did, as it was told; 0.0 where it was not.
+        begins: whether it is the first one of a stream: nothing before it belongs to that.
+    """
+
+    data: bytes
+    timestamp: int
+    lost: int = 0
+    damaged: int = 0
+    arrived: float = 0.0
+    begins: bool = False
+
+
+class OpenUnit(ABC):
+    """An access unit that packets are still to come for.
+
+    Attributes:
+        whole: nothing of it is missing so far.
+        has_picture: whether a part of the picture came, and not parameters alone.
+        parts: what came, in order.
+    """
+
+    def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
+        self.timestamp, self.whole, self.arrived = timestamp, whole, arrived
+        self.parts: list[bytes] = []
+        self.size = 0
+        self.has_picture = False
+
+    def add(self, payload: bytes) -> None:
+        """Take what a packet has; what cannot be makes it damaged."""
+        if self.whole:
+            self.size += len(payload) + len(START_CODE)
+            self.whole = self.size <= MAX_ACCESS_UNIT_BYTES and (
+                not payload or self._added(payload)
+            )
+        if not self.whole:
+            self.parts.clear()
+
+    def ended(self) -> bool:
+        """Return True if the unit is whole and no part of it is still to come."""
+        return self.whole and bool(self.parts)
+
+    def data(self) -> bytes:
+        """Return the encoded frame."""
+        return b"".join(self.parts)
+
+    @abstractmethod
+    def _added(self, payload: bytes) -> bool:
+        """Take a payload, which has bytes; return False if it cannot be."""
+
+
+class UnitKind(Protocol):
+    """The kind of unit that is made of a stream's payloads."""
+
+    def open(self, timestamp: int, whole: bool, arrived: float, /) -> OpenUnit:
+        """Return a new access unit."""
+        ...
+
+    def begins(self, payload: bytes, /) -> bool:
+        """Return True if a packet is surely the first one of a frame."""
+        ...
+
+
+class NalUnit(OpenUnit):
+    """An access unit of H.264's kind: of units, several in a packet or one in parts."""
+
+    HEAD: ClassVar[int]
+    """Bytes before a unit's content."""
+    SEVERAL: ClassVar[int]
+    """Kind of a packet with several units."""
+    PART: ClassVar[int]
+    """Kind of a packet with a part of a unit."""
+
+    def __init__(self, timestamp: int, whole: bool, arrived: float) -> None:
+        super().__init__(timestamp, whole, arrived)
+        self._part_of = -1  # kind of the unit whose parts come
+
+    @staticmethod
+    @abstractmethod
+    def kind_of(head: int) -> int:
+        """Return a unit's kind by its first byte; -1: there is no such unit."""
+
+    @staticmethod
+    @abstractmethod
+    def is_picture(kind: int) -> bool:
+        """Return True if units of a kind are parts of the picture."""
+
+    @classmethod
+    @abstractmethod
+    def whole_head(cls, payload: bytes) -> bytes:
+        """Return the head of the unit that a packet has a part of."""
+
+    @classmethod
+    def leading(cls, access_unit: bytes) -> Iterator[bytes]:
+        """Yield the units before a frame's picture and the first of the picture, without codes."""
+        place = access_unit.find(b"\0\0\1")
+        while place >= 0:
+            after = access_unit.find(b"\0\0\1", place + 3)
+            unit = access_unit[place + 3 : after if after >= 0 else len(access_unit)].rstrip(b"\0")
+            kind = cls.kind_of(unit[0]) if len(unit) >= cls.HEAD else -1
+            if kind >= 0:
+                yield unit
+            if cls.is_picture(kind):
+                return
+            place = after
+
+    def ended(self) -> bool:
+        """Return True if the unit is whole and no part of it is still to come."""
+        return super().ended() and self._part_of < 0
+
+    def _added(self, payload: bytes) -> bool:
+        kind = self.kind_of(payload[0])
+        if kind == self.PART:
+            return self._part(payload)
+        if self._part_of >= 0:
+            return False
+        if kind == self.SEVERAL:
+            return self._several(payload)
+        return self._unit(payload)
+
+    def _unit(self, unit: bytes) -> bool:
+        kind = self.kind_of(unit[0]) if len(unit) >= self.HEAD else -1
+        if not 0 <= kind < self.SEVERAL:
+            return False
+        self.has_picture |= self.is_picture(kind)
+        self.parts += (START_CODE, unit)
+        return True
+
+    def _several(self, payload: bytes) -> bool:
+        place = self.HEAD
+        while place < len(payload):
+            end = place + 2 + int.from_bytes(payload[place : place + 2], "big")
+            if end > len(payload) or not self._unit(payload[place + 2 : end]):
+                return False
+            place = end
+        return len(payload) > self.HEAD
+
+    def _part(self, payload: bytes) -> bool:
+        if len(payload) < self.HEAD + 2:
+            return False
+        head = self.whole_head(payload)
+        second, kind = payload[self.HEAD], self.kind_of(head[0])
+        start = bool(second & START)
+        if start != (self._part_of < 0) or (start and second & END):
+            return False
+        if not 0 <= kind < self.SEVERAL or (not start and kind != self._part_of):
+            return False
+        if start:
+            self.has_picture |= self.is_picture(kind)
+            self.parts += (START_CODE, head)
+        self.parts.append(payload[self.HEAD + 1 :])
+        self._part_of = -1 if second & END else kind
+        return True

@@ -1,0 +1,301 @@
+"""Encoded frames of a stream become frames of a source, with an account of the others."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._frame import Frame, Moment
+from smartcam.frames._pixels.formats import find_format
+
+if TYPE_CHECKING:
+    from smartcam.frames._codecs.h264 import H264Decoder
+    from smartcam.frames._driver import FrameSink
+    from smartcam.frames._streaming.rtp.assembling import AccessUnit
+    from smartcam.frames._streaming.rtp.codings import Coding
+
+
+WAITING: Final = 16
+"""Encoded frames that wait for the decoder; what comes beyond ends with a key frame."""
+
+MAX_UNDECODABLE_FRAMES: Final = 10
+"""Encoded frames in a row that cannot be decoded, from which on it may end with the reason."""
+
+FAILURE_GRACE: Final = 3.0
+"""Seconds for which they must come before it ends: they may be a stranger's, who was first."""
+
+
+DRAIN_TIMEOUT: Final = 5.0
+"""Seconds that frames which wait may take to be decoded when a stream has ended."""
+
+DRAIN_LOOK_INTERVAL: Final = 0.005
+"""Seconds between two looks whether what waits at a stream's end was decoded."""
+
+
+class UnitSource(Protocol):
+    """The source of encoded frames, as their decoding sees it."""
+
+    def utc(self, timestamp: int, /) -> float | None:
+        """Return a time on the sender's wall clock, where it told."""
+        ...
+
+    def want_picture(self) -> None:
+        """Ask for a key frame."""
+        ...
+
+    def shown(self) -> None:
+        """Take that a picture could be decoded."""
+        ...
+
+
+class DecodingPlan(NamedTuple):
+    """The plan by which frames are made of a stream.
+
+    Attributes:
+        name: of the source.
+        coding: of the stream.
+        delay: longest time from exposure to arrival, seconds.
+        size: size that the pictures must have; None: any.
+        sets: parameters of the codec that were told beside the stream, as in a file.
+        to: pixel format of FFmpeg that pictures are converted to; "": as they are.
+        passed_on: whether encoded frames are handed on as they came.
+    """
+
+    name: str
+    coding: Coding
+    delay: float
+    size: tuple[int, int] | None = None
+    sets: bytes = b""
+    to: str = ""
+    passed_on: bool = False
+
+
+class UnitDecoding:
+    """The decoding of a stream while a driver streams.
+
+    Args:
+        plan: how.
+        sink: takes the frames, and what it ends with.
+    """
+
+    def __init__(self, plan: DecodingPlan, sink: FrameSink) -> None:
+        self._plan, self._sink, self._name = plan, sink, plan.name
+        self._size = plan.size or (plan.coding.size_in(plan.sets) if plan.sets else None)
+        self._loop = asyncio.get_running_loop()
+        self._units: collections.deque[tuple[AccessUnit, float | None]] = collections.deque()
+        self._came = asyncio.Event()
+        self.overflows = 0
+        self._source: UnitSource | None = None
+        self._skipped = 0  # units that were thrown away since the last one was decoded
+        self._anew = True  # that what comes is another stream than what was decoded
+        self._reorders = False
+        self._pace = _UnitPace()
+        self._missed = self._number = 0
+        self._failed = 0  # frames in a row that could not be decoded
+        self._failing_since = 0.0
+        self._shown = False
+        self._ended = False
+        self._codecs = Codecs(threads=1)
+        self._task: asyncio.Task[None] | None = None
+
+    async def begin(self, source: UnitSource) -> None:
+        """Decode what comes from a source."""
+        self._source = source
+        await self._codecs.__aenter__()
+        self._task = asyncio.create_task(self._decode(), name=f"frames of {self._name}")
+
+    async def end(self) -> None:
+        """End all; the sink hears no more."""
+        self._ended = True
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+        try:
+            if task is not None:
+                await asyncio.wait([task])
+        finally:
+            await self._codecs.close()
+
+    def over(self, error: FrameSourceError) -> None:
+        """Tell the sink that nothing more comes, once."""
+        if not self._ended:
+            self._ended = True
+            error.source = self._name
+            if self._missed and self._shown:
+                self._sink.lost(self._missed)
+            self._sink.ended(error)
+
+    async def finish(self, error: FrameSourceError) -> None:
+        """Tell the sink that nothing more comes, when the frames that wait were decoded.
+
+        It waits for them no longer than :data:`DRAIN_TIMEOUT`.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(DRAIN_TIMEOUT):
+                while self._units and not self._ended:  # noqa: ASYNC110 - no event says so
+                    await asyncio.sleep(DRAIN_LOOK_INTERVAL)
+        self.over(error)
+
+    def take(self, units: list[AccessUnit]) -> None:
+        """Have encoded frames wait for the decoder, all or none."""
+        source = self._source
+        assert source is not None  # noqa: S101 - nothing comes before it begins
+        self._units += [(one, source.utc(one.timestamp)) for one in units]
+        if len(self._units) > WAITING:
+            self.overflows += 1
+            self._skipped += len(self._units)
+            self._missed += sum(self._pace.lost(one) for one, _ in self._units)
+            self._anew |= any(one.begins for one, _ in self._units)
+            self._units.clear()
+            source.want_picture()
+        self._came.set()
+
+    async def _decode(self) -> None:
+        try:
+            await self._decode_all()
+        except FrameSourceError as error:
+            self.over(error)
+        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+            failed = FrameSourceError(f"{self._name}: {exc!r}")
+            failed.__cause__ = exc
+            self.over(failed)
+
+    async def _decode_all(self) -> None:
+        decoder = self._decoder()
+        while not self._ended:
+            if not self._units:
+                self._came.clear()
+                await self._came.wait()
+                continue
+            unit, device_time = self._units.popleft()
+            begins = unit.begins or self._anew
+            behind = not begins and self._pace.goes_back(unit)
+            missing = self._pace.lost(unit) + self._skipped
+            self._missed += missing
+            if behind and not self._reorders:
+                self._reorders = begins = True
+            if begins:
+                decoder = self._decoder()
+                unit = self._with_sets(unit)
+            elif missing:
+                decoder.lost()
+            self._skipped, self._anew = 0, False
+            await self._give(decoder, unit, device_time)
+
+    def _decoder(self) -> H264Decoder:
+        run = self._codecs._run  # noqa: SLF001 - as the decoders that the codecs give out
+        return self._plan.coding.decoder(run, reorders=self._reorders, to=self._plan.to)
+
+    def _with_sets(self, unit: AccessUnit) -> AccessUnit:
+        if not self._plan.sets or self._plan.coding.size_in(unit.data) is not None:
+            return unit
+        return unit._replace(data=self._plan.sets + unit.data)
+
+    async def _give(
+        self, decoder: H264Decoder, unit: AccessUnit, device_time: float | None
+    ) -> None:
+        """Have an encoded frame decoded, and hand its picture on."""
+        frame = self._frame(unit, device_time)
+        if frame is not None and not self._plan.passed_on:
+            frame = await self._decoded(decoder, frame)
+        if frame is not None:
+            self._show(frame)
+        elif not (self._reorders and decoder.whole):  # there it waits for another one
+            self._missed += 1
+            if self._source is not None:
+                self._source.want_picture()
+
+    def _frame(self, unit: AccessUnit, device_time: float | None) -> Frame | None:
+        """Return an encoded frame; None: its size is not known yet."""
+        size = self._size = self._plan.coding.size_in(unit.data) or self._size
+        if size is None:
+            return None
+        if self._plan.size not in (None, size):
+            raise FrameFormatError(
+                f"{self._name}: expected pictures of {_shown(self._plan.size)}, as it was opened, "
+                f"got {_shown(size)}: open it anew",
+                available=(_shown(size),),
+            )
+        passed = self._loop.time() - unit.arrived
+        return Frame(
+            data=unit.data,
+            format=find_format(self._plan.coding.format),
+            width=size[0],
+            height=size[1],
+            stride=0,
+            captured=time.monotonic() - passed,
+            utc=time.time() - passed,
+            moment=Moment.ARRIVAL,
+            duration=self._plan.delay,
+            device_time=device_time,
+            sequence=0,
+            source=self._name,
+        )
+
+    async def _decoded(self, decoder: H264Decoder, frame: Frame) -> Frame | None:
+        try:
+            decoded = await decoder.decode(frame)
+        except FrameFormatError as exc:  # one may be damaged; if all are it is something else
+            self._failed += 1
+            if self._failed == 1:
+                self._failing_since = self._loop.time()
+            late = self._loop.time() - self._failing_since >= FAILURE_GRACE
+            if self._failed < MAX_UNDECODABLE_FRAMES or not late:
+                return None
+            raise FrameFormatError(f"{self._name}: {exc}", available=exc.available) from exc
+        self._failed = 0
+        return decoded
+
+    def _show(self, picture: Frame) -> None:
+        if self._source is not None:
+            self._source.shown()
+        lost, self._missed = self._missed if self._shown else 0, 0
+        self._shown = True
+        self._number += 1 + lost
+        if not self._ended:
+            self._sink.frame(replace(picture, sequence=self._number, lost=lost))
+
+
+class _UnitPace:
+    """The distance of encoded frames, which tells how many a gap had."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+        self._step = 0  # ticks between the last two that followed each other
+
+    def goes_back(self, unit: AccessUnit) -> bool:
+        """Return True if a frame is to be shown before one that came before it."""
+        return self._last is not None and -STEP_MOST < self._since(unit) < 0
+
+    def lost(self, unit: AccessUnit) -> int:
+        """Return the number of frames lost before this one, as far as that can be known.
+
+        Of a gap in which whole frames vanished it is as many as fit into the time, at the pace of
+        the frames before, and no more than packets are missing.
+        """
+        since = 0 if self._last is None or unit.begins else self._since(unit)
+        least = max(unit.damaged, 1 if unit.lost or unit.begins else 0)
+        if not least and 0 < since < STEP_MOST:
+            self._step = since
+        if self._last is None or since >= 0:
+            self._last = unit.timestamp
+        fits = round(since / self._step) - 1 if self._step and since > 0 else 0
+        return max(least, min(fits, unit.damaged + unit.lost))
+
+    def _since(self, unit: AccessUnit) -> int:
+        since = unit.timestamp - (self._last or 0)
+        return (since + 0x8000_0000 & 0xFFFF_FFFF) - 0x8000_0000
+
+
+STEP_MOST: Final = 60 * 90_000
+"""Ticks between two frames: further apart they are not of one pace."""
+
+
+def _shown(size: tuple[int, int] | None) -> str:
+    return "any size" if size is None else f"{size[0]}x{size[1]}"

@@ -1,0 +1,225 @@
+"""Encoded frames of one stream's packets: in order, each once, with an account of gaps."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from smartcam.frames._streaming.rtp.assembling import AccessUnit
+from smartcam.frames._streaming.rtp.h264 import H264Units
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.frames._streaming.rtp.assembling import OpenUnit, UnitKind
+    from smartcam.frames._streaming.rtp.packets import RtpPacket
+
+
+WINDOW: Final = 64
+"""Packets that may wait for an earlier one that is missing."""
+
+MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
+"""Packets: a sequence number further off is a stream that began anew, if a second one follows."""
+
+PROOFS: Final = 2
+"""Frames behind whose marker another timestamp followed, after which markers are believed."""
+
+
+class Depacketizer:
+    """Makes encoded frames of one stream's packets: whole ones, in order, each once.
+
+    Packets may come late, twice, or not at all. One that is missing is waited for until ``window``
+    packets came after it, or until it is told that it took too long: :meth:`give_up`.
+    Another SSRC is a new stream.
+
+    A frame ends with the packet that has the marker. Some senders put markers on each slice or
+    unit: who is wary waits until :data:`PROOFS` frames showed that the marker is right, or until
+    :meth:`end_marked`; behind a wrong one frames end with the next timestamp. Parameters without a
+    picture belong to the next frame, whatever their marker and timestamp.
+
+    Args:
+        window: packets.
+        kind: of the payloads.
+        wary: whether the marker is to prove itself first.
+
+    Attributes:
+        lost: packets that never came.
+        duplicates: packets that came more than once, or too late.
+        damaged: frames that something was seen of, and that did not come whole.
+        streams: how often a stream began.
+        proofs: frames whose marker was right; :data:`PROOFS` of them are enough.
+    """
+
+    def __init__(
+        self, window: int = WINDOW, kind: UnitKind | None = None, *, wary: bool = False
+    ) -> None:
+        self._window, self._kind = window, kind or H264Units()
+        self._wary = wary
+        self.proofs = 0 if wary else PROOFS
+        self.lost = self.duplicates = self.damaged = self.streams = 0
+        self._ssrc: int | None = None
+        self._told = (0, 0)  # what of lost and damaged the last unit said
+        self._begin()
+
+    def _begin(self) -> None:
+        self._next: int | None = None  # with the wraps counted
+        self._held: dict[int, tuple[RtpPacket, float]] = {}
+        self._open: OpenUnit | None = None
+        self._sure = False  # that the next packet is the first one of a frame
+        self._closed: int | None = None  # timestamp of the last frame that ended
+        self._begins = True  # until a frame is whole
+        self._odd: int | None = None  # what would follow a sequence number that was far off
+        self._marked_at: float | None = None  # when the open frame's marker came, while that waits
+        self._marked = False  # whether the last frame that ended had a marker
+        self._marks_lie = False
+        self._parameters: OpenUnit | None = None  # that came without a picture
+
+    def take(self, packet: RtpPacket, now: float = 0.0) -> list[AccessUnit]:
+        """Take a packet, and return the frames that are whole with it.
+
+        Args:
+            packet: of the stream.
+            now: when it arrived.
+        """
+        if packet.ssrc != self._ssrc:
+            self._damage_open()
+            if self._wary and self._ssrc is not None:
+                self.proofs = 0
+            self._ssrc = packet.ssrc
+            self.streams += 1
+            self._begin()
+        place = self._place(packet.sequence)
+        if place is None:
+            self.duplicates += 1
+            return []
+        self._held[place] = (packet, now)
+        return self._ready(len(self._held) > self._window)
+
+    def missing(self) -> list[int]:
+        """Return the sequence numbers that are waited for."""
+        if not self._held or self._next is None:
+            return []
+        gone = (one for one in range(self._next, max(self._held)) if one not in self._held)
+        return [one & 0xFFFF for one in gone]
+
+    def tail(self) -> int | None:
+        """Return the sequence number that a frame goes on with whose end did not come yet.
+
+        None: none is begun, or others are missing before that.
+        """
+        if self._open is None or not self._open.whole or self._held or self._next is None:
+            return None
+        if self._marked_at is not None:
+            return None
+        return self._next & 0xFFFF
+
+    @property
+    def marked_at(self) -> float | None:
+        """Time of a frame's marker that is not believed yet; None: no frame waits for that."""
+        return None if self._held else self._marked_at
+
+    def end_marked(self, before: float) -> list[AccessUnit]:
+        """Return the frame whose marker came before a moment, and nothing else after that."""
+        marked = self.marked_at
+        return list(self._end()) if marked is not None and marked < before else []
+
+    def waits_since(self) -> float | None:
+        """Return when the first packet came that waits for another; None: none does."""
+        return min((now for _, now in self._held.values()), default=None)
+
+    def give_up(self, before: float) -> list[AccessUnit]:
+        """Return the frames completed by no longer waiting for packets overdue since a moment."""
+        made: list[AccessUnit] = []
+        while (since := self.waits_since()) is not None and since < before:
+            made += self._ready(True)
+        return made
+
+    def _place(self, sequence: int) -> int | None:
+        """Return a packet's number with the wraps counted; None: it came before, or too late."""
+        if self._next is None:
+            self._next = sequence
+        off = (sequence - self._next + 0x8000 & 0xFFFF) - 0x8000
+        if not -MAX_PACKETS_LATE <= off <= MAX_PACKETS_AHEAD:
+            if sequence != self._odd:
+                self._odd = sequence + 1 & 0xFFFF
+                return None
+            self._damage_open()
+            self._begin()
+            self.streams += 1
+            self._next, off = sequence, 0
+        self._odd = None
+        place = self._next + off
+        return None if off < 0 or place in self._held else place
+
+    def _ready(self, at_once: bool) -> list[AccessUnit]:
+        """Return the frames of the packets that nothing is missing before."""
+        made: list[AccessUnit] = []
+        while self._held and self._next is not None:
+            if self._next not in self._held:
+                if not at_once:
+                    break
+                first = min(self._held)
+                self.lost += first - self._next
+                self._gap()
+                self._next = first
+            at_once = False
+            made += self._follow(*self._held.pop(self._next))
+            self._next += 1
+        return made
+
+    def _gap(self) -> None:
+        if self._open is not None:
+            self._open.whole = False
+        self._sure, self._parameters = False, None
+
+    def _follow(self, packet: RtpPacket, now: float) -> Iterator[AccessUnit]:
+        if self._open is not None and self._open.timestamp != packet.timestamp:
+            yield from self._end()
+        elif self._open is not None and self._marked_at is not None and packet.payload:
+            self._marks_lie, self._marked_at, self.proofs = True, None, 0
+        if self._open is None:
+            self._open = self._opened(packet, now)
+        self._open.add(packet.payload)
+        self._sure = True
+        over = self._open.has_picture or not self._open.parts
+        if packet.marker and over and not self._marks_lie:
+            self._marked_at = now
+            if self.proofs >= PROOFS:
+                yield from self._end()
+
+    def _opened(self, packet: RtpPacket, now: float) -> OpenUnit:
+        again = packet.timestamp == self._closed  # the frame was not over
+        self.proofs += self._marked and self._sure and not again
+        if again and self._sure and packet.payload:
+            self._marks_lie, self.proofs = True, 0
+        sure = (self._sure or self._kind.begins(packet.payload)) and not again
+        opened = self._kind.open(packet.timestamp, sure, now)
+        before, self._parameters = self._parameters, None
+        if before is not None and self._sure:
+            opened.parts, opened.size, opened.arrived = before.parts, before.size, before.arrived
+        return opened
+
+    def _end(self) -> Iterator[AccessUnit]:
+        ended, self._open = self._open, None
+        self._marked, self._marked_at = self._marked_at is not None, None
+        if ended is None:
+            return
+        if ended.ended() and not ended.has_picture:
+            self._parameters = ended
+            return
+        self._closed = ended.timestamp
+        if not ended.ended():
+            self.damaged += 1
+            return
+        lost, damaged = self._told
+        self._told = (self.lost, self.damaged)
+        since, begins, self._begins = (
+            (self.lost - lost, self.damaged - damaged),
+            self._begins,
+            False,
+        )
+        yield AccessUnit(ended.data(), ended.timestamp, *since, ended.arrived, begins)
+
+    def _damage_open(self) -> None:
+        if self._open is not None:
+            self._open = None
+            self.damaged += 1

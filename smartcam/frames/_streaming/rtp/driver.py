@@ -1,0 +1,224 @@
+"""H.264 over RTP as a source of frames."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam._extras import load
+from smartcam.exceptions import FrameSourceError, LocalProtocolError
+from smartcam.frames._driver import FrameDriver, FrameSink, StreamFormat
+from smartcam.frames._pixels.formats import find_format
+from smartcam.frames._streaming.rtp.codings import H264
+from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
+from smartcam.frames._streaming.rtp.receiver import RtpStatistics, StreamReceiver
+from smartcam.frames._streaming.rtp.sockets import SocketPair, resolved
+
+if TYPE_CHECKING:
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._streaming.rtp.sockets import Endpoint
+
+
+KNOWN: Final = ("delay", "from", "name", "payload", "repair", "size", "timeout")
+
+
+class RtpDriver(FrameDriver):
+    """H.264 that somebody sends here by RTP: ``rtp://0.0.0.0:5004?size=640x480``.
+
+    The address is one of this machine, or a multicast group, which is joined. RTCP is on the next
+    port.
+
+    ============ =================================================================================
+    ``size``     of the pictures; usual: as the stream says, for which opening waits
+    ``payload``  type of the packets, usual 96; others are dropped
+    ``repair``   seconds that a missing packet is waited for while the sender is asked for it;
+                 usual 0.1, 0: not at all
+    ``timeout``  seconds without a packet after which the sender counts as gone; usual 5
+    ``delay``    longest time from exposure to arrival, seconds; usual 1
+    ``from``     host whose packets alone count; usual: anybody's, of one sender at a time
+    ``name``     of the camera
+    ============ =================================================================================
+
+    Only whole pictures come. What is lost is asked for again (generic NACK), and if it does not
+    come a key frame is (PLI); a sender that knows neither is waited for until its next refresh.
+    ``frame.lost`` counts what was seen to be missing: of a gap in which whole frames vanished, one.
+
+    ``captured`` is when a frame's first packet arrived. As soon as the sender told what its clock
+    says (RTCP sender reports), ``device_time`` is the frame's time on it, in seconds since 1970.
+    """
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        said = address.parameters(KNOWN)
+        number = address.number
+        self._wanted = address.size(said["size"]) if "size" in said else None
+        self._plan = _RtpPlan(
+            said.get("name") or address.shown.partition("?")[0],
+            int(number("payload", said.get("payload", "96"), 0, 127)),
+            number("repair", said.get("repair", "0.1"), 0, 1),
+            number("timeout", said.get("timeout", "5"), 0.1, 600),
+            number("delay", said.get("delay", "1"), 0, 600),
+        )
+        self._from = said.get("from", "")
+        if not address.host or not 1 <= (address.port or 5004) < 65535:
+            raise address.wrong("address", "HOST:PORT with a port below 65535", address.shown)
+        self._where = (address.host, address.port or 5004)
+        self._endpoint: Endpoint | None = None
+        self._stream: _RtpStream | None = None
+
+    @property
+    def name(self) -> str:
+        """The address, or as the URL says."""
+        return self._plan.name
+
+    def statistics(self) -> RtpStatistics:
+        """Return the counts of packets since the driver last began to stream."""
+        return RtpStatistics() if self._stream is None else self._stream.statistics()
+
+    async def open(self) -> StreamFormat:
+        """See that it can be listened to; without a ``size`` wait for a first picture, too.
+
+        Raises:
+            FrameSourceError: the port is in use, no such address, or nothing comes in time.
+            MissingExtraError: the extra ``video`` is not installed.
+        """
+        load("av")
+        self._endpoint = await resolved(*self._where, self.name)
+        if self._from:
+            only = await resolved(self._from, 0, self.name)
+            self._plan = self._plan._replace(only=only.host.partition("%")[0])
+        if self._wanted is not None:
+            self._listening(self._endpoint).close()
+            return StreamFormat(find_format("I420"), *self._wanted)
+        first = FirstPicture()
+        try:
+            await self.start(first)
+            async with asyncio.timeout(self._plan.timeout):
+                frame = await first.came
+        except TimeoutError:
+            raise FrameSourceError(
+                f"{self.name}: expected a whole picture of H.264 with payload type "
+                f"{self._plan.payload} within {self._plan.timeout:g} s, got none: "
+                f"{self.statistics()}",
+                source=self.name,
+            ) from None
+        finally:
+            await self.stop()
+        self._wanted = (frame.width, frame.height)
+        return StreamFormat(frame.format, *self._wanted)
+
+    def _listening(self, endpoint: Endpoint) -> SocketPair:
+        try:
+            return SocketPair.listening(endpoint)
+        except OSError as exc:
+            raise FrameSourceError(
+                f"{self.name}: cannot listen there, and at the next port for RTCP: {exc}",
+                source=self.name,
+            ) from exc
+
+    async def start(self, sink: FrameSink) -> None:
+        """Listen.
+
+        Raises:
+            FrameSourceError: the port is in use.
+        """
+        await self.stop()
+        if self._endpoint is None:
+            raise LocalProtocolError(f"{self.name} is not open")
+        pair = self._listening(self._endpoint)
+        self._stream = stream = _RtpStream(self._plan, self._wanted, pair, sink)
+        await stream.begin()
+
+    async def stop(self) -> None:
+        """Listen no longer."""
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            await stream.end()
+
+    async def close(self) -> None:
+        """Have nothing left. Idempotent."""
+        await self.stop()
+
+
+class FirstPicture(FrameSink):
+    """Takes one picture."""
+
+    def __init__(self) -> None:
+        self.came: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
+
+    def frame(self, frame: Frame) -> None:
+        if not self.came.done():
+            self.came.set_result(frame)
+
+    def lost(self, count: int) -> None:
+        pass
+
+    def ended(self, error: FrameSourceError | None) -> None:
+        if error is not None and not self.came.done():
+            self.came.set_exception(error)
+            self.came.exception()  # nobody may wait any longer
+
+
+class _RtpPlan(NamedTuple):
+    """The options that the URL gives."""
+
+    name: str
+    payload: int
+    repair: float
+    timeout: float
+    delay: float
+    only: str = ""  # address of the sender's host; "": anybody's
+
+
+class _RtpStream:
+    """The tasks and sockets of a driver while it streams.
+
+    Args:
+        size: of the pictures; None: as the stream says.
+    """
+
+    def __init__(
+        self, plan: _RtpPlan, size: tuple[int, int] | None, pair: SocketPair, sink: FrameSink
+    ) -> None:
+        self._plan, self._watched = plan, size is not None
+        self._decoding = UnitDecoding(DecodingPlan(plan.name, H264, plan.delay, size), sink)
+        self._watching: asyncio.Task[None] | None = None
+        self._receiver = StreamReceiver(
+            pair, plan.payload, plan.repair, self._decoding.take, self._gone, plan.only
+        )
+
+    async def begin(self) -> None:
+        """Decode what comes."""
+        await self._decoding.begin(self._receiver)
+        if self._watched:  # who opens it has a timeout of its own, and says more
+            name = f"silence of {self._plan.name}"
+            self._watching = asyncio.create_task(self._watch(), name=name)
+
+    async def end(self) -> None:
+        """End all; the sink hears no more."""
+        self._receiver.close()
+        watching, self._watching = self._watching, None
+        if watching is not None:
+            watching.cancel()
+        try:
+            if watching is not None:
+                await asyncio.wait([watching])
+        finally:
+            await self._decoding.end()
+
+    def statistics(self) -> RtpStatistics:
+        """Return the counts of packets received."""
+        return self._receiver.statistics(self._decoding.overflows)
+
+    def _gone(self, reason: str) -> None:
+        why = f" ({reason})" if reason else ""
+        self._decoding.over(FrameSourceError(f"{self._plan.name}: the sender said goodbye{why}"))
+
+    async def _watch(self) -> None:
+        receiver, longest = self._receiver, self._plan.timeout
+        loop = asyncio.get_running_loop()
+        while (left := receiver.heard + longest - loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(left)
+        text = f"{self._plan.name}: no packet came for {self._plan.timeout:g} s"
+        self._decoding.over(FrameSourceError(text))

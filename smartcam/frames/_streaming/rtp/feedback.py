@@ -1,0 +1,141 @@
+"""Read and write a receiver's reports: its name, its losses, the packets that it wants again."""
+
+from __future__ import annotations
+
+import collections
+import time
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from smartcam.frames._streaming.rtp.packets import ReceiverReport, ReportBlock
+from smartcam.frames._streaming.rtp.parameters import CLOCK_RATE
+from smartcam.frames._streaming.rtp.reception import middle, ntp_time
+
+RECEIVER_TIMEOUT: Final = 10.0
+"""Seconds after which a receiver that no longer reports is forgotten."""
+
+MAX_RECEIVERS: Final = 64
+
+REMEMBERED: Final = 1024
+"""Packets that are kept to be sent again on request."""
+
+MAX_RESEND_AGE: Final = 0.2
+"""Seconds after which a packet is not sent again: its picture would be late."""
+
+RESENT: Final = 5
+"""Times that one packet is sent again at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class RtpReceiver:
+    """The last report of a receiver.
+
+    Attributes:
+        address: address that the receiver reports from, ``HOST:PORT``.
+        loss: share of the packets lost since the report before, 0 to 1.
+        lost: packets lost since the beginning, less those that came when sent again.
+        jitter: jitter of the arrival, seconds.
+        round_trip: seconds there and back; None: not known.
+        age: seconds since the receiver was last heard.
+    """
+
+    address: str
+    loss: float
+    lost: int
+    jitter: float
+    round_trip: float | None
+    age: float
+
+
+class _HeardReceiver(NamedTuple):
+    address: str
+    block: ReportBlock
+    round_trip: float | None
+    at: float
+
+
+class Audience:
+    """The receivers of a stream.
+
+    Args:
+        ssrc: the stream's.
+    """
+
+    def __init__(self, ssrc: int) -> None:
+        self._nothing = ReportBlock(ssrc, 0, 0, 0, 0)
+        self._heard: dict[int, _HeardReceiver] = {}
+
+    def report(self, report: ReceiverReport, address: str) -> bool:
+        """Take a report; return True if it is the first of its receiver."""
+        now = time.monotonic()
+        self._forget(now)
+        new = report.ssrc not in self._heard
+        if new and len(self._heard) >= MAX_RECEIVERS:
+            return False
+        known = self._heard.get(report.ssrc, _HeardReceiver(address, self._nothing, None, now))
+        block = next((one for one in report.blocks if one.ssrc == self._nothing.ssrc), None)
+        if block is not None:  # what is asked for in a hurry comes without
+            known = _HeardReceiver(address, block, _round_trip(block), now)
+        self._heard[report.ssrc] = known._replace(at=now)
+        return new
+
+    def left(self, ssrc: int) -> None:
+        """Forget a receiver that said goodbye."""
+        self._heard.pop(ssrc, None)
+
+    def receivers(self) -> tuple[RtpReceiver, ...]:
+        """Return the receivers that still report."""
+        now = time.monotonic()
+        self._forget(now)
+        return tuple(
+            RtpReceiver(
+                one.address,
+                one.block.fraction / 256,
+                one.block.lost,
+                one.block.jitter / CLOCK_RATE,
+                one.round_trip,
+                now - one.at,
+            )
+            for one in self._heard.values()
+        )
+
+    def _forget(self, now: float) -> None:
+        self._heard = {
+            ssrc: one for ssrc, one in self._heard.items() if now - one.at < RECEIVER_TIMEOUT
+        }
+
+
+def _round_trip(block: ReportBlock) -> float | None:
+    """Return RFC 3550's round-trip time, seconds, where a sender report came back."""
+    if not block.last_report:
+        return None
+    ticks = middle(ntp_time(time.time())) - block.last_report - block.delay & 0xFFFF_FFFF
+    return ticks / 65536 if ticks < 1 << 31 else 0.0  # below 0 by a clock that was set
+
+
+class _SentPacket:
+    __slots__ = ("at", "data", "times")
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.times, self.at = data, 0, time.monotonic()
+
+
+class PacketHistory:
+    """The packets of the last moments."""
+
+    def __init__(self) -> None:
+        self._sent: collections.OrderedDict[int, _SentPacket] = collections.OrderedDict()
+
+    def sent(self, sequence: int, data: bytes) -> None:
+        """Remember a packet."""
+        self._sent[sequence] = _SentPacket(data)
+        if len(self._sent) > REMEMBERED:
+            self._sent.popitem(last=False)
+
+    def again(self, sequence: int) -> bytes | None:
+        """Return a packet that is to be sent again; None: it is too old, or was too often."""
+        found = self._sent.get(sequence)
+        if found is None or found.times >= RESENT or time.monotonic() - found.at > MAX_RESEND_AGE:
+            return None
+        found.times += 1
+        return found.data

@@ -1,0 +1,204 @@
+"""H.264 in RTP packets and back (RFC 6184, packetization mode 1)."""
+
+from __future__ import annotations
+
+import secrets
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+from smartcam.frames._streaming.rtp.assembling import END, START, NalUnit
+from smartcam.frames._streaming.rtp.packets import RtpPacket
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+MTU_PAYLOAD: Final = 1380
+"""Bytes of a packet behind its 12: with UDP, IP and a tunnel they fit into Ethernet's 1500."""
+
+SLICES, KEY, SPS, PPS, DELIMITER = range(1, 6), 5, 7, 8, 9
+"""Kinds of units (ITU-T H.264, table 7-1)."""
+
+STAP_A, FU_A = 24, 28
+"""Kinds of payloads: several units in a packet, and a part of one."""
+
+
+def units(access_unit: bytes) -> list[bytes]:
+    """Return the units of an encoded frame, without start codes.
+
+    Args:
+        access_unit: as in a file (ITU-T H.264, annex B).
+
+    Raises:
+        FrameFormatError: it begins with none, or has one that cannot be.
+    """
+    data = bytes(access_unit)
+    place = data.find(b"\0\0\1")
+    if place < 0 or data[:place].strip(b"\0"):
+        raise _wrong("a start code first", data)
+    found = []
+    while place >= 0:
+        after = data.find(b"\0\0\1", place + 3)
+        unit = data[place + 3 : after if after >= 0 else len(data)].rstrip(b"\0")
+        if not unit or unit[0] & 0x80 or not 1 <= unit[0] & 0x1F < STAP_A:
+            raise _wrong("units of kinds 1 to 23", unit)
+        found.append(unit)
+        place = after
+    return found
+
+
+def parameter_sets(access_unit: bytes) -> tuple[bytes, bytes] | None:
+    """Return the sequence's and the picture's parameters; None where one of them is not in it.
+
+    Raises:
+        FrameFormatError: as :func:`units`.
+    """
+    by_kind = {unit[0] & 0x1F: unit for unit in units(access_unit)}
+    if SPS not in by_kind or PPS not in by_kind:
+        return None
+    return by_kind[SPS], by_kind[PPS]
+
+
+class H264Packetizer:
+    """Makes the packets of one stream.
+
+    Args:
+        payload_type: 0 to 127; what has no number of its own takes 96 to 127.
+        ssrc: of the stream; None: a random one.
+        sequence: of the first packet; None: a random one.
+        mtu_payload: bytes of a packet's payload.
+
+    Attributes:
+        packets_made: since the beginning.
+        octets_made: of their payloads.
+
+    Raises:
+        ConfigurationError: a number out of its range.
+    """
+
+    def __init__(
+        self,
+        payload_type: int = 96,
+        ssrc: int | None = None,
+        sequence: int | None = None,
+        mtu_payload: int = MTU_PAYLOAD,
+    ) -> None:
+        ssrc = secrets.randbits(32) if ssrc is None else ssrc
+        sequence = secrets.randbits(16) if sequence is None else sequence
+        for name, value, least, most in (
+            ("payload_type", payload_type, 0, 127),
+            ("ssrc", ssrc, 0, 0xFFFFFFFF),
+            ("sequence", sequence, 0, 0xFFFF),
+            ("mtu_payload", mtu_payload, 64, 65_000),
+        ):
+            if not least <= value <= most:
+                raise ConfigurationError(f"RTP: {name}: expected {least} to {most}, got {value!r}")
+        self.payload_type, self.ssrc, self._mtu = payload_type, ssrc, mtu_payload
+        self._sequence = sequence
+        self.packets_made = self.octets_made = 0
+
+    @property
+    def sequence(self) -> int:
+        """The next packet's."""
+        return self._sequence
+
+    def packets(self, access_unit: bytes, timestamp: int) -> list[bytes]:
+        """Return an encoded frame's packets; the last one has the marker.
+
+        Args:
+            access_unit: one encoded frame, as in a file (annex B).
+            timestamp: of the frame, in ticks of 90 kHz; its lower 32 bits count.
+
+        Raises:
+            FrameFormatError: it is no encoded frame; no sequence number was used.
+        """
+        payloads = [
+            part for group in self._groups(units(access_unit)) for part in self._payloads(group)
+        ]
+        made: list[bytes] = []
+        for payload in payloads:
+            last = len(made) == len(payloads) - 1
+            head = (last, self.payload_type, self._sequence, timestamp & 0xFFFFFFFF, self.ssrc)
+            made.append(RtpPacket(*head, payload).pack())
+            self._sequence = self._sequence + 1 & 0xFFFF
+        self.packets_made += len(made)
+        self.octets_made += sum(map(len, payloads))
+        return made
+
+    def _groups(self, found: list[bytes]) -> Iterator[list[bytes]]:
+        """Yield the units that go together: parameter sets and messages, as far as they fit."""
+        group: list[bytes] = []
+        for unit in found:
+            fits = 1 + sum(2 + len(one) for one in (*group, unit)) <= self._mtu
+            if group and (unit[0] & 0x1F in SLICES or not fits):
+                yield group
+                group = []
+            group.append(unit)
+            if unit[0] & 0x1F in SLICES:
+                yield group
+                group = []
+        if group:
+            yield group
+
+    def _payloads(self, group: list[bytes]) -> Iterator[bytes]:
+        first = group[0]
+        if len(group) > 1:
+            importance = max(unit[0] & 0x60 for unit in group)
+            sized = (len(unit).to_bytes(2, "big") + unit for unit in group)
+            yield bytes((importance | STAP_A,)) + b"".join(sized)
+        elif len(first) <= self._mtu:
+            yield first
+        else:
+            room = self._mtu - 2
+            for at in range(1, len(first), room):
+                start, end = START * (at == 1), END * (at + room >= len(first))
+                second = start | end | first[0] & 0x1F
+                yield bytes((first[0] & 0x60 | FU_A, second)) + first[at : at + room]
+
+
+class H264Unit(NalUnit):
+    """An access unit of H.264."""
+
+    HEAD, SEVERAL, PART = 1, 24, 28
+
+    @staticmethod
+    def kind_of(head: int) -> int:
+        """Return a unit's kind."""
+        return -1 if head & 0x80 or not head & 0x1F else head & 0x1F
+
+    @staticmethod
+    def is_picture(kind: int) -> bool:
+        """Return True for slices."""
+        return kind in SLICES
+
+    @classmethod
+    def whole_head(cls, payload: bytes) -> bytes:
+        """Return the head of the unit that a packet has a part of."""
+        return bytes((payload[0] & 0xE0 | payload[1] & 0x1F,))
+
+
+class H264Units:
+    """The kind of a stream of H.264."""
+
+    open = H264Unit
+
+    @staticmethod
+    def begins(payload: bytes) -> bool:
+        """Return True if a packet has what only begins frames, or a key frame's first slice."""
+        kind = payload[0] & 0x1F if payload else 0
+        if kind == STAP_A and len(payload) > 3:
+            payload = payload[3:]
+            kind = payload[0] & 0x1F
+        elif kind == FU_A and len(payload) > 2 and payload[1] & START:
+            payload = payload[1:]
+            kind = payload[0] & 0x1F
+        if kind == KEY:  # its first macroblock's number stands first, and 0 is one bit
+            return len(payload) > 1 and bool(payload[1] & 0x80)
+        return kind in (SPS, DELIMITER)
+
+
+def _wrong(expected: str, got: bytes) -> FrameFormatError:
+    return FrameFormatError(
+        f"H264: expected {expected} (annex B), got {len(got)} bytes that begin with "
+        f"{got[:8].hex(' ') or 'nothing'}"
+    )

@@ -1,0 +1,99 @@
+"""H.265 of RTP packets (RFC 7798), without the numbers of interleaved packets."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from smartcam.frames._streaming.rtp.assembling import NalUnit
+from smartcam.frames._streaming.rtp.parameters import FieldBits, checked_size
+
+VPS, SPS, PPS, DELIMITER = 32, 33, 34, 35
+"""Kinds of units (ITU-T H.265, table 7-1)."""
+
+KEYS: Final = range(16, 24)
+"""Kinds of slices of pictures that refer to none before them."""
+
+_SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
+
+
+class H265Unit(NalUnit):
+    """An access unit of H.265."""
+
+    HEAD, SEVERAL, PART = 2, 48, 49
+
+    @staticmethod
+    def kind_of(head: int) -> int:
+        """Return a unit's kind."""
+        return -1 if head & 0x80 else head >> 1 & 0x3F
+
+    @staticmethod
+    def is_picture(kind: int) -> bool:
+        """Return True for slices."""
+        return 0 <= kind < 32
+
+    @classmethod
+    def whole_head(cls, payload: bytes) -> bytes:
+        """Return the head of the unit that a packet has a part of."""
+        return bytes((payload[0] & 0x81 | (payload[2] & 0x3F) << 1, payload[1]))
+
+
+class H265Units:
+    """The kind of a stream of H.265."""
+
+    open = H265Unit
+
+    @staticmethod
+    def begins(payload: bytes) -> bool:
+        """Return True if a packet has a unit that only begins frames."""
+        kind = H265Unit.kind_of(payload[0]) if payload else -1
+        if kind == H265Unit.SEVERAL and len(payload) > 4:
+            payload = payload[4:]
+            kind = H265Unit.kind_of(payload[0])
+        elif kind == H265Unit.PART and len(payload) > 3 and payload[2] & 0x80:
+            payload = H265Unit.whole_head(payload) + payload[3:]
+            kind = H265Unit.kind_of(payload[0])
+        if kind in KEYS:  # the first slice of a picture says so with its first bit
+            return len(payload) > 2 and bool(payload[2] & 0x80)
+        return kind in (VPS, SPS, DELIMITER)
+
+
+def picture_size(sps: bytes) -> tuple[int, int]:
+    """Return the width and the height of the pictures, in pixels.
+
+    Args:
+        sps: the sequence's parameters, with the two bytes of their head.
+
+    Raises:
+        FrameFormatError: they are none.
+    """
+    return checked_size("H265", sps, lambda: _size(FieldBits(sps[2:257])))
+
+
+def _size(bits: FieldBits) -> tuple[int, int]:
+    bits.fixed(4)
+    layers = bits.fixed(3)
+    bits.fixed(1 + 96)
+    said = [(bits.fixed(1), bits.fixed(1)) for _ in range(layers)]
+    bits.fixed(2 * (8 - layers) if layers else 0)
+    for profile, level in said:
+        bits.fixed(88 * profile + 8 * level)
+    bits.unsigned()
+    colours = bits.unsigned()
+    if colours == 3:
+        bits.fixed(1)
+    width, height = bits.unsigned(), bits.unsigned()
+    crop = [bits.unsigned() for _ in range(4)] if bits.fixed(1) else [0] * 4
+    across, down = _SHARED[colours]
+    return width - across * (crop[0] + crop[1]), height - down * (crop[2] + crop[3])
+
+
+def size_in(access_unit: bytes) -> tuple[int, int] | None:
+    """Return the size of the pictures where an encoded frame has the parameters.
+
+    Raises:
+        FrameFormatError: the parameters are none.
+    """
+    for unit in H265Unit.leading(access_unit):
+        if H265Unit.kind_of(unit[0]) == SPS:
+            return picture_size(unit)
+    return None

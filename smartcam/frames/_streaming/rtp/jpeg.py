@@ -1,0 +1,179 @@
+"""JPEGs of RTP packets (RFC 2435)."""
+
+from __future__ import annotations
+
+import struct
+from typing import Final
+
+from smartcam.frames._streaming.rtp.assembling import OpenUnit
+
+HEAD: Final = 8
+"""Bytes before a packet's piece of a picture."""
+
+RESTARTS: Final = range(64, 128)
+"""Types of pictures with restart markers."""
+
+MAX_QUANTIZATION_TABLES: Final = 64
+"""Sets of quantization tables that are remembered, by their quality."""
+
+_LUMA: Final = (
+    "16 11 12 14 12 10 16 14 13 14 18 17 16 19 24 40 26 24 22 22 24 49 35 37 29 40 58 51 61 60 57 "
+    "51 56 55 64 72 92 78 64 68 87 69 55 56 80 109 81 87 95 98 103 104 103 62 77 113 121 112 100 "
+    "120 92 101 103 99"
+)
+_CHROMA: Final = (
+    "17 18 18 24 21 24 47 26 26 47 99 66 56 66 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 "
+    "99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 99 "
+    "99 99"
+)
+"""Tables of quality 50 in the order of their zigzag (ITU-T T.81, annex K.1)."""
+
+_HUFFMAN: Final = tuple(
+    (place, bytes.fromhex(counts), bytes.fromhex(values))
+    for place, counts, values in (
+        (0x00, "00010501010101010100000000000000", "000102030405060708090a0b"),
+        (
+            0x10,
+            "0002010303020403050504040000017d",
+            "01020300041105122131410613516107227114328191a1082342b1c11552d1f02433627282090a161718191a"
+            "25262728292a3435363738393a434445464748494a535455565758595a636465666768696a73747576777879"
+            "7a838485868788898a92939495969798999aa2a3a4a5a6a7a8a9aab2b3b4b5b6b7b8b9bac2c3c4c5c6c7c8c9"
+            "cad2d3d4d5d6d7d8d9dae1e2e3e4e5e6e7e8e9eaf1f2f3f4f5f6f7f8f9fa",
+        ),
+        (0x01, "00030101010101010101010000000000", "000102030405060708090a0b"),
+        (
+            0x11,
+            "00020102040403040705040400010277",
+            "0001020311040521310612415107617113223281081442 91a1b1c109233352f0156272d10a162434e1"
+            "25f11718191a262728292a35363738393a434445464748494a535455565758595a636465666768696a737475767778"
+            "797a82838485868788898a92939495969798999aa2a3a4a5a6a7a8a9aab2b3b4b5b6b7b8b9bac2c3c4c5c6c7"
+            "c8c9cad2d3d4d5d6d7d8d9dae2e3e4e5e6e7e8e9eaf2f3f4f5f6f7f8f9fa",
+        ),
+    )
+)
+"""Tables of the codes that every such picture has (annex K.3): where they go, counts, values."""
+
+
+class JpegUnits:
+    """The kind of a stream of JPEGs; it remembers tables that are sent once.
+
+    Args:
+        size: of the pictures where the packets have no room for it: above 2040 pixels.
+    """
+
+    def __init__(self, size: tuple[int, int] | None = None) -> None:
+        self.size = size
+        self.tables: dict[int, tuple[bytes, ...]] = {}
+
+    def open(self, timestamp: int, whole: bool, arrived: float) -> JpegUnit:
+        """Return a new picture."""
+        return JpegUnit(self, timestamp, whole, arrived)
+
+    @staticmethod
+    def begins(payload: bytes) -> bool:
+        """Return True if a packet has the first piece of a picture."""
+        return len(payload) > HEAD and payload[1:4] == b"\0\0\0"
+
+
+class JpegUnit(OpenUnit):
+    """One picture."""
+
+    def __init__(self, kind: JpegUnits, timestamp: int, whole: bool, arrived: float) -> None:
+        super().__init__(timestamp, whole, arrived)
+        self._of = kind
+        self._next = 0  # offset of the next piece
+
+    def data(self) -> bytes:
+        """Return the picture as a file."""
+        end = b"" if self.parts[-1].endswith(b"\xff\xd9") else b"\xff\xd9"
+        return b"".join((*self.parts, end))
+
+    def _added(self, payload: bytes) -> bool:
+        if len(payload) <= HEAD or int.from_bytes(payload[1:4], "big") != self._next:
+            return False
+        place = HEAD
+        restart = b""
+        if payload[4] in RESTARTS:
+            restart, place = payload[place : place + 2], place + 4
+        if not self._next:
+            tables = self._tables(payload, place)
+            if tables is None or payload[4] & 0x3F > 1 or payload[0] not in (0, 3):
+                return False
+            place, found = tables
+            self.parts.append(self._head(payload, found, restart))
+        piece = payload[place:]
+        self._next += len(piece)
+        self.parts.append(piece)
+        self.has_picture = True
+        return bool(piece)
+
+    def _tables(self, payload: bytes, place: int) -> tuple[int, tuple[bytes, ...]] | None:
+        """Return the place behind the tables, and the tables; None: they are not known."""
+        quality = payload[5]
+        if quality < 128:
+            return (place, scaled(quality)) if 1 <= quality < 100 else None
+        if len(payload) < place + 4:
+            return None
+        _, wide, length = struct.unpack_from("!BBH", payload, place)
+        place += 4
+        if not length:
+            known = self._of.tables.get(quality)
+            return None if known is None else (place, known)
+        found = cut(payload[place : place + length], wide)
+        if len(found) < 1 or place + length > len(payload):
+            return None
+        if quality < 255 and len(self._of.tables) < MAX_QUANTIZATION_TABLES:
+            self._of.tables[quality] = found
+        return place + length, found
+
+    def _head(self, payload: bytes, tables: tuple[bytes, ...], restart: bytes) -> bytes:
+        width, height = payload[6] * 8, payload[7] * 8
+        if self._of.size is not None and not (width and height):
+            width, height = self._of.size
+        parts = [b"\xff\xd8"]
+        for number, table in enumerate(tables[:2]):
+            wide = len(table) > 64
+            parts.append(_segment(0xDB, bytes((wide << 4 | number,)) + table))
+        if any(restart):
+            parts.append(_segment(0xDD, restart))
+        sampling = 0x22 if payload[4] & 1 else 0x21
+        chroma = min(1, len(tables) - 1)
+        frame = struct.pack("!BHHB", 8, height, width, 3)
+        parts.append(_segment(0xC0, frame + bytes((1, sampling, 0, 2, 17, chroma, 3, 17, chroma))))
+        parts += (_segment(0xC4, bytes((at,)) + counts + codes) for at, counts, codes in _HUFFMAN)
+        parts.append(_segment(0xDA, bytes((3, 1, 0, 2, 0x11, 3, 0x11, 0, 63, 0))))
+        return b"".join(parts)
+
+
+def scaled(quality: int) -> tuple[bytes, ...]:
+    """Return the tables of a quality from 1 to 99."""
+    factor = 5000 // quality if quality < 50 else 200 - 2 * quality
+    return tuple(
+        bytes(min(255, max(1, (int(one) * factor + 50) // 100)) for one in table.split())
+        for table in (_LUMA, _CHROMA)
+    )
+
+
+def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
+    """Return the tables that stand one behind the other: of 64 bytes, or of 128 by a bit each."""
+    found: list[bytes] = []
+    while data and len(found) < 4:
+        size = 128 if wide >> len(found) & 1 else 64
+        if len(data) < size:
+            return ()
+        found.append(data[:size])
+        data = data[size:]
+    return tuple(found)
+
+
+def size_in(picture: bytes) -> tuple[int, int] | None:
+    """Return the size that a picture's head says; it is one of ours."""
+    place = picture.find(b"\xff\xc0\0\x11\x08")
+    if place < 0 or len(picture) < place + 9:
+        return None
+    height, width = struct.unpack_from("!HH", picture, place + 5)
+    return (width, height) if width and height else None
+
+
+def _segment(kind: int, data: bytes) -> bytes:
+    return bytes((0xFF, kind)) + (len(data) + 2).to_bytes(2, "big") + data

@@ -1,0 +1,371 @@
+"""RTP packets, and the reports of RTCP beside them (RFC 3550, RFC 4585)."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+from smartcam.exceptions import MessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+
+VERSION: Final = 2
+MAX_REPORT_BLOCKS: Final = 31
+"""Report blocks in one report, and sources in one BYE: the count has five bits."""
+
+SR, RR, SDES, BYE, APP, RTPFB, PSFB = range(200, 207)
+"""Types of RTCP packets."""
+
+CNAME: Final = 1
+NACK: Final = 1
+PLI: Final = 1
+
+_HEAD: Final = struct.Struct("!BBHII")
+_BLOCK: Final = struct.Struct("!IIIIII")
+_SENDER: Final = struct.Struct("!IQIII")
+
+
+class RtpPacket(NamedTuple):
+    """One packet of a stream.
+
+    Attributes:
+        marker: of video: the last packet of a picture.
+        payload_type: 0 to 127.
+        sequence: 0 to 65535.
+        timestamp: 0 to 2**32 - 1; of video in ticks of 90 kHz.
+        ssrc: the stream, 0 to 2**32 - 1.
+        payload: without padding.
+    """
+
+    marker: bool
+    payload_type: int
+    sequence: int
+    timestamp: int
+    ssrc: int
+    payload: bytes
+
+    def pack(self) -> bytes:
+        """Return its bytes: no CSRC, no extension, no padding."""
+        second = self.marker << 7 | self.payload_type
+        head = _HEAD.pack(VERSION << 6, second, self.sequence, self.timestamp, self.ssrc)
+        return head + self.payload
+
+    @classmethod
+    def parse(cls, data: bytes | memoryview) -> RtpPacket:
+        """Read a datagram; CSRC, extension and padding are taken off.
+
+        Raises:
+            MessageError: it is no RTP packet.
+        """
+        if len(data) < _HEAD.size:
+            raise MessageError(f"RTP: expected 12 bytes or more, got {len(data)}", data=data)
+        first, second, sequence, timestamp, ssrc = _HEAD.unpack_from(data)
+        if first >> 6 != VERSION:
+            raise MessageError(f"RTP: expected version 2, got {first >> 6}", data=data)
+        begin, end = _HEAD.size + 4 * (first & 0xF), len(data)
+        if first & 0x10:
+            if begin + 4 > end:
+                raise _cut_off("extension", begin + 4, data)
+            begin += 4 + 4 * int.from_bytes(data[begin + 2 : begin + 4], "big")
+        if begin > end:
+            raise _cut_off("head", begin, data)
+        if first & 0x20:
+            padding = data[-1]
+            if not 1 <= padding <= end - begin:
+                raise MessageError(
+                    f"RTP: padding: expected 1 to {end - begin} bytes, got {padding}",
+                    offset=end - 1,
+                    data=data,
+                )
+            end -= padding
+        payload = bytes(data[begin:end])
+        return cls(second >= 0x80, second & 0x7F, sequence, timestamp, ssrc, payload)
+
+
+class ReportBlock(NamedTuple):
+    """A receiver's report on one stream.
+
+    Attributes:
+        ssrc: the stream.
+        fraction: of its packets that were lost since the last report, in 256ths.
+        lost: packets since the beginning; below 0 where there were more duplicates.
+        highest: sequence number, with the count of its wraps above the 16 bits.
+        jitter: of the arrival, ticks of the stream's clock.
+        last_report: the middle 32 bits of the last sender report's NTP time; 0: none came.
+        delay: since that came, in 65536ths of a second.
+    """
+
+    ssrc: int
+    fraction: int
+    lost: int
+    highest: int
+    jitter: int
+    last_report: int = 0
+    delay: int = 0
+
+    def pack(self) -> bytes:
+        """Return its 24 bytes; ``lost`` is held within its 24 bits."""
+        lost = max(-(1 << 23), min(self.lost, (1 << 23) - 1)) & 0xFFFFFF
+        rest = (self.highest, self.jitter, self.last_report, self.delay)
+        return _BLOCK.pack(self.ssrc, self.fraction << 24 | lost, *rest)
+
+    @classmethod
+    def parse(cls, data: bytes) -> ReportBlock:
+        """Read 24 bytes."""
+        ssrc, lost, *rest = _BLOCK.unpack(data)
+        signed = ((lost & 0xFFFFFF) ^ 0x800000) - 0x800000
+        return cls(ssrc, lost >> 24, signed, *rest)
+
+
+class SenderReport(NamedTuple):
+    """A sender's report on its stream.
+
+    Attributes:
+        ssrc: the stream.
+        ntp: seconds since 1900 in units of 2**-32, at the same moment as
+        timestamp: of the stream's clock.
+        packets: sent since the beginning.
+        octets: of payload in them.
+        blocks: what it says of others' streams, at most 31.
+    """
+
+    ssrc: int
+    ntp: int
+    timestamp: int
+    packets: int
+    octets: int
+    blocks: tuple[ReportBlock, ...] = ()
+
+    def pack(self) -> bytes:
+        """Return its bytes."""
+        head = _SENDER.pack(*(part & mask for part, mask in zip(self[:5], _MASKS, strict=True)))
+        return _packet(SR, len(self.blocks), head + b"".join(b.pack() for b in self.blocks))
+
+
+class ReceiverReport(NamedTuple):
+    """A receiver's reports on the streams that it gets, at most 31."""
+
+    ssrc: int
+    blocks: tuple[ReportBlock, ...] = ()
+
+    def pack(self) -> bytes:
+        """Return its bytes."""
+        body = self.ssrc.to_bytes(4, "big") + b"".join(one.pack() for one in self.blocks)
+        return _packet(RR, len(self.blocks), body)
+
+
+class SourceDescription(NamedTuple):
+    """The name of a participant, which stays the same when its SSRC changes."""
+
+    ssrc: int
+    cname: str
+
+    def pack(self) -> bytes:
+        """Return its bytes; a name is cut after 255."""
+        name = self.cname.encode()[:255]
+        body = self.ssrc.to_bytes(4, "big") + bytes((CNAME, len(name))) + name + b"\0"
+        return _packet(SDES, 1, body + bytes(-len(body) % 4))
+
+
+class Goodbye(NamedTuple):
+    """Participants, at most 31, that send no more (BYE)."""
+
+    ssrcs: tuple[int, ...]
+    reason: str = ""
+
+    def pack(self) -> bytes:
+        """Return its bytes; a reason is cut after 255."""
+        body = b"".join(one.to_bytes(4, "big") for one in self.ssrcs)
+        if self.reason:
+            reason = self.reason.encode()[:255]
+            body += bytes((len(reason),)) + reason
+            body += bytes(-len(body) % 4)
+        return _packet(BYE, len(self.ssrcs), body)
+
+
+class PacketsMissing(NamedTuple):
+    """A receiver asks for packets again (generic NACK, RFC 4585).
+
+    Attributes:
+        ssrc: the receiver.
+        media: the stream.
+        sequences: numbers of the packets that are missing.
+    """
+
+    ssrc: int
+    media: int
+    sequences: tuple[int, ...]
+
+    def pack(self) -> bytes:
+        """Return its bytes: one entry for up to 17 packets that are near each other."""
+        body = struct.pack("!II", self.ssrc, self.media)
+        left = list(self.sequences)
+        while left:
+            first = left[0]
+            mask = sum(1 << near - 1 for one in left if 1 <= (near := one - first & 0xFFFF) <= 16)
+            left = [one for one in left if one - first & 0xFFFF > 16]
+            body += struct.pack("!HH", first, mask)
+        return _packet(RTPFB, NACK, body)
+
+
+class PictureLost(NamedTuple):
+    """A receiver asks for a key frame (PLI, RFC 4585)."""
+
+    ssrc: int
+    media: int
+
+    def pack(self) -> bytes:
+        """Return its bytes."""
+        return _packet(PSFB, PLI, struct.pack("!II", self.ssrc, self.media))
+
+
+Report: TypeAlias = (
+    SenderReport | ReceiverReport | SourceDescription | Goodbye | PacketsMissing | PictureLost
+)
+
+
+def compound(*reports: Report) -> bytes:
+    """Return one datagram of RTCP; the first should be a sender's or a receiver's report."""
+    return b"".join(one.pack() for one in reports)
+
+
+def parse_rtcp(data: bytes) -> list[Report]:
+    """Read a datagram of RTCP; kinds of packets that we have no use for are left out.
+
+    Raises:
+        MessageError: it is none: a length or count that does not fit, or not a report at first.
+    """
+    found: list[Report] = []
+    place = 0
+    while place < len(data) or not place:
+        if len(data) - place < 4:
+            raise _cut_off("RTCP head", place + 4, data)
+        first, kind = data[place], data[place + 1]
+        end = place + 4 + 4 * int.from_bytes(data[place + 2 : place + 4], "big")
+        if first >> 6 != VERSION or not 192 <= kind <= 223:
+            raise MessageError(
+                f"RTCP: expected version 2 and a type from 192 to 223, got {first >> 6} and {kind}",
+                offset=place,
+                data=data[place:],
+            )
+        if end > len(data):
+            raise _cut_off("RTCP packet", end, data)
+        body = data[place + 4 : end]
+        if first & 0x20:
+            body = _unpadded(body, end == len(data), place, data)
+        read = _READERS.get(kind)
+        if read is not None:
+            try:
+                found += read(first & 0x1F, body)
+            except (struct.error, IndexError) as exc:
+                raise MessageError(
+                    f"RTCP: a packet of type {kind} with a count of {first & 0x1F}: its "
+                    f"{len(body)} bytes are too few",
+                    offset=place,
+                    data=data[place:end],
+                ) from exc
+        place = end
+    return found
+
+
+def is_rtcp(data: bytes) -> bool:
+    """Return True if a datagram is RTCP rather than RTP, where both share a port (RFC 5761)."""
+    return len(data) > 1 and 192 <= data[1] <= 223
+
+
+def _sender_report(count: int, body: bytes) -> Iterable[Report]:
+    ssrc, ntp, timestamp, packets, octets = _SENDER.unpack_from(body)
+    blocks = _blocks(count, body[_SENDER.size :])
+    yield SenderReport(ssrc, ntp, timestamp, packets, octets, blocks)
+
+
+def _receiver_report(count: int, body: bytes) -> Iterable[Report]:
+    yield ReceiverReport(_number(body, 0), _blocks(count, body[4:]))
+
+
+def _blocks(count: int, data: bytes) -> tuple[ReportBlock, ...]:
+    size = _BLOCK.size
+    return tuple(ReportBlock.parse(data[at : at + size]) for at in range(0, count * size, size))
+
+
+def _descriptions(count: int, body: bytes) -> Iterable[Report]:
+    place = 0
+    for _ in range(count):
+        ssrc = _number(body, place)
+        place += 4
+        while body[place]:
+            item, size = body[place], body[place + 1]
+            place += 2 + size
+            if place > len(body):
+                raise IndexError
+            if item == CNAME:
+                yield SourceDescription(ssrc, body[place - size : place].decode(errors="replace"))
+        place += 4 - place % 4
+
+
+def _goodbye(count: int, body: bytes) -> Iterable[Report]:
+    ssrcs = tuple(_number(body, 4 * place) for place in range(count))
+    reason = body[4 * count :]
+    size = reason[0] if reason else 0
+    if 1 + size > len(reason) > 0:
+        raise IndexError
+    yield Goodbye(ssrcs, reason[1 : 1 + size].decode(errors="replace"))
+
+
+def _missing(kind: int, body: bytes) -> Iterable[Report]:
+    ssrc, media = _number(body, 0), _number(body, 4)
+    if kind != NACK:
+        return
+    sequences: dict[int, None] = {}
+    for first, mask in struct.iter_unpack("!HH", body[8:]):
+        near = [place + 1 for place in range(16) if mask >> place & 1]
+        sequences |= dict.fromkeys(first + one & 0xFFFF for one in (0, *near))
+    yield PacketsMissing(ssrc, media, tuple(sequences))
+
+
+def _picture_lost(kind: int, body: bytes) -> Iterable[Report]:
+    ssrc, media = _number(body, 0), _number(body, 4)
+    if kind == PLI:
+        yield PictureLost(ssrc, media)
+
+
+_READERS: Final[dict[int, Callable[[int, bytes], Iterable[Report]]]] = {
+    SR: _sender_report,
+    RR: _receiver_report,
+    SDES: _descriptions,
+    BYE: _goodbye,
+    RTPFB: _missing,
+    PSFB: _picture_lost,
+}
+"""The reader of each type of packet, called with its count (or kind of feedback) and body."""
+
+_MASKS: Final = (0xFFFFFFFF, (1 << 64) - 1, 0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF)
+
+
+def _number(data: bytes, place: int) -> int:
+    number: int = struct.unpack_from("!I", data, place)[0]
+    return number
+
+
+def _packet(kind: int, count: int, body: bytes) -> bytes:
+    if not 0 <= count <= MAX_REPORT_BLOCKS:
+        raise ValueError(f"RTCP: expected 0 to {MAX_REPORT_BLOCKS} entries, got {count}")
+    return struct.pack("!BBH", VERSION << 6 | count, kind, len(body) // 4) + body
+
+
+def _unpadded(body: bytes, last: bool, place: int, data: bytes) -> bytes:
+    padding = body[-1] if body else 0
+    if not last or not 4 <= padding <= len(body) or padding % 4:
+        raise MessageError(
+            f"RTCP: padding: expected a multiple of 4 up to {len(body)} in the last packet, got "
+            f"{padding}",
+            offset=place,
+            data=data[place:],
+        )
+    return body[:-padding]
+
+
+def _cut_off(what: str, expected: int, data: bytes | memoryview) -> MessageError:
+    return MessageError(f"{what}: expected {expected} bytes or more, got {len(data)}", data=data)

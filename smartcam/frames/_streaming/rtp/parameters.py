@@ -1,0 +1,197 @@
+"""Read a stream's parameters, for the size of its pictures, and describe it (RFC 8866)."""
+
+from __future__ import annotations
+
+import base64
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames._streaming.rtp.h264 import H264Unit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+MAX_PICTURE_PIXELS: Final = 1 << 27
+"""Pixels of a picture at most; parameters with more count as wrong."""
+
+CLOCK_RATE: Final = 90_000
+"""Ticks a second of the clock of video streams."""
+
+_HIGH: Final = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
+"""Profiles whose parameters have a format of colours (ITU-T H.264, 7.3.2.1.1)."""
+
+_SHARED: Final = {0: (1, 1), 1: (2, 2), 2: (2, 1), 3: (1, 1)}
+"""Columns and rows that share a colour, by the format of colours: cropping counts in them."""
+
+
+class FieldBits:
+    """Reads a unit's fields, one after the other."""
+
+    def __init__(self, data: bytes) -> None:
+        plain = data.replace(b"\0\0\3", b"\0\0")
+        self._bits = iter("".join(f"{byte:08b}" for byte in plain))
+
+    def fixed(self, count: int) -> int:
+        """u(n)."""
+        return int("".join(next(self._bits) for _ in range(count)) or "0", 2)
+
+    def unsigned(self) -> int:
+        """ue(v)."""
+        zeros = 0
+        while next(self._bits) == "0":
+            zeros += 1
+        return (1 << zeros) - 1 + (self.fixed(zeros) if zeros else 0)
+
+    def signed(self) -> int:
+        """se(v)."""
+        number = self.unsigned()
+        return (number + 1) // 2 if number % 2 else -(number // 2)
+
+
+def picture_size(sps: bytes) -> tuple[int, int]:
+    """Return the width and the height of the pictures, in pixels.
+
+    Args:
+        sps: the sequence's parameters, as of
+            :func:`~smartcam.frames._streaming.rtp.h264.parameter_sets`.
+
+    Raises:
+        FrameFormatError: they are none.
+    """
+    return checked_size("H264", sps, lambda: _size(FieldBits(sps[1:256])))
+
+
+def checked_size(codec: str, sps: bytes, read: Callable[[], tuple[int, int]]) -> tuple[int, int]:
+    """Return a size read from parameters.
+
+    Raises:
+        FrameFormatError: they are none.
+    """
+    try:
+        width, height = read()
+    except (StopIteration, RuntimeError, KeyError):
+        raise _wrong(codec, "whole parameters", sps) from None
+    if not (width > 0 and height > 0 and width * height <= MAX_PICTURE_PIXELS):
+        raise _wrong(
+            codec, f"pictures of up to {MAX_PICTURE_PIXELS} pixels, not {width}x{height}", sps
+        )
+    return width, height
+
+
+def _size(bits: FieldBits) -> tuple[int, int]:
+    profile = bits.fixed(8)
+    bits.fixed(16)
+    bits.unsigned()
+    colours = _high(bits) if profile in _HIGH else 1
+    bits.unsigned()
+    order = bits.unsigned()
+    if order == 0:
+        bits.unsigned()
+    elif order == 1:
+        bits.fixed(1)
+        bits.signed()
+        bits.signed()
+        for _ in range(bits.unsigned()):
+            bits.signed()
+    bits.unsigned()
+    bits.fixed(1)
+    columns, rows = bits.unsigned() + 1, bits.unsigned() + 1
+    fields = 2 - bits.fixed(1)
+    bits.fixed(2 if fields == 2 else 1)
+    crop = [bits.unsigned() for _ in range(4)] if bits.fixed(1) else [0] * 4
+    across, down = _SHARED[colours]
+    return (
+        16 * columns - across * (crop[0] + crop[1]),
+        16 * rows * fields - down * fields * (crop[2] + crop[3]),
+    )
+
+
+def _high(bits: FieldBits) -> int:
+    """Return the format of colours; 0 where the planes are separate ones."""
+    colours = bits.unsigned()
+    separate = bits.fixed(1) if colours == 3 else 0
+    bits.unsigned()
+    bits.unsigned()
+    bits.fixed(1)
+    if bits.fixed(1):
+        for number in range(12 if colours == 3 else 8):
+            if bits.fixed(1):
+                _skip_list(bits, 16 if number < 6 else 64)
+    return 0 if separate else colours
+
+
+def _skip_list(bits: FieldBits, count: int) -> None:
+    last = following = 8
+    for _ in range(count):
+        if following:
+            following = (last + bits.signed()) % 256
+        last = following or last
+
+
+def size_in(access_unit: bytes) -> tuple[int, int] | None:
+    """Return the size of the pictures where an encoded frame has the parameters.
+
+    Raises:
+        FrameFormatError: the parameters are none.
+    """
+    for unit in H264Unit.leading(access_unit):
+        if unit[0] & 0x1F == 7:
+            return picture_size(unit)
+    return None
+
+
+def description(
+    host: str,
+    port: int,
+    payload_type: int,
+    *,
+    session: int = 0,
+    ttl: int | None = None,
+    sets: tuple[bytes, bytes] | None = None,
+    name: str = "smartcam",
+) -> str:
+    """Return the SDP of one stream of H.264.
+
+    Args:
+        host: address that the stream is sent to.
+        port: port that the stream is sent to.
+        payload_type: payload type of the packets.
+        session: number of the session.
+        ttl: number of networks that multicast passes; None: no multicast.
+        sets: parameters of the sequence and of the picture, where they are known.
+        name: name of the session, one line.
+    """
+    return "".join(
+        f"{line}\r\n"
+        for line in _lines(host, port, payload_type, session, ttl, sets, " ".join(name.split()))
+    )
+
+
+def _lines(
+    host: str,
+    port: int,
+    payload_type: int,
+    session: int,
+    ttl: int | None,
+    sets: tuple[bytes, bytes] | None,
+    name: str,
+) -> Iterator[str]:
+    kind = "IP6" if ":" in host else "IP4"
+    yield "v=0"
+    yield f"o=- {session} 0 IN {kind} {host}"
+    yield f"s={name or '-'}"
+    yield f"c=IN {kind} {host}" + (f"/{ttl}" if ttl is not None and kind == "IP4" else "")
+    yield "t=0 0"
+    yield f"m=video {port} RTP/AVP {payload_type}"
+    yield f"a=rtpmap:{payload_type} H264/{CLOCK_RATE}"
+    parameters = ["packetization-mode=1"]
+    if sets is not None:
+        shown = ",".join(base64.b64encode(one).decode() for one in sets)
+        parameters += [f"profile-level-id={sets[0][1:4].hex()}", f"sprop-parameter-sets={shown}"]
+    yield f"a=fmtp:{payload_type} {'; '.join(parameters)}"
+
+
+def _wrong(codec: str, expected: str, got: bytes) -> FrameFormatError:
+    return FrameFormatError(
+        f"{codec}: expected {expected}, got {len(got)} bytes that begin with {got[:8].hex(' ')}"
+    )

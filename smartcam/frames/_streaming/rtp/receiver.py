@@ -1,0 +1,354 @@
+"""Receives one stream: packets in, whole encoded frames out, reports back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import secrets
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from smartcam.exceptions import MessageError
+from smartcam.frames._streaming.rtp import packets as wire
+from smartcam.frames._streaming.rtp.depacketizer import Depacketizer
+from smartcam.frames._streaming.rtp.reception import Reception
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.frames._streaming.rtp.assembling import AccessUnit, UnitKind
+    from smartcam.frames._streaming.rtp.packets import RtpPacket
+
+
+WINDOW: Final = 1024
+"""Packets that may wait for missing ones."""
+
+LOOK_INTERVAL: Final = 0.005
+"""Seconds between two looks at what is missing."""
+
+RESEND_INTERVAL: Final = 0.02
+"""Seconds after which a packet is asked for once more."""
+
+PAUSE: Final = 0.008
+"""Seconds without a packet in the midst of a frame, after which its next one counts as missing:
+else that is only seen when the next frame comes."""
+
+MAX_PACKETS_REQUESTED: Final = 256
+"""Packets requested at a time; if more are missing, a key frame is requested instead."""
+
+REORDER_GRACE: Final = 0.02
+"""Seconds that a packet is waited for where the sender sends none again."""
+
+IN_VAIN: Final = 4
+"""Times that asking brought nothing, from which on the sender counts as one that does not."""
+
+MARKER_GRACE: Final = 0.05
+"""Seconds for which the rest of a frame may follow a marker that is not believed yet."""
+
+REPORT_INTERVAL: Final = 1.0
+"""Seconds between two receiver reports."""
+
+KEY_FRAME_REQUEST_INTERVAL: Final = 0.2
+"""Seconds between two requests for a key frame."""
+
+NEW_STREAM_DELAY: Final = 1.0
+"""Seconds after which another stream is taken: of silence where it comes from the same host, and of
+packets without a picture that could be decoded from whichever host."""
+
+NEW_HOST_DELAY: Final = 5.0
+"""Seconds of silence after which the stream of another host is taken."""
+
+
+@dataclass(frozen=True, slots=True)
+class RtpStatistics:
+    """Counts of a receiver of RTP since it last began to stream.
+
+    Attributes:
+        packets: packets that came, duplicates included.
+        lost: packets that never came.
+        repaired: packets that came after they were asked for again.
+        duplicates: packets that came twice, or too late.
+        damaged: encoded frames that did not come whole.
+        overflows: times that decoding was too slow, and frames were thrown away.
+        strange: datagrams that do not belong to the stream: from other senders, or no RTP.
+        jitter: jitter of the arrival, seconds.
+    """
+
+    packets: int = 0
+    lost: int = 0
+    repaired: int = 0
+    duplicates: int = 0
+    damaged: int = 0
+    overflows: int = 0
+    strange: int = 0
+    jitter: float = 0.0
+
+
+class PacketWays(Protocol):
+    """The two ways of a stream, such as a pair of sockets: packets, and reports beside them."""
+
+    def read(
+        self,
+        rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
+        rtcp: Callable[[bytes, tuple[Any, ...]], None],
+        read: Callable[[], None],
+        /,
+    ) -> None:
+        """Call for each packet and report, with who sent it, and after those that came together."""
+        ...
+
+    def report(self, data: bytes, to: tuple[Any, ...], /) -> None:
+        """Send a report; one that cannot be sent now is left out."""
+        ...
+
+    def close(self) -> None:
+        """Call no more."""
+        ...
+
+
+class StreamReceiver:
+    """One stream from a pair of ways, until :meth:`close`, which closes them.
+
+    Args:
+        pair: ways, not read yet.
+        payload_type: of the stream's packets.
+        repair: seconds that a missing packet is waited for, and asked for again.
+        done: takes the encoded frames that came whole.
+        gone: takes that the sender said goodbye.
+        only: address of the host whose packets count; "": any.
+        kind: of the payloads; None: H.264.
+        agreed: whether the stream was asked for, so that another one of the same host takes its
+            place at once, and packets that are missing are waited for without asking.
+        proofs: frames of the sender whose marker was right before.
+
+    Attributes:
+        heard: when a packet of the stream last came, on the loop's clock.
+    """
+
+    def __init__(
+        self,
+        pair: PacketWays,
+        payload_type: int,
+        repair: float,
+        done: Callable[[list[AccessUnit]], None],
+        gone: Callable[[str], None],
+        only: str = "",
+        kind: UnitKind | None = None,
+        *,
+        agreed: bool = False,
+        proofs: int = 0,
+    ) -> None:
+        self._pair, self._payload_type, self._repair = pair, payload_type, repair
+        self._done, self._gone, self._only = done, gone, only
+        self._agreed = agreed
+        self._loop = asyncio.get_running_loop()
+        self._depacketizer = Depacketizer(WINDOW, kind, wary=True)
+        self._depacketizer.proofs = proofs
+        self._reception: Reception | None = None
+        self._early: tuple[wire.SenderReport, float] | None = None  # before the first packet
+        self._sender: tuple[Any, ...] = ()
+        self._reports_to: tuple[Any, ...] = ()
+        self._ssrc = secrets.randbits(32)
+        self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
+        self._asked: dict[int, float] = {}
+        self._vain = 0
+        self._repaired = self._strange = self._packets = 0
+        self._made: list[AccessUnit] = []
+        self._tick: asyncio.TimerHandle | None = None
+        self._next_report: asyncio.TimerHandle | None = None
+        self._picture_asked = float("-inf")
+        self._began = self._shown_at = float("-inf")
+        self.heard = self._loop.time()
+        pair.read(self._packet, self._report_came, self._read)
+
+    def close(self) -> None:
+        """Say goodbye and receive no more. Idempotent."""
+        for timer in (self._tick, self._next_report):
+            if timer is not None:
+                timer.cancel()
+        if self._reception is not None:
+            self._say(wire.Goodbye((self._ssrc,)))
+            self._reception = None
+        self._pair.close()
+
+    def statistics(self, overflows: int) -> RtpStatistics:
+        """Return the counts of packets received."""
+        taken = self._depacketizer
+        return RtpStatistics(
+            self._packets,
+            taken.lost,
+            self._repaired,
+            taken.duplicates,
+            taken.damaged,
+            overflows,
+            self._strange,
+            0.0 if self._reception is None else self._reception.jitter,
+        )
+
+    @property
+    def proofs(self) -> int:
+        """Frames of the sender whose marker was right."""
+        return self._depacketizer.proofs
+
+    def utc(self, timestamp: int) -> float | None:
+        """Return a time on the sender's wall clock, where it told."""
+        return None if self._reception is None else self._reception.utc(timestamp)
+
+    def want_picture(self) -> None:
+        """Ask for a key frame, unless that was just done."""
+        now = self._loop.time()
+        if self._reception is not None and now - self._picture_asked >= KEY_FRAME_REQUEST_INTERVAL:
+            self._picture_asked = now
+            self._say(wire.PictureLost(self._ssrc, self._reception.ssrc))
+
+    def shown(self) -> None:
+        """Take that a picture of the stream could be decoded."""
+        self._shown_at = self._loop.time()
+
+    # what comes
+
+    def _packet(self, data: bytes, sender: tuple[Any, ...]) -> None:
+        try:
+            packet = wire.RtpPacket.parse(data)
+        except MessageError:
+            self._strange += 1
+            return
+        ours = self._stream_of(packet, sender)
+        if ours is None:
+            self._strange += 1
+            return
+        self.heard = now = self._loop.time()
+        self._packets += 1
+        ours.packet(packet, now)
+        if self._asked.pop(packet.sequence, None) is not None:
+            self._repaired += 1
+            self._vain = 0
+        self._made += self._depacketizer.take(packet, now)
+
+    def _stream_of(self, packet: RtpPacket, sender: tuple[Any, ...]) -> Reception | None:
+        """Return the stream that it is of: the first one is ours, until that is silent."""
+        if packet.payload_type != self._payload_type or not self._may_speak(sender):
+            return None
+        now = self._loop.time()
+        if (ours := self._reception) is not None:
+            same = self._agreed or sender == self._sender
+            if packet.ssrc == ours.ssrc and same:
+                return ours
+            if self._holds_against(sender, now):
+                return None
+        self._reception = ours = Reception(packet.ssrc)
+        if self._early is not None and self._early[0].ssrc == ours.ssrc:
+            ours.sender(*self._early)
+        self._began, self._shown_at = now, float("-inf")
+        self._sender = sender
+        if self._reports_to[:1] != sender[:1]:
+            self._reports_to = (sender[0], sender[1] + 1, *sender[2:])
+        self._asked.clear()
+        self._vain = 0
+        self._report()
+        self.want_picture()
+        return ours
+
+    def _holds_against(self, sender: tuple[Any, ...], now: float) -> bool:
+        """Return True if the stream keeps its place although another sender sends packets.
+
+        A stream without a decoded picture has no right to its place: anybody can send packets.
+        """
+        if self._agreed:
+            return (
+                now - self._began < NEW_STREAM_DELAY
+                and now - self.heard < KEY_FRAME_REQUEST_INTERVAL
+            )
+        if now - self._shown_at >= NEW_HOST_DELAY:
+            return now - self._began < NEW_STREAM_DELAY
+        return now - self.heard < (
+            NEW_STREAM_DELAY if sender[0] == self._sender[0] else NEW_HOST_DELAY
+        )
+
+    def _may_speak(self, sender: tuple[Any, ...]) -> bool:
+        return not self._only or str(sender[0]).partition("%")[0] == self._only
+
+    def _read(self) -> None:
+        """Hand on what is whole, and have a look later where something is missing."""
+        made, self._made = self._made, []
+        taken = self._depacketizer
+        waits = taken.waits_since() is not None or taken.marked_at is not None
+        if self._tick is None and (waits or self._tail_due()):
+            self._tick = self._loop.call_later(LOOK_INTERVAL, self._look)
+        if made:
+            self._done(made)
+
+    def _look(self) -> None:
+        self._tick = None
+        now = self._loop.time()
+        missing = self._depacketizer.missing()
+        lost = self._depacketizer.lost
+        self._made += self._depacketizer.give_up(now - self._patience())
+        self._made += self._depacketizer.end_marked(now - MARKER_GRACE)
+        if self._depacketizer.lost > lost:
+            self._vain += 1
+            self._asked.clear()
+            self.want_picture()
+        elif self._repair and len(missing) <= MAX_PACKETS_REQUESTED:
+            tail = self._depacketizer.tail()
+            if tail is not None and self._tail_due() and now - self.heard >= PAUSE:
+                missing = [tail]
+            self._ask(missing, now)
+        self._read()
+
+    def _patience(self) -> float:
+        if self._agreed:
+            return REORDER_GRACE
+        return self._repair if self._vain < IN_VAIN else min(self._repair, REORDER_GRACE)
+
+    def _tail_due(self) -> bool:
+        """Return True if the rest of a frame is missing and the sender repairs such losses."""
+        if not self._repaired or self._loop.time() - self.heard > self._repair:
+            return False
+        return self._depacketizer.tail() is not None
+
+    def _ask(self, missing: list[int], now: float) -> None:
+        asked = self._asked
+        due = [one for one in missing if now - asked.get(one, float("-inf")) >= RESEND_INTERVAL]
+        if due and self._reception is not None:
+            self._asked = {one: asked.get(one, now) for one in missing} | dict.fromkeys(due, now)
+            self._say(wire.PacketsMissing(self._ssrc, self._reception.ssrc, tuple(due)))
+
+    def _report_came(self, data: bytes, sender: tuple[Any, ...]) -> None:
+        if not self._may_speak(sender):
+            self._strange += 1
+            return
+        with contextlib.suppress(MessageError):  # anybody may send anything
+            for report in wire.parse_rtcp(data):
+                self._take(report, sender)
+
+    def _take(self, report: wire.Report, sender: tuple[Any, ...]) -> None:
+        ours = self._reception
+        if isinstance(report, wire.SenderReport) and ours is None:
+            self._reports_to = sender
+            self._early = (report, self._loop.time()) if report.ntp >> 32 else None
+        if ours is None or sender[0] != self._sender[0]:
+            return
+        if isinstance(report, wire.SenderReport) and report.ssrc == ours.ssrc:
+            self._reports_to = sender
+            if report.ntp >> 32:  # a sender without a clock says 0
+                ours.sender(report, self._loop.time())
+        elif isinstance(report, wire.Goodbye) and ours.ssrc in report.ssrcs:
+            self._gone(report.reason)
+
+    def _report(self) -> None:
+        self._say()
+        if self._next_report is not None:
+            self._next_report.cancel()
+        self._next_report = self._loop.call_later(REPORT_INTERVAL, self._report)
+
+    def _say(self, *more: wire.Report) -> None:
+        """Send a compound of reports: what came, who we are, and what else there is."""
+        if self._reception is None:
+            return
+        full = not more or not isinstance(more[0], wire.PacketsMissing | wire.PictureLost)
+        blocks = (self._reception.block(self._loop.time()),) if full else ()
+        report = wire.ReceiverReport(self._ssrc, blocks)
+        name = wire.SourceDescription(self._ssrc, self._cname)
+        self._pair.report(wire.compound(report, name, *more), self._reports_to)

@@ -1,0 +1,349 @@
+"""A source's pictures as H.264 over RTP, to one receiver or a group."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import socket
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam._arguments import check_integer, check_kind, check_number, check_text
+from smartcam.exceptions import (
+    FrameSourceError,
+    LocalProtocolError,
+    MessageError,
+)
+from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._source import FrameSource
+from smartcam.frames._streaming.rtp import packets as wire
+from smartcam.frames._streaming.rtp.feedback import Audience, PacketHistory
+from smartcam.frames._streaming.rtp.h264 import H264Packetizer, parameter_sets
+from smartcam.frames._streaming.rtp.parameters import CLOCK_RATE, description
+from smartcam.frames._streaming.rtp.reception import ntp_time
+from smartcam.frames._streaming.rtp.sockets import SocketPair, host_and_port, resolved
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from smartcam.frames._codecs.h264 import H264Encoder
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._streaming.rtp.feedback import RtpReceiver
+    from smartcam.frames._streaming.rtp.sockets import Endpoint
+
+
+_log = logging.getLogger("smartcam.frames")
+
+REPORT_INTERVAL: Final = 2.0
+"""Seconds between two sender reports."""
+
+MIN_KEY_FRAME_INTERVAL: Final = 0.2
+"""Seconds between two key frames made on request, since key frames are large."""
+
+FULL_SOCKET_TIMEOUT: Final = 1.0
+"""Seconds that a full socket is waited for before the next frame is tried all the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class RtpSenderStatistics:
+    """Counts of a sender since it began.
+
+    Attributes:
+        frames: frames that were sent whole.
+        packets: packets sent for the first time.
+        bytes: bytes of these packets, with the headers of RTP.
+        cut: frames whose rest was thrown away, since the socket was full.
+        resent: packets that were sent again to a receiver that missed them.
+        anew: key frames made for a receiver that joined or lost packets, or after a cut frame.
+        receivers: last reports of the receivers.
+    """
+
+    frames: int
+    packets: int
+    bytes: int
+    cut: int
+    resent: int
+    anew: int
+    receivers: tuple[RtpReceiver, ...]
+
+
+class _RtpOutlet(NamedTuple):
+    """The sockets that the sender uses, and the address that it sends to."""
+
+    pair: SocketPair
+    to: Endpoint
+
+
+class RtpSender:
+    """Sends what a source shows as H.264 over RTP (RFC 6184); ``async with`` sends.
+
+    ::
+
+        async with smartcam.frames.RtpSender(source, "192.168.0.20:5004", crf=20) as sender:
+            await sender.wait()
+
+    It is a reader like any other: the newest frame is encoded and sent at once, and what comes
+    meanwhile is skipped. RTCP goes to the next port. Packets that a receiver asks for (generic
+    NACK, RFC 4585) are sent again; one that joins, or asks for a picture (PLI), is sent a key
+    frame.
+
+    Args:
+        source: open.
+        to: ``HOST:PORT``, or a multicast group's.
+        fps: frames a second, for the bit rate; None: the source's, or 30.
+        crf: quality, 0 (best) to 51.
+        bitrate: bits a second that it keeps to instead of a quality.
+        keyint: frames in which every part of the picture is sent anew.
+        payload_type: 96 to 127.
+        ttl: networks that multicast passes.
+
+    Raises:
+        ConfigurationError: a number out of its range, or ``to`` is no address.
+        MissingExtraError: the extra ``video`` is not installed.
+    """
+
+    def __init__(
+        self,
+        source: FrameSource,
+        to: str,
+        *,
+        fps: float | None = None,
+        crf: float = 23.0,
+        bitrate: int | None = None,
+        keyint: int = 30,
+        payload_type: int = 96,
+        ttl: int = 1,
+    ) -> None:
+        payload_type = check_integer(payload_type, "payload_type", 96, 127, "RTP")
+        if fps is not None:
+            fps = check_number(fps, "fps", 0.01, 1000.0, "RTP")
+        self._source = check_kind(source, FrameSource, "source", "a source of frames", "RTP")
+        self._to = host_and_port(check_text(to, "to", "RTP", most=300))
+        self._ttl = check_integer(ttl, "ttl", 0, 255, "RTP")
+        self._fps, self._options = fps, {"crf": crf, "bitrate": bitrate, "keyint": keyint}
+        self._codecs = Codecs(threads=1)
+        self._encoder = self._made_encoder(fps or 30.0)
+        self._packetizer = H264Packetizer(payload_type)
+        self._first = secrets.randbits(32)  # timestamp at the clock's 0
+        self._ticks = 0
+        self._cname = f"{secrets.token_hex(6)}@{socket.gethostname()}"
+        self._history = PacketHistory()
+        self._audience = Audience(self._packetizer.ssrc)
+        self._sets: tuple[bytes, bytes] | None = None
+        self._frames = self._packets = self._bytes = self._cut = self._resent = self._anew = 0
+        self._octets = 0
+        self._wanted = False  # a key frame
+        self._made_anew = float("-inf")
+        self._endpoint: Endpoint | None = None
+        self._link: _RtpOutlet | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+        self._entered = False
+
+    def _made_encoder(self, fps: float) -> H264Encoder:
+        return self._codecs.h264_encoder(fps=fps, **self._options)  # type: ignore[arg-type]
+
+    @property
+    def sdp(self) -> str:
+        """The stream's description for ``ffplay``, VLC and others, who save it as a file.
+
+        The parameter sets stand in it from the first frame on; they are in the stream, too.
+
+        Raises:
+            LocalProtocolError: it was not entered.
+        """
+        if self._endpoint is None:
+            raise LocalProtocolError("RtpSender: not open: use `async with`")
+        return description(
+            self._endpoint.host,
+            self._endpoint.port,
+            self._packetizer.payload_type,
+            session=self._packetizer.ssrc,
+            ttl=self._ttl if self._endpoint.multicast else None,
+            sets=self._sets,
+            name=self._source.name,
+        )
+
+    def statistics(self) -> RtpSenderStatistics:
+        """Return the counts of the sender since it began."""
+        return RtpSenderStatistics(
+            self._frames,
+            self._packets,
+            self._bytes,
+            self._cut,
+            self._resent,
+            self._anew,
+            self._audience.receivers(),
+        )
+
+    async def __aenter__(self) -> Self:
+        """Begin to send.
+
+        Raises:
+            FrameSourceError: there is no such host, or no port is free.
+            LocalProtocolError: it was entered before, or the source is not open.
+
+        Cancellation: nothing is sent, nothing stays open.
+        """
+        if self._entered:
+            raise LocalProtocolError("RtpSender: entered before; make a new one")
+        rates = self._source.format.rates
+        self._entered = True
+        if self._fps is None and rates:
+            self._encoder = self._made_encoder(min(max(rates[0], 0.01), 1000.0))
+        host, port = self._to
+        who = f"RTP to {host}:{port}"
+        self._endpoint = to = await resolved(host, port, who)
+        try:
+            self._link = link = _RtpOutlet(SocketPair.sending(to, self._ttl), to)
+        except OSError as exc:
+            raise FrameSourceError(f"{who}: {exc}", source=self._source.name) from exc
+        try:
+            await self._codecs.__aenter__()
+            link.pair.read(None, partial(self._reported, link))
+            self._tasks = [
+                asyncio.create_task(work, name=f"{what} to {to}")
+                for work, what in ((self._send(link), "RTP"), (self._report(link), "RTCP"))
+            ]
+        except BaseException:
+            self._link = None
+            link.pair.close()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Say goodbye and send no more. Idempotent.
+
+        Cancellation: it ends all the same; a picture that is being encoded is thrown away.
+        """
+        link, self._link = self._link, None
+        if link is None:
+            return
+        for task in self._tasks:
+            task.cancel()
+        try:
+            await asyncio.wait(self._tasks)
+            for task in self._tasks:
+                if not task.cancelled():
+                    task.exception()  # it was told, and stands in the log
+        finally:
+            link.pair.close()
+            await self._codecs.close()
+
+    async def wait(self) -> None:
+        """Return when the source ended, or the sender was closed.
+
+        Raises:
+            FrameSourceError: what the source ended with, or its frames cannot be encoded.
+            LocalProtocolError: it was not entered.
+
+        Cancellation: safe; it goes on sending.
+        """
+        if not self._tasks:
+            raise LocalProtocolError("RtpSender: not open: use `async with`")
+        sending = self._tasks[0]
+        await asyncio.wait([sending])
+        if not sending.cancelled() and (error := sending.exception()) is not None:
+            raise error
+
+    # sending
+
+    async def _send(self, link: _RtpOutlet) -> None:
+        try:
+            async with self._source.reader(timeout=None) as reader:
+                async for frame in reader:
+                    if (
+                        self._wanted
+                        and time.monotonic() - self._made_anew >= MIN_KEY_FRAME_INTERVAL
+                    ):
+                        self._begin_anew()
+                    encoded = await self._encoder.encode(frame)
+                    if not self._put(link, encoded):
+                        self._cut += 1
+                        self._wanted = True
+                        await link.pair.writable(FULL_SOCKET_TIMEOUT)
+        except FrameSourceError as error:
+            _log.warning("! RTP to %s: %s", link.to, error)
+            raise
+        except Exception:
+            _log.exception("! RTP to %s", link.to)
+            raise
+        finally:
+            self._say(link, wire.Goodbye((self._packetizer.ssrc,)))
+
+    def _begin_anew(self) -> None:
+        self._wanted, self._made_anew = False, time.monotonic()
+        self._anew += 1
+        self._encoder.begin_anew()
+
+    def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
+        """Send a frame's packets; return whether the socket took them all."""
+        data = bytes(encoded.data)
+        self._sets = parameter_sets(data) or self._sets
+        self._ticks = max(self._ticks + 1, int(encoded.captured * CLOCK_RATE))
+        sequence = self._packetizer.sequence
+        to = link.to[1:]
+        for packet in self._packetizer.packets(data, self._first + self._ticks):
+            try:
+                link.pair.rtp.sendto(packet, to)
+            except OSError:  # it is full, or there is no way there just now
+                return False
+            self._history.sent(sequence, packet)
+            sequence = sequence + 1 & 0xFFFF
+            self._packets += 1
+            self._bytes += len(packet)
+            self._octets += len(packet) - 12
+        self._frames += 1
+        return True
+
+    async def _report(self, link: _RtpOutlet) -> None:
+        while True:
+            self._say(link)
+            await asyncio.sleep(REPORT_INTERVAL)
+
+    def _say(self, link: _RtpOutlet, *more: wire.Report) -> None:
+        now = int(time.monotonic() * CLOCK_RATE) + self._first & 0xFFFF_FFFF
+        report = wire.SenderReport(
+            self._packetizer.ssrc, ntp_time(time.time()), now, self._packets, self._octets
+        )
+        name = wire.SourceDescription(self._packetizer.ssrc, self._cname)
+        link.pair.report(wire.compound(report, name, *more), link.to.reports)
+
+    # what receivers say
+
+    def _reported(self, link: _RtpOutlet, data: bytes, sender: tuple[Any, ...]) -> None:
+        if not link.to.multicast and sender[0] != link.to.host:
+            return
+        with contextlib.suppress(MessageError):  # anybody may send anything
+            for report in wire.parse_rtcp(data):
+                self._take(link, report, f"{sender[0]}:{sender[1]}")
+
+    def _take(self, link: _RtpOutlet, report: wire.Report, address: str) -> None:
+        ours = self._packetizer.ssrc
+        if isinstance(report, wire.PacketsMissing) and report.media == ours:
+            self._send_again(link, report.sequences)
+        elif isinstance(report, wire.PictureLost) and report.media == ours:
+            self._wanted = True
+        elif isinstance(report, wire.Goodbye):
+            for ssrc in report.ssrcs:
+                self._audience.left(ssrc)
+        elif isinstance(report, wire.ReceiverReport) and self._audience.report(report, address):
+            self._wanted = True
+            self._say(link)  # it wants to know our clock
+
+    def _send_again(self, link: _RtpOutlet, sequences: tuple[int, ...]) -> None:
+        for sequence in sequences:
+            packet = self._history.again(sequence)
+            if packet is None:
+                continue
+            try:
+                link.pair.rtp.sendto(packet, link.to[1:])
+            except OSError:
+                return
+            self._resent += 1

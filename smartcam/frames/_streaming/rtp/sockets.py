@@ -1,0 +1,262 @@
+"""Two sockets side by side: RTP, and RTCP on the next port."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import socket
+import struct
+import sys
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam.exceptions import ConfigurationError, FrameSourceError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+MAX_DATAGRAMS_PER_TURN: Final = 64
+"""Datagrams that are read before other tasks of the event loop have a turn."""
+
+RECEIVE_BUFFER: Final = 4 << 20
+SEND_BUFFER: Final = 128 << 10
+"""Bytes that may wait in the system, a twentieth of a second on a link of 20 Mbit/s."""
+
+SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
+"""asm-generic/socket.h: past rmem_max, for who may administer the network."""
+
+TRIES: Final = 32
+"""Tries to find two free ports side by side."""
+
+
+class Endpoint(NamedTuple):
+    """An address with its kind.
+
+    Attributes:
+        family: of sockets.
+        host: a number, not a name.
+        port: of RTP; RTCP has the next one.
+    """
+
+    family: socket.AddressFamily
+    host: str
+    port: int
+
+    @property
+    def multicast(self) -> bool:
+        """True if the address is a multicast group's."""
+        return ipaddress.ip_address(self.host.partition("%")[0]).is_multicast
+
+    @property
+    def reports(self) -> tuple[str, int]:
+        """Address for RTCP."""
+        return self.host, self.port + 1
+
+    def __str__(self) -> str:
+        """Return ``HOST:PORT``."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+async def resolved(host: str, port: int, who: str) -> Endpoint:
+    """Return a host's address.
+
+    Raises:
+        FrameSourceError: there is no such host.
+    """
+    loop = asyncio.get_running_loop()
+    try:
+        found = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as exc:
+        raise FrameSourceError(
+            f"{who}: no address of {host!r} is known: {exc}", source=who
+        ) from exc
+    family, *_, where = found[0]
+    return Endpoint(family, str(where[0]), port)
+
+
+def host_and_port(text: str) -> tuple[str, int]:
+    """Read ``HOST:PORT`` or ``[HOST]:PORT``.
+
+    Raises:
+        ConfigurationError: it is something else.
+    """
+    host, colon, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]")
+    if not colon or not host or not port.isdecimal() or not 1 <= int(port) <= 65534:
+        raise ConfigurationError(f"RTP: expected HOST:PORT with a port below 65535, got {text!r}")
+    return host, int(port)
+
+
+class SocketPair:
+    """RTP and RTCP.
+
+    Args:
+        rtp: bound.
+        rtcp: bound to the next port.
+    """
+
+    def __init__(self, rtp: socket.socket, rtcp: socket.socket) -> None:
+        self.rtp, self.rtcp = rtp, rtcp
+        self._loop = asyncio.get_running_loop()
+        self._closed = False
+
+    @classmethod
+    def listening(cls, at: Endpoint) -> SocketPair:
+        """Return those that a receiver has; a group is joined.
+
+        Raises:
+            OSError: the port is in use, or there is no such address here.
+        """
+        with contextlib.ExitStack() as stack:
+            made = []
+            for port in (at.port, at.port + 1):
+                one = stack.enter_context(_socket(at.family))
+                _grown(one)
+                if at.multicast:
+                    one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                one.bind((at.host if sys.platform == "linux" or not at.multicast else "", port))
+                if at.multicast:
+                    _join(one, at)
+                made.append(one)
+            stack.pop_all()
+        return cls(*made)
+
+    @classmethod
+    def waiting(cls, at: Endpoint) -> SocketPair:
+        """Return those of who asks to be sent to: an even port of an address, and the next one.
+
+        Raises:
+            OSError: no ports are free.
+        """
+        for left in reversed(range(TRIES)):
+            with _socket(at.family) as probe:
+                probe.bind((at.host, 0))
+                even = probe.getsockname()[1] & ~1
+            try:
+                return cls.listening(at._replace(port=even))
+            except OSError:
+                if not left:
+                    raise
+        raise AssertionError("unreachable")
+
+    @classmethod
+    def sending(cls, to: Endpoint, ttl: int) -> SocketPair:
+        """Return those that a sender has.
+
+        Raises:
+            OSError: no ports are free.
+        """
+        for left in reversed(range(TRIES)):
+            with contextlib.ExitStack() as stack:
+                rtp, rtcp = (stack.enter_context(_socket(to.family)) for _ in range(2))
+                rtp.bind(("", 0))
+                port = rtp.getsockname()[1]
+                try:
+                    rtcp.bind(("", port + 1 if port < 65535 else 0))
+                except OSError:
+                    if not left:
+                        raise
+                    continue
+                rtp.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+                for one in (rtp, rtcp):
+                    if to.multicast:
+                        _hops(one, to.family, ttl)
+                stack.pop_all()
+                return cls(rtp, rtcp)
+        raise AssertionError("unreachable")
+
+    def read(
+        self,
+        rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
+        rtcp: Callable[[bytes, tuple[Any, ...]], None],
+        read: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Call for each datagram, with who sent it, until :meth:`close`.
+
+        Args:
+            rtp: for those of the stream; None: they are not read.
+            rtcp: for reports.
+            read: after those that came together.
+        """
+        for one, take in ((self.rtp, rtp), (self.rtcp, rtcp)):
+            if take is not None:
+                self._loop.add_reader(one, self._readable, one, take, read)
+
+    def _readable(
+        self,
+        one: socket.socket,
+        take: Callable[[bytes, tuple[Any, ...]], None],
+        read: Callable[[], None],
+    ) -> None:
+        for _ in range(MAX_DATAGRAMS_PER_TURN):
+            if self._closed:
+                return
+            try:
+                data, sender = one.recvfrom(65536)
+            except BlockingIOError:
+                break
+            except OSError:  # of an earlier datagram of ours; the next ones come
+                continue
+            take(data, sender)
+        if not self._closed:
+            read()
+
+    def report(self, data: bytes, to: tuple[Any, ...]) -> None:
+        """Send RTCP; what the system does not take is left out, since the next one comes soon."""
+        with contextlib.suppress(OSError):
+            self.rtcp.sendto(data, to)
+
+    async def writable(self, within: float) -> None:
+        """Wait until the stream's socket takes more, or a time is over."""
+        free = asyncio.Event()
+        self._loop.add_writer(self.rtp, free.set)
+        try:
+            async with asyncio.timeout(within):
+                await free.wait()
+        except TimeoutError:
+            pass
+        finally:
+            if not self._closed:
+                self._loop.remove_writer(self.rtp)
+
+    def close(self) -> None:
+        """Close both. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        for one in (self.rtp, self.rtcp):
+            self._loop.remove_reader(one)
+            self._loop.remove_writer(one)
+            one.close()
+
+
+def _socket(family: socket.AddressFamily) -> socket.socket:
+    made = socket.socket(family, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    return made
+
+
+def _grown(one: socket.socket) -> None:
+    for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
+        with contextlib.suppress(OSError):  # the second one is for the privileged
+            one.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
+
+
+def _join(one: socket.socket, group: Endpoint) -> None:
+    address = socket.inet_pton(group.family, group.host.partition("%")[0])
+    if group.family == socket.AF_INET6:
+        scope = group.host.partition("%")[2]
+        index = socket.if_nametoindex(scope) if scope else 0
+        one.setsockopt(
+            socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, address + struct.pack("@I", index)
+        )
+    else:
+        one.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, address + struct.pack("=I", 0))
+
+
+def _hops(one: socket.socket, family: socket.AddressFamily, ttl: int) -> None:
+    if family == socket.AF_INET6:
+        one.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_MULTICAST_HOPS, ttl)
+    else:
+        one.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, ttl)

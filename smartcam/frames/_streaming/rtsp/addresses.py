@@ -1,0 +1,114 @@
+"""URLs, transports and ports as RTSP's clients say them."""
+
+from __future__ import annotations
+
+import re
+from typing import Final, NamedTuple
+from urllib.parse import unquote, urlsplit
+
+from smartcam.frames._streaming.rtsp.messages import RtspError
+
+TRACK: Final = "track1"
+"""The one track that each stream has."""
+
+NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._~-]{0,63}")
+"""The names that a stream may have, which need no escapes in a URL."""
+
+
+class RtspTarget(NamedTuple):
+    """The target of a request.
+
+    Attributes:
+        base: the stream's URL as its client writes it, without the slash at its end.
+        name: of the stream.
+        track: whether its track is meant, and not the stream as a whole.
+    """
+
+    base: str
+    name: str
+    track: bool
+
+
+def target_of(url: str) -> RtspTarget:
+    """Read a request's URL.
+
+    Raises:
+        RtspError: it is none of RTSP's.
+    """
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+        parts = None
+    if parts is None or parts.scheme != "rtsp" or not host:
+        raise RtspError(400, f"URL: expected rtsp://HOST/NAME, got {url[:80]!r}")
+    names = [unquote(part) for part in parts.path.split("/") if part]
+    track = len(names) > 1 and names[-1] == TRACK
+    name = "/".join(names[:-1] if track else names)
+    where = f"[{host}]" if ":" in host else host
+    base = f"rtsp://{where}{'' if port is None else f':{port}'}/{name}"
+    return RtspTarget(base, name, track)
+
+
+class TransportWish(NamedTuple):
+    """A transport that we offer: over the connection's own channels, or from ports to ports.
+
+    Attributes:
+        tcp: True for channels of the connection, False for ports.
+        rtp: channel or port of the client; None: a channel that we choose.
+        rtcp: channel or port of the client.
+    """
+
+    tcp: bool
+    rtp: int | None
+    rtcp: int | None
+
+
+def wish_of(header: str, client: str) -> TransportWish:
+    """Return the first transport in a client's list that we offer.
+
+    Args:
+        header: value of the header ``Transport``.
+        client: address of the client, the only one that packets go to.
+
+    Raises:
+        RtspError: the list has no transport that we offer.
+    """
+    for said in header.split(","):
+        wish = _read(said, client)
+        if wish is not None:
+            return wish
+    raise RtspError(
+        461,
+        "Transport: expected RTP/AVP;unicast;client_port=A-B to the client's own address, or "
+        f"RTP/AVP/TCP;unicast;interleaved=0-1, got {header[:80]!r}",
+    )
+
+
+def _read(said: str, client: str) -> TransportWish | None:
+    protocol, *rest = (part.strip() for part in said.split(";"))
+    options = {key.lower(): value for key, _, value in (one.partition("=") for one in rest)}
+    tcp = protocol.upper() == "RTP/AVP/TCP"
+    if not tcp and protocol.upper() not in ("RTP/AVP", "RTP/AVP/UDP"):
+        return None
+    if "multicast" in options or options.get("destination", client) != client:
+        return None
+    if options.get("mode", "play").strip('"').lower() != "play":
+        return None
+    if tcp and "interleaved" not in options:
+        return TransportWish(True, None, None)
+    least, most = (0, 255) if tcp else (1, 65535)
+    pair = _pair(options.get("interleaved" if tcp else "client_port", ""), least, most)
+    return None if pair is None else TransportWish(tcp, *pair)
+
+
+def _pair(text: str, least: int, most: int) -> tuple[int, int] | None:
+    found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text, re.ASCII)
+    if found is None:
+        return None
+    first = int(found[1])
+    second = int(found[2]) if found[2] else first + 1
+    if not (least <= first <= most and least <= second <= most) or first == second:
+        return None
+    return first, second

@@ -1,0 +1,133 @@
+"""Decide who may look: Digest and Basic authentication (RFC 2617)."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import hmac
+import re
+import secrets
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.frames._streaming.rtsp.messages import RtspError
+
+if TYPE_CHECKING:
+    from smartcam.frames._streaming.rtsp.messages import RtspRequest
+
+
+REALM: Final = "smartcam"
+
+MAX_WRONG_ANSWERS: Final = 10
+"""Wrong answers that a connection may give."""
+
+_PART: Final = re.compile(r'([A-Za-z]{1,32})=(?:"([^"\\]*)"|([^\s",=]+))\s*(?:,\s*|$)')
+
+
+class Authentication:
+    """The user and the password that a server demands.
+
+    Args:
+        user: None: everybody may.
+        password: of the user.
+        basic: whether the password may come as it is, for clients that know no Digest.
+
+    Raises:
+        ConfigurationError: one of the two only, or characters that cannot be said.
+    """
+
+    def __init__(self, user: str | None, password: str | None, *, basic: bool = False) -> None:
+        if (user is None) != (password is None):
+            raise ConfigurationError("RTSP: expected user and password, got one of them")
+        if user is not None and (not user or not password or re.search(r'[:"\\]|[^ -~]', user)):
+            raise ConfigurationError(
+                'RTSP: expected a user of ASCII characters without : " and \\, and a password'
+            )
+        self.wanted: bool = user is not None
+        self.basic = basic
+        self._user, self._secret = (user or "").encode(), (password or "").encode()
+        self._hashed = _md5(self._user, REALM.encode(), self._secret)
+
+    def accepts(self, request: RtspRequest, nonce: str) -> bool:
+        """Return True if a request proves the user's password, by the nonce of its connection."""
+        scheme, _, said = request.headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "digest":
+            return self._accepts_digest(request, nonce, said)
+        return scheme.lower() == "basic" and self.basic and self._accepts_basic(said)
+
+    def _accepts_digest(self, request: RtspRequest, nonce: str, said: str) -> bool:
+        parts = _parts(said)
+        expected = {"username": self._user.decode(), "realm": REALM, "nonce": nonce}
+        same = [_same(parts.get(name, ""), value) for name, value in expected.items()]
+        if parts.get("algorithm", "MD5").upper() != "MD5" or "qop" in parts:
+            return False
+        uri = parts.get("uri", "")
+        if not f"{request.url}/".startswith(f"{uri.rstrip('/')}/"):
+            return False  # live555 always says the stream, also where it asks for its track
+        asked = _md5(request.method.encode(), uri.encode())
+        response = _md5(self._hashed.encode(), nonce.encode(), asked.encode())
+        return _same(parts.get("response", "").lower(), response) and all(same)
+
+    def _accepts_basic(self, said: str) -> bool:
+        try:
+            given = base64.b64decode(said.strip().encode("latin-1"), validate=True)
+        except binascii.Error:
+            return False
+        return hmac.compare_digest(given, self._user + b":" + self._secret)
+
+    def challenge(self, nonce: str) -> tuple[tuple[str, str], ...]:
+        """Return the headers that ask for an authorization."""
+        digest = f'Digest realm="{REALM}", nonce="{nonce}", algorithm="MD5"'
+        asked = (("WWW-Authenticate", digest),)
+        basic = (("WWW-Authenticate", f'Basic realm="{REALM}"'),)
+        return asked + basic if self.basic else asked
+
+
+class PasswordGate:
+    """The check of one connection: a nonce of its own, and a bounded number of tries."""
+
+    def __init__(self, authentication: Authentication) -> None:
+        self._authentication = authentication
+        self._nonce = secrets.token_hex(16)
+        self._wrong = 0
+
+    def check(self, request: RtspRequest) -> None:
+        """Let a request pass.
+
+        Raises:
+            RtspError: it is nobody's who may look; the last one is fatal.
+        """
+        if not self._authentication.wanted or self._authentication.accepts(request, self._nonce):
+            return
+        given = "authorization" in request.headers
+        self._wrong += given
+        text = "wrong user or password" if given else "a password is wanted"
+        raise RtspError(
+            401,
+            text,
+            self._authentication.challenge(self._nonce),
+            fatal=self._wrong >= MAX_WRONG_ANSWERS,
+        )
+
+
+def _parts(said: str) -> dict[str, str]:
+    """Return the parts of a Digest; none where they are not written as they should be."""
+    parts: dict[str, str] = {}
+    place = 0
+    said = said.strip()
+    while place < len(said):
+        found = _PART.match(said, place)
+        if found is None or found[1].lower() in parts:
+            return {}
+        parts[found[1].lower()] = found[2] if found[2] is not None else found[3]
+        place = found.end()
+    return parts
+
+
+def _same(given: str, expected: str) -> bool:
+    return hmac.compare_digest(given.encode(), expected.encode())
+
+
+def _md5(*parts: bytes) -> str:
+    return hashlib.md5(b":".join(parts), usedforsecurity=False).hexdigest()

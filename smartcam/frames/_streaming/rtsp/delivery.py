@@ -1,0 +1,213 @@
+"""Deliver packets to a client: over its connection's channels, or as datagrams."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from typing import TYPE_CHECKING, Final, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+CATCH_UP_TIME: Final = 0.5
+"""Seconds for a key frame, which is large, in which others may wait behind it. At other times a
+frame is skipped where anything of an earlier one still waits."""
+
+MAX_WAITING_BYTES: Final = 4 << 20
+"""Bytes that may wait behind a key frame."""
+
+STALL_TIMEOUT: Final = 10.0
+"""Seconds in which nothing is taken; then a connection is cut off."""
+
+SEND_BUFFER: Final = 64 << 10
+"""Bytes of a connection that wait in the system, where they cannot be skipped any longer."""
+
+DATAGRAMS: Final = 1 << 20
+"""Bytes of datagrams that the system may hold: a key frame's, at once."""
+
+PAIRS: Final = 32
+"""Tries to find two ports, an even one and the next."""
+
+
+class PacketDelivery(Protocol):
+    """A way for the packets of one viewer."""
+
+    transport: str
+    """The header Transport in the answer to SETUP."""
+
+    def ready(self, now: float) -> bool:
+        """Return True if a frame's packets would go without waiting."""
+        ...
+
+    def send(self, packets: list[bytes], key: bool, now: float) -> bool:
+        """Send a frame; return whether all of it went."""
+        ...
+
+    def report(self, data: bytes) -> None:
+        """Send RTCP, if it goes at once."""
+        ...
+
+    def alive(self, now: float) -> bool | None:
+        """Return True if the client takes what is sent; None if this cannot be known."""
+        ...
+
+    def close(self) -> None:
+        """Have nothing left of it."""
+        ...
+
+
+class ChannelDelivery:
+    """Over the RTSP connection itself (section 10.12); whole frames, or nothing of one."""
+
+    def __init__(self, connection: asyncio.Transport, rtp: int, rtcp: int) -> None:
+        self.transport = f"RTP/AVP/TCP;unicast;interleaved={rtp}-{rtcp}"
+        self.channels = (rtp, rtcp)
+        self._connection = connection
+        self._patient_until = -1.0
+        self._waited = 0  # bytes at the last look
+        self._progress: float | None = None  # when it last took something
+
+    def ready(self, now: float) -> bool:
+        waiting = self._connection.get_write_buffer_size()
+        return not waiting or (waiting < MAX_WAITING_BYTES and now < self._patient_until)
+
+    def send(self, packets: list[bytes], key: bool, now: float) -> bool:
+        if key:
+            self._patient_until = now + CATCH_UP_TIME
+        self._write(0, packets)
+        return True
+
+    def report(self, data: bytes) -> None:
+        if not self._connection.get_write_buffer_size():
+            self._write(1, [data])
+
+    def _write(self, which: int, packets: list[bytes]) -> None:
+        head = bytes((ord("$"), self.channels[which]))
+        pieces = (head + len(one).to_bytes(2, "big") + one for one in packets)
+        self._connection.write(b"".join(pieces))
+
+    def alive(self, now: float) -> bool | None:
+        waiting = self._connection.get_write_buffer_size()
+        if not waiting or waiting < self._waited or self._progress is None:
+            self._progress = now
+        self._waited = waiting
+        return now - self._progress < STALL_TIMEOUT
+
+    def close(self) -> None:
+        pass  # the connection is its owner's
+
+
+class DatagramDelivery:
+    """Sends packets from two ports of ours to two of the client, or drops packets that would wait.
+
+    Args:
+        sockets: bound sockets for RTP and RTCP.
+        client: address of the client, as the RTSP connection has it.
+        ports: ports of the client for RTP and RTCP.
+        heard: function that is called with the RTCP from the client.
+    """
+
+    def __init__(
+        self,
+        sockets: tuple[socket.socket, socket.socket],
+        client: tuple[str | int, ...],
+        ports: tuple[int, int],
+        heard: Callable[[bytes], None],
+    ) -> None:
+        self._socket, control = sockets
+        ours = f"{self._socket.getsockname()[1]}-{control.getsockname()[1]}"
+        self.transport = f"RTP/AVP;unicast;client_port={ports[0]}-{ports[1]};server_port={ours}"
+        self._to, self._control_to = ((client[0], port, *client[2:]) for port in ports)
+        self._control_socket = control
+        self._control: asyncio.DatagramTransport | None = None
+        self._heard = heard
+
+    async def open(self) -> None:
+        """Hear what the client says.
+
+        Cancellation: closes it.
+        """
+        loop = asyncio.get_running_loop()
+        try:
+            self._control, _ = await loop.create_datagram_endpoint(
+                lambda: _ControlPort(str(self._to[0]), self._heard), sock=self._control_socket
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    def ready(self, now: float) -> bool:
+        return True
+
+    def send(self, packets: list[bytes], key: bool, now: float) -> bool:
+        try:
+            for one in packets:
+                self._socket.sendto(one, self._to)
+        except OSError:  # no room for it, or no way there at this time
+            return False
+        return True
+
+    def report(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            self._control_socket.sendto(data, self._control_to)
+
+    def alive(self, now: float) -> bool | None:
+        return None
+
+    def close(self) -> None:
+        self._socket.close()
+        if self._control is not None:
+            self._control.abort()
+        else:
+            self._control_socket.close()
+
+
+class _ControlPort(asyncio.DatagramProtocol):
+    """Hands on what comes from one host."""
+
+    def __init__(self, host: str, heard: Callable[[bytes], None]) -> None:
+        self._host, self._heard = host, heard
+
+    def datagram_received(self, data: bytes, addr: tuple[str | int, ...]) -> None:
+        if addr[0] == self._host:
+            self._heard(data)
+
+    def error_received(self, exc: Exception) -> None:
+        """Leave what ICMP says: it may be anybody's."""
+
+
+def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, socket.socket]:
+    """Return two sockets on an even port and the next one.
+
+    Raises:
+        OSError: there is none.
+    """
+    for _ in range(PAIRS):
+        first = _bound(host, 0, family)
+        port = first.getsockname()[1]
+        try:
+            second = _bound(host, port ^ 1, family)
+        except OSError:
+            first.close()
+            continue
+        except BaseException:
+            first.close()
+            raise
+        with contextlib.suppress(OSError):
+            (second if port & 1 else first).setsockopt(
+                socket.SOL_SOCKET, socket.SO_SNDBUF, DATAGRAMS
+            )
+        return (second, first) if port & 1 else (first, second)
+    raise OSError(f"{host}: no two ports next to each other are free")
+
+
+def _bound(host: str, port: int, family: socket.AddressFamily) -> socket.socket:
+    made = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        made.setblocking(False)
+        made.bind((host, port))
+    except BaseException:
+        made.close()
+        raise
+    return made

@@ -1,0 +1,221 @@
+"""RTSP's messages: requests cut from bytes, and answers made (RFC 2326)."""
+
+from __future__ import annotations
+
+import re
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+MAX_LINE_BYTES: Final = 4096
+"""Bytes of a line."""
+
+MAX_HEADERS: Final = 64
+
+MAX_BODY_BYTES: Final = 8192
+"""Bytes of a request's body at most; none of the requests served needs a body."""
+
+MAX_DIGITS: Final = 9
+"""Digits of CSeq and Content-Length at most."""
+
+_REQUEST: Final = re.compile(rb"([A-Z_]{1,32}) ([\x21-\x7e]{1,2048}) RTSP/(\d\.\d)")
+_HEADER: Final = re.compile(rb"([A-Za-z0-9!#$%&'*+.^_`|~-]{1,64}):[ \t]*([\t\x20-\x7e\x80-\xff]*)")
+_ONCE: Final = ("authorization", "content-length", "cseq", "session", "transport")
+
+_WORDS: Final[Mapping[int, str]] = {
+    453: "Not Enough Bandwidth",
+    454: "Session Not Found",
+    455: "Method Not Valid in This State",
+    459: "Aggregate Operation Not Allowed",
+    461: "Unsupported Transport",
+    505: "RTSP Version Not Supported",
+    551: "Option Not Supported",
+}
+"""Statuses that HTTP has not, or has other words for."""
+
+
+class RtspError(Exception):
+    """A request that is answered with an error.
+
+    Args:
+        status: of RFC 2326, section 7.1.1.
+        text: why, for people; the body of the answer.
+        headers: of the answer.
+        fatal: nothing more can be cut from these bytes.
+    """
+
+    def __init__(
+        self,
+        status: int,
+        text: str,
+        headers: tuple[tuple[str, str], ...] = (),
+        *,
+        fatal: bool = False,
+    ) -> None:
+        super().__init__(text)
+        self.status, self.text, self.headers, self.fatal = status, text, headers, fatal
+
+
+class RtspRequest(NamedTuple):
+    """A request; the names of its headers are in small letters."""
+
+    method: str
+    url: str
+    headers: Mapping[str, str]
+    body: bytes = b""
+
+
+class ChannelData(NamedTuple):
+    """A packet of a channel, between the requests (section 10.12)."""
+
+    channel: int
+    data: bytes
+
+
+def answer(
+    status: int, cseq: str, headers: tuple[tuple[str, str], ...] = (), body: bytes = b""
+) -> bytes:
+    """Return an answer's bytes; without a CSeq where none was understood."""
+    lines = [f"RTSP/1.0 {status} {_WORDS.get(status) or HTTPStatus(status).phrase}"]
+    if cseq:
+        lines.append(f"CSeq: {cseq}")
+    lines += (f"{name}: {value}" for name, value in headers)
+    if body:
+        lines.append(f"Content-Length: {len(body)}")
+    return "\r\n".join((*lines, "", "")).encode() + body
+
+
+class RequestParser:
+    """Cuts requests and packets from bytes that come in any pieces.
+
+    What is held is bounded by :data:`ROOM` and by what one feeds before one takes.
+    """
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._seen = 0  # bytes in which there is no end of a line
+        self._start: tuple[str, str] | None = None  # method and URL
+        self._headers: dict[str, str] = {}
+
+    def feed(self, data: bytes) -> None:
+        """Take bytes."""
+        self._data += data
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that were not taken yet."""
+        return len(self._data)
+
+    @property
+    def in_midst(self) -> bool:
+        """True while a message has begun and is not whole."""
+        return self._start is not None or bool(self._data)
+
+    def next(self) -> RtspRequest | ChannelData | None:
+        """Return the next whole message; None: it is not there yet.
+
+        Raises:
+            RtspError: it can be none; a fatal one.
+        """
+        while self._start is None:
+            if self._data[:1] == b"$":
+                return self._channel_data()
+            line = self._line()
+            if line is None:
+                return None
+            if line:
+                self._start = _start_line(line)
+        return self._request(*self._start)
+
+    def _request(self, method: str, url: str) -> RtspRequest | None:
+        while (line := self._line(self._size())) is not None:
+            if line:
+                self._add_header(line)
+                continue
+            size = self._size()
+            body = bytes(self._data[:size])
+            del self._data[:size]
+            request = RtspRequest(method, url, self._headers, body)
+            self._start, self._headers = None, {}
+            return request
+        return None
+
+    def _channel_data(self) -> ChannelData | None:
+        if len(self._data) < 4:
+            return None
+        end = 4 + int.from_bytes(self._data[2:4], "big")
+        if len(self._data) < end:
+            return None
+        packet = ChannelData(self._data[1], bytes(self._data[4:end]))
+        del self._data[:end]
+        return packet
+
+    def _line(self, body: int = 0) -> bytes | None:
+        """Take a line; the last one of a head only where its body is there, too."""
+        end = self._data.find(b"\n", self._seen)
+        if end < 0 or end > MAX_LINE_BYTES:
+            self._seen = len(self._data)
+            if end > 0 or self._seen > MAX_LINE_BYTES:
+                _refuse(f"a line: expected {MAX_LINE_BYTES} bytes at most, got more")
+            return None
+        line = bytes(self._data[:end]).removesuffix(b"\r")
+        if not line and len(self._data) - end - 1 < body:
+            return None
+        del self._data[: end + 1]
+        self._seen = 0
+        return line
+
+    def _add_header(self, line: bytes) -> None:
+        found = _HEADER.fullmatch(line)
+        if found is None:
+            _refuse(f"a header: expected NAME: VALUE, got {line[:60]!r}")
+        name = found[1].decode("ascii").lower()
+        value = found[2].decode("latin-1").strip()
+        if name in self._headers:
+            if name in _ONCE:
+                _refuse(f"{name}: expected once, got it twice")
+            value = f"{self._headers.pop(name)}, {value}"
+        if len(self._headers) == MAX_HEADERS or len(value) > MAX_LINE_BYTES:
+            _refuse(f"headers: expected {MAX_HEADERS} at most, got more")
+        if name == "content-length" and (not _is_number(value) or int(value) > MAX_BODY_BYTES):
+            _refuse(f"Content-Length: expected 0 to {MAX_BODY_BYTES}, got {value[:20]!r}", 413)
+        self._headers[name] = value
+
+    def _size(self) -> int:
+        return int(self._headers.get("content-length", "0"))
+
+
+ROOM: Final = 4 + 0xFFFF
+"""Bytes of the largest message that a buffer has to hold: of a channel."""
+
+
+def _start_line(line: bytes) -> tuple[str, str]:
+    found = _REQUEST.fullmatch(line)
+    if found is None:
+        _refuse(f"expected METHOD URL RTSP/1.0, got {line[:60]!r}")
+    if found[3] != b"1.0":
+        _refuse(f"expected RTSP/1.0, got RTSP/{found[3].decode()}", 505)
+    return found[1].decode(), found[2].decode()
+
+
+def _is_number(text: str) -> bool:
+    return text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS
+
+
+def cseq_of(request: RtspRequest) -> str:
+    """Return the number of a request, which its answer repeats.
+
+    Raises:
+        RtspError: it has none.
+    """
+    cseq = request.headers.get("cseq", "")
+    if not _is_number(cseq):
+        raise RtspError(400, f"CSeq: expected a number, got {cseq[:20]!r}")
+    return cseq
+
+
+def _refuse(text: str, status: int = 400) -> NoReturn:
+    raise RtspError(status, text, fatal=True)

@@ -1,0 +1,218 @@
+"""Do what each method asks of the server (RFC 2326, section 10)."""
+
+from __future__ import annotations
+
+import socket
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames._streaming.rtp.h264 import parameter_sets
+from smartcam.frames._streaming.rtsp.addresses import TRACK, target_of, wish_of
+from smartcam.frames._streaming.rtsp.delivery import ChannelDelivery, DatagramDelivery, port_pair
+from smartcam.frames._streaming.rtsp.messages import RtspError
+from smartcam.frames._streaming.rtsp.packing import PAYLOAD_TYPE
+from smartcam.frames._streaming.rtsp.sdp import describe
+from smartcam.frames._streaming.rtsp.session import TIMEOUT, RtspSession
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.frames._streaming.rtsp.addresses import RtspTarget, TransportWish
+    from smartcam.frames._streaming.rtsp.connection import RtspConnection
+    from smartcam.frames._streaming.rtsp.delivery import PacketDelivery
+    from smartcam.frames._streaming.rtsp.messages import RtspRequest
+
+
+MAX_SESSIONS: Final = 8
+"""Sessions of one connection at most."""
+
+FIRST_FRAME_TIMEOUT: Final = 5.0
+"""Seconds for the frame that a description is made of; FFmpeg waits longer for an answer."""
+
+ELSEWHERE: Final = ("ANNOUNCE", "RECORD", "REDIRECT")
+"""Methods of RTSP that this server does not have."""
+
+
+class RtspAnswer(NamedTuple):
+    """The answer to a request that is not refused."""
+
+    headers: tuple[tuple[str, str], ...] = ()
+    body: bytes = b""
+
+
+async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    """Do what a request asks for.
+
+    Raises:
+        RtspError: it is answered with that.
+    """
+    method = request.method
+    if method not in METHODS:
+        allowed = ((("Allow", PUBLIC),)) if method in ELSEWHERE else (("Public", PUBLIC),)
+        status = 405 if method in ELSEWHERE else 501
+        raise RtspError(status, f"expected one of {PUBLIC}, got {method}", allowed)
+    if "require" in request.headers:
+        wanted = request.headers["require"]
+        raise RtspError(
+            551, f"no option is known, {wanted[:80]!r} neither", (("Unsupported", wanted),)
+        )
+    if method == "OPTIONS":  # anybody may ask that
+        return await _options(connection, request)
+    connection.gate.check(request)
+    for session in connection.sessions.values():
+        session.heard()
+    with connection.serving():
+        return await METHODS[method](connection, request)
+
+
+async def _options(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    if request.url != "*":
+        target_of(request.url)
+    return RtspAnswer((("Public", PUBLIC),))
+
+
+async def _describe(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    accepted = request.headers.get("accept", "application/sdp").lower()
+    if "application/sdp" not in accepted and "*/*" not in accepted:
+        raise RtspError(406, f"Accept: expected application/sdp, got {accepted[:80]!r}")
+    target = target_of(request.url)
+    stream = connection.owner.stream(target.name)
+    try:
+        key = await stream.shared.first(FIRST_FRAME_TIMEOUT)
+        sets = parameter_sets(bytes(key.data))
+    except FrameSourceError as exc:
+        raise RtspError(503, str(exc)) from exc
+    if sets is None:
+        raise RtspError(503, f"{target.name}: a key frame without parameter sets")
+    rate, host = stream.rate, str(connection.address[0])
+    body = describe(stream.name, host, connection.owner.number, sets, PAYLOAD_TYPE, rate)
+    return RtspAnswer(
+        (("Content-Type", "application/sdp"), ("Content-Base", f"{target.base}/")), body
+    )
+
+
+async def _setup(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    target = target_of(request.url)
+    stream = connection.owner.stream(target.name)
+    if "session" in request.headers:
+        session = _session(connection, request)
+        if session.playing or session.stream is stream:
+            raise RtspError(455, f"{stream.name}: it is set up already")
+        raise RtspError(459, "each stream has a session of its own")
+    wish = wish_of(request.headers.get("transport", ""), str(connection.peer[0]))
+    if len(connection.sessions) >= MAX_SESSIONS:
+        raise RtspError(453, f"{MAX_SESSIONS} sessions are open on this connection")
+    session = RtspSession(stream, connection.session_ended)
+    connection.owner.admit(session, str(connection.peer[0]))
+    try:
+        delivery = await _delivery(connection, wish, session)
+    except BaseException:
+        connection.owner.dismiss(session, str(connection.peer[0]))
+        raise
+    session.start(delivery)
+    connection.sessions[session.id] = session
+    transport = f'{delivery.transport};ssrc={session.ssrc:08X};mode="PLAY"'
+    return RtspAnswer((_session_header(session), ("Transport", transport)))
+
+
+async def _delivery(
+    connection: RtspConnection, wish: TransportWish, session: RtspSession
+) -> PacketDelivery:
+    if wish.tcp:
+        return ChannelDelivery(connection.transport, *_channels(connection, wish))
+    address = connection.address
+    family = socket.AF_INET6 if ":" in str(address[0]) else socket.AF_INET
+    try:
+        sockets = port_pair(str(address[0]), family)
+    except OSError as exc:
+        raise RtspError(503, f"no ports: {exc}") from exc
+    ports = (wish.rtp or 0, wish.rtcp or 0)
+    delivery = DatagramDelivery(sockets, connection.peer, ports, session.take_rtcp)
+    await delivery.open()
+    return delivery
+
+
+def _channels(connection: RtspConnection, wish: TransportWish) -> tuple[int, int]:
+    taken = set(connection.channels())
+    if wish.rtp is None or wish.rtcp is None:
+        first = next(one for one in range(0, 256, 2) if not {one, one + 1} & taken)
+        return first, first + 1
+    if {wish.rtp, wish.rtcp} & taken:
+        raise RtspError(461, f"Transport: channels {wish.rtp}-{wish.rtcp} are in use")
+    return wish.rtp, wish.rtcp
+
+
+async def _play(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    target, session = _aimed(connection, request)
+    begins = session.play()
+    return RtspAnswer(
+        (
+            _session_header(session),
+            ("Range", "npt=now-"),
+            ("RTP-Info", f"url={target.base}/{TRACK};{begins}"),
+        )
+    )
+
+
+async def _pause(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    _, session = _aimed(connection, request)
+    if not session.playing:
+        raise RtspError(455, "it does not play")
+    session.pause()
+    return RtspAnswer((_session_header(session),))
+
+
+async def _teardown(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    _, session = _aimed(connection, request)
+    session.close()
+    connection.forget(session)
+    return RtspAnswer()
+
+
+async def _parameter(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
+    """Take that the client is there, which is what it is for; we have no parameters."""
+    if request.url != "*":
+        target_of(request.url)
+    headers: tuple[tuple[str, str], ...] = ()
+    if "session" in request.headers:
+        headers = (_session_header(_session(connection, request)),)
+    if request.body.strip():
+        raise RtspError(451, f"no parameter is known, got {request.body[:60]!r}", headers)
+    return RtspAnswer(headers)
+
+
+def _session(connection: RtspConnection, request: RtspRequest) -> RtspSession:
+    said = request.headers.get("session", "").partition(";")[0].strip()
+    if said not in connection.sessions:
+        raise RtspError(454, f"Session: expected one of this connection's, got {said[:40]!r}")
+    return connection.sessions[said]
+
+
+def _aimed(connection: RtspConnection, request: RtspRequest) -> tuple[RtspTarget, RtspSession]:
+    """Return the target of a request, and its session."""
+    target = target_of(request.url)
+    stream = connection.owner.stream(target.name)
+    if "session" not in request.headers and not connection.sessions:
+        raise RtspError(455, f"{request.method}: expected SETUP before it")
+    session = _session(connection, request)
+    if session.stream is not stream:
+        raise RtspError(454, f"Session: it is of {session.stream.name}, not of {stream.name}")
+    return target, session
+
+
+def _session_header(session: RtspSession) -> tuple[str, str]:
+    return "Session", f"{session.id};timeout={TIMEOUT}"
+
+
+METHODS: Final[dict[str, Callable[[RtspConnection, RtspRequest], Awaitable[RtspAnswer]]]] = {
+    "OPTIONS": _options,
+    "DESCRIBE": _describe,
+    "SETUP": _setup,
+    "PLAY": _play,
+    "PAUSE": _pause,
+    "GET_PARAMETER": _parameter,
+    "SET_PARAMETER": _parameter,
+    "TEARDOWN": _teardown,
+}
+
+PUBLIC: Final = ", ".join(METHODS)

@@ -1,0 +1,41 @@
+"""Describe a stream to a client before it asks for it (SDP, RFC 4566 and RFC 6184)."""
+
+from __future__ import annotations
+
+import base64
+
+from smartcam.frames._streaming.rtsp.addresses import TRACK
+
+
+def describe(
+    name: str, host: str, session: int, sets: tuple[bytes, bytes], payload_type: int, rate: float
+) -> bytes:
+    """Return the description of one stream of H.264.
+
+    Args:
+        name: of the stream.
+        host: the server's own address.
+        session: a number, another one for another description.
+        sets: the sequence's and the picture's parameters.
+        payload_type: of its packets.
+        rate: frames a second.
+    """
+    kind = "IP6" if ":" in host else "IP4"
+    nothing = "::" if kind == "IP6" else "0.0.0.0"  # noqa: S104 - "any", to SDP
+    coded = ",".join(base64.b64encode(one).decode() for one in sets)
+    lines = (
+        "v=0",
+        f"o=- {session} 1 IN {kind} {host}",
+        f"s={name}",
+        f"c=IN {kind} {nothing}",
+        "t=0 0",
+        "a=control:*",
+        "a=range:npt=now-",
+        f"m=video 0 RTP/AVP {payload_type}",
+        f"a=rtpmap:{payload_type} H264/90000",
+        f"a=fmtp:{payload_type} packetization-mode=1;profile-level-id={sets[0][1:4].hex().upper()};"
+        f"sprop-parameter-sets={coded}",
+        f"a=framerate:{rate:g}",
+        f"a=control:{TRACK}",
+    )
+    return "\r\n".join((*lines, "")).encode()

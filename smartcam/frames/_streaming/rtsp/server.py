@@ -1,0 +1,198 @@
+"""Sources that VLC, FFmpeg and GStreamer can look at."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from smartcam._accepting import listening
+from smartcam._arguments import check_flag, check_integer, check_kind, check_number, check_text
+from smartcam._finishing import finish
+from smartcam._server import Server
+from smartcam.exceptions import ConfigurationError, LocalProtocolError
+from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._source import FrameSource
+from smartcam.frames._streaming.rtsp.addresses import NAME
+from smartcam.frames._streaming.rtsp.authentication import Authentication
+from smartcam.frames._streaming.rtsp.serving import RtspServing
+from smartcam.frames._streaming.rtsp.streams import RtspStream
+from smartcam.frames._streaming.shared_stream import SharedH264
+
+if TYPE_CHECKING:
+    from smartcam.frames._streaming.rtsp.streams import RtspStatistics
+
+
+PORT: Final = 8554
+
+RATE: Final = 30.0
+"""Frames a second of a source that does not say."""
+
+_ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
+
+
+class RtspServer(Server):
+    """Serves sources by RTSP, as H.264 over UDP or over the connection (RFC 2326, RFC 6184).
+
+    ::
+
+        async with RtspServer({"left": source}) as server:
+            print(server.url("left"))
+
+    A source is encoded once, however many look at it, and streams while somebody looks, and for two
+    seconds after. A viewer that is too slow is sent whole frames only, skips those in between, and
+    goes on with a key frame; one that takes nothing for 10 s is cut off, and so is one over UDP of
+    which nothing was heard for 60 s. Datagrams go to the address that the connection comes from,
+    and nowhere else. When a source ends, its viewers are told and their connections closed; who
+    asks then is answered 503 with the reason, and the source is tried again.
+
+    Whoever reaches the port may look, unless there is a password. Neither it nor the pictures are
+    encrypted: with Digest the password itself does not go over the network.
+
+    Args:
+        sources: sources by name; a request for one that is not open is answered 503. A name has 1
+            to 64 letters, digits and ``. _ ~ -``, the first a letter or digit.
+        host: address to listen on.
+        port: port to listen on; 0: any.
+        user: name of the user who may look; None: everybody may.
+        password: password of the user.
+        basic: also accept the bare password, from clients that do not know Digest.
+        bitrate: bits a second that an encoder keeps to instead of a quality.
+        crf: quality, 0 (best) to 51.
+        fps: frames a second, for the bit rate; None: as each source says, else 30.
+        keyint: frames in which every part of the picture is sent anew.
+        max_connections: connections at a time.
+        max_viewers: sessions of all connections at a time.
+
+    Raises:
+        ConfigurationError: no sources, a name that is none, user without password, or a number out
+            of its range.
+    """
+
+    def __init__(
+        self,
+        sources: Mapping[str, FrameSource],
+        *,
+        host: str = "127.0.0.1",
+        port: int = PORT,
+        user: str | None = None,
+        password: str | None = None,
+        basic: bool = False,
+        bitrate: int | None = None,
+        crf: float = 23.0,
+        fps: float | None = None,
+        keyint: int = 30,
+        max_connections: int = 64,
+        max_viewers: int = 32,
+    ) -> None:
+        who = "RtspServer"
+        check_kind(sources, Mapping, "sources", "a mapping from name to source", who)
+        for name, source in sources.items():
+            check_kind(source, FrameSource, "sources", "sources of frames", who)
+            if not isinstance(name, str) or not NAME.fullmatch(name):
+                raise ConfigurationError(
+                    "RtspServer: a name: expected 1 to 64 letters, digits and . _ ~ -, the first a "
+                    f"letter or digit, got {name!r}"
+                )
+        if not sources:
+            raise ConfigurationError("RtspServer: expected a source, got none")
+        for word, value in (("user", user), ("password", password)):
+            if value is not None:
+                check_text(value, word, who, least=1, most=200)
+        self.host: str = check_text(host, "host", who, least=1, most=300)
+        self._authentication = Authentication(user, password, basic=check_flag(basic, "basic", who))
+        self._sources = dict(sources)
+        self._port = check_integer(port, "port", 0, 0xFFFF, who)
+        self._fps = None if fps is None else check_number(fps, "fps", 0.01, 1000.0, who)
+        self._keyint = check_integer(keyint, "keyint", 2, 600, who)
+        self._crf = check_number(crf, "crf", 0, 51, who)
+        if bitrate is not None:
+            bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, who)
+        self._bitrate = bitrate
+        self._max_connections = check_integer(max_connections, "max_connections", 1, 1000, who)
+        self._max_viewers = check_integer(max_viewers, "max_viewers", 1, 1000, who)
+        self._streams: dict[str, RtspStream] = {}
+        self._serving: RtspServing | None = None
+
+    @property
+    def port(self) -> int:
+        """The port it listens on; the one given until it is started."""
+        return self._port
+
+    def url(self, name: str) -> str:
+        """Return a stream's URL, without the password.
+
+        It has this machine's name where the server listens on all addresses.
+
+        Raises:
+            ConfigurationError: there is no such stream.
+        """
+        name = check_text(name, "name", "RtspServer", most=64)
+        if name not in self._sources:
+            raise ConfigurationError(
+                f"RtspServer: expected one of {', '.join(self._sources)}, got {name!r}"
+            )
+        host = socket.gethostname() if self.host in _ANY else self.host
+        return f"rtsp://{f'[{host}]' if ':' in host else host}:{self._port}/{name}"
+
+    def statistics(self) -> dict[str, RtspStatistics]:
+        """Return the counts of each stream since the server was started, by its name."""
+        return {name: stream.statistics() for name, stream in self._streams.items()}
+
+    async def start(self) -> None:
+        """Open the port; does nothing if it is started already.
+
+        Raises:
+            ConfigurationError: it cannot listen there, or a number is out of its range.
+            MissingExtraError: the extra ``video`` is not installed.
+
+        Cancellation: leaves it stopped.
+        """
+        if self._serving is not None:
+            return
+        codecs = Codecs(threads=min(4, len(self._sources)))
+        streams = self._made(codecs)
+        try:
+            listener = await listening(self.host, self._port)
+        except (OSError, ValueError, OverflowError) as exc:
+            raise ConfigurationError(
+                f"RTSP: cannot listen on {self.host} port {self._port}: {exc}"
+            ) from exc
+        await codecs.__aenter__()
+        self._port = listener.getsockname()[1]
+        self._streams = streams
+        limits = (self._max_connections, self._max_viewers)
+        self._serving = RtspServing(streams, codecs, self._authentication, *limits)
+        self._serving.open(listener)
+
+    async def stop(self) -> None:
+        """Say goodbye to the viewers and close everything; does nothing if stopped.
+
+        Cancellation: takes effect when all is closed, which a second or two take at most.
+        """
+        serving, self._serving = self._serving, None
+        if serving is None:
+            return
+        await finish(serving.close)
+
+    def _made(self, codecs: Codecs) -> dict[str, RtspStream]:
+        """Return the streams; two names of a source share one encoder."""
+        shared: dict[int, tuple[SharedH264, float]] = {}
+        for source in self._sources.values():
+            if id(source) in shared:
+                continue
+            rate = self._fps if self._fps is not None else _rate(source)
+            encoder = codecs.h264_encoder(
+                fps=rate, keyint=self._keyint, crf=self._crf, bitrate=self._bitrate
+            )
+            shared[id(source)] = SharedH264(source, encoder), rate
+        return {name: RtspStream(name, *shared[id(one)]) for name, one in self._sources.items()}
+
+
+def _rate(source: FrameSource) -> float:
+    """Return the frames a second that a source says, or the usual where it is not open yet."""
+    try:
+        rates = source.format.rates
+    except LocalProtocolError:
+        rates = ()
+    return min(max(rates[0], 0.01), 1000.0) if rates else RATE

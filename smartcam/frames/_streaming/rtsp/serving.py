@@ -1,0 +1,127 @@
+"""The parts of a server while it is started: its port, connections and streams."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import secrets
+from typing import TYPE_CHECKING
+
+from smartcam._accepting import Acceptor, Places, is_loopback, share_of
+from smartcam.frames._streaming.rtsp.connection import IDLE_TIMEOUT, RtspConnection
+from smartcam.frames._streaming.rtsp.messages import RtspError
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Mapping
+
+    from smartcam.frames._codecs.threads import Codecs
+    from smartcam.frames._streaming.rtsp.authentication import Authentication
+    from smartcam.frames._streaming.rtsp.session import RtspSession
+    from smartcam.frames._streaming.rtsp.streams import RtspStream
+
+
+_log = logging.getLogger(__name__)
+
+
+class RtspServing:
+    """Takes connections, and counts them and their viewers.
+
+    Args:
+        streams: streams by their names.
+        codecs: open codecs, which are closed with this object.
+        authentication: user who may look, and the password.
+        max_connections: connections at a time.
+        max_viewers: sessions at a time.
+    """
+
+    def __init__(
+        self,
+        streams: Mapping[str, RtspStream],
+        codecs: Codecs,
+        authentication: Authentication,
+        max_connections: int,
+        max_viewers: int,
+    ) -> None:
+        self.authentication = authentication
+        self.number: int = secrets.randbits(31)  # of its descriptions
+        self._streams, self._codecs = streams, codecs
+        self._max_viewers = max_viewers
+        self._viewers: list[str] = []  # the addresses of those who look
+        self._listener: socket.socket | None = None
+        self.places: Places[RtspConnection] = Places(max_connections, within=IDLE_TIMEOUT)
+        self._acceptor = Acceptor(
+            lambda: RtspConnection(self), self.places, _log, name="smartcam.rtsp"
+        )
+
+    def open(self, listener: socket.socket) -> None:
+        """Take connections from now on; the socket is closed with it."""
+        self._listener = listener
+        self._acceptor.open(listener)
+
+    async def close(self) -> None:
+        """Say goodbye, and close everything."""
+        listener, self._listener = self._listener, None
+        self._acceptor.close()
+        if listener is not None:
+            listener.close()
+        await self._acceptor.wait_closed()
+        connections = list(self.places)
+        for connection in connections:
+            connection.close("the server is stopped")
+        tasks = {one.task for one in connections if one.task is not None}
+        if tasks:
+            await asyncio.wait(tasks)
+        for shared in {id(one.shared): one.shared for one in self._streams.values()}.values():
+            await shared.close()
+        await self._codecs.close()
+
+    # what its connections ask
+
+    def enter(self, connection: RtspConnection, peer: object) -> str:
+        """Take a new connection; return "", or why there is no room for it."""
+        if self._listener is None:
+            return "the server is stopped"
+        return self._acceptor.enter(connection, peer)
+
+    def leave(self, connection: RtspConnection) -> None:
+        """Forget a connection that is closed."""
+        self._acceptor.leave(connection)
+
+    def served(self, connection: RtspConnection) -> None:
+        """Take that a connection was served: it is the last that makes room."""
+        self._acceptor.move_back(connection)
+
+    def unseated(self, connection: RtspConnection) -> None:
+        """Take that a connection has no session any more."""
+        self._acceptor.move_back(connection)
+        self._acceptor.expect(connection, IDLE_TIMEOUT, "no session")
+
+    def stream(self, name: str) -> RtspStream:
+        """Return a stream.
+
+        Raises:
+            RtspError: there is none of that name.
+        """
+        if name not in self._streams:
+            raise RtspError(404, f"expected one of {', '.join(self._streams)}, got {name[:80]!r}")
+        return self._streams[name]
+
+    def admit(self, session: RtspSession, peer: str) -> None:
+        """Count a viewer, who comes from an address.
+
+        Raises:
+            RtspError: there are too many, or too many of that address.
+        """
+        if len(self._viewers) >= self._max_viewers:
+            raise RtspError(453, f"{self._max_viewers} others look already")
+        share = share_of(self._max_viewers)
+        if not is_loopback(peer) and self._viewers.count(peer) >= share:
+            raise RtspError(453, f"{share} others of {peer} look already")
+        self._viewers.append(peer)
+        session.stream.viewers += 1
+
+    def dismiss(self, session: RtspSession, peer: str) -> None:
+        """Count a viewer no longer."""
+        self._viewers.remove(peer)
+        session.stream.viewers -= 1

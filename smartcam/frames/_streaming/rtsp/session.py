@@ -1,0 +1,197 @@
+"""One viewer: what it gets, and whether it is still there."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+import time
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import FrameSourceError, MessageError
+from smartcam.frames._streaming.rtp.packets import (
+    Goodbye,
+    PictureLost,
+    ReceiverReport,
+    SenderReport,
+    SourceDescription,
+    compound,
+    parse_rtcp,
+)
+from smartcam.frames._streaming.rtp.reception import ntp_time
+from smartcam.frames._streaming.rtsp.packing import PacketNumbers
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._streaming.rtsp.delivery import PacketDelivery
+    from smartcam.frames._streaming.rtsp.streams import RtspStream
+
+
+TIMEOUT: Final = 60
+"""Seconds in which a client has to say something; it is told so."""
+
+REPORT_INTERVAL: Final = 5.0
+"""Seconds between two sender's reports."""
+
+LOOK_INTERVAL: Final = 1.0
+"""Seconds between two looks whether the client is still there."""
+
+CLOCK: Final = 90_000
+
+
+class RtspSession:
+    """A session, which SETUP begins and TEARDOWN ends.
+
+    It plays from a key frame on. A frame that would have to wait is skipped, and with it those that
+    follow until there is a key frame again, for which it asks.
+
+    Args:
+        stream: stream that the client watches.
+        ended: function that is called once when the session ends by itself, with the session and
+            the reason; "": the client takes nothing.
+    """
+
+    def __init__(self, stream: RtspStream, ended: Callable[[RtspSession, str], None]) -> None:
+        self.id: str = secrets.token_hex(12)
+        self.stream = stream
+        self.playing = False
+        self.delivery: PacketDelivery | None = None
+        self._ended = ended
+        self._loop = asyncio.get_running_loop()
+        self._numbering = PacketNumbers()
+        self._offset = secrets.randbits(32)
+        self._last = -1  # the last timestamp, before the offset
+        self._wants_key, self._skips = True, False
+        self._told_at = -REPORT_INTERVAL
+        self._heard_at = self._loop.time()
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def ssrc(self) -> int:
+        """Of its packets."""
+        return self._numbering.ssrc
+
+    def start(self, delivery: PacketDelivery) -> None:
+        """Have a way to the client; it is closed with the session."""
+        self.delivery = delivery
+        self._timer = self._loop.call_later(LOOK_INTERVAL, self._look)
+
+    def play(self) -> str:
+        """Send what comes; return where that begins, for RTP-Info."""
+        if not self.playing:
+            self.playing, self._wants_key, self._skips = True, True, False
+            self.stream.shared.join(self)
+        now = self._timestamp(self._ticks(time.monotonic()))
+        return f"seq={self._numbering.sequence};rtptime={now}"
+
+    def pause(self) -> None:
+        """Send no more, until it plays again."""
+        self.playing = False
+        self.stream.shared.leave(self)
+
+    def close(self, why: str = "") -> None:
+        """Have nothing left. Idempotent.
+
+        Args:
+            why: the client is told so; "": it knows.
+        """
+        self.pause()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        delivery, self.delivery = self.delivery, None
+        if delivery is not None:
+            if why:
+                delivery.report(compound(*self._report(), Goodbye((self.ssrc,), why)))
+            delivery.close()
+
+    def heard(self) -> None:
+        """Note that the client is there."""
+        self._heard_at = self._loop.time()
+
+    def take_rtcp(self, data: bytes) -> None:
+        """Hear what the client reports; what is none is left."""
+        try:
+            reports = parse_rtcp(data)
+        except MessageError:
+            return
+        if any(isinstance(one, ReceiverReport | SenderReport) for one in reports):
+            self.heard()
+        if any(isinstance(one, PictureLost) and one.media == self.ssrc for one in reports):
+            self.stream.shared.key_frame()
+
+    # what the stream says
+
+    def take(self, unit: Frame, key: bool) -> None:
+        """Send an encoded frame, or skip it."""
+        now, delivery = self._loop.time(), self.delivery
+        if delivery is None:
+            return
+        ready = delivery.ready(now)
+        if self._wants_key and not key:
+            self.stream.skipped += self._skips
+            if ready:
+                self.stream.shared.key_frame()
+            return
+        ticks = max(self._ticks(unit.captured), self._last + 1)
+        if not (ready and self._send(delivery, unit, ticks, key, now)):
+            self.stream.skipped += 1
+            self._wants_key = self._skips = True
+            return
+        self._last, self._wants_key, self._skips = ticks, False, False
+        self.stream.sent += 1
+
+    def ended(self, error: FrameSourceError) -> None:
+        """Hear that the source has ended."""
+        self.playing = False
+        self._end(str(error))
+
+    def _send(
+        self, delivery: PacketDelivery, unit: Frame, ticks: int, key: bool, now: float
+    ) -> bool:
+        pieces = self.stream.cutter.pieces(unit)
+        packets = self._numbering.numbered(pieces, self._timestamp(ticks))
+        if now - self._told_at >= REPORT_INTERVAL:
+            self._tell(now)
+        return delivery.send(packets, key, now)
+
+    def _ticks(self, moment: float) -> int:
+        return round(moment * CLOCK)
+
+    def _timestamp(self, ticks: int) -> int:
+        return ticks + self._offset & 0xFFFFFFFF
+
+    def _report(self) -> tuple[SenderReport, SourceDescription]:
+        ntp = ntp_time(time.time())
+        stamp = self._timestamp(self._ticks(time.monotonic()))
+        made = self._numbering
+        report = SenderReport(self.ssrc, ntp, stamp, made.packets, made.octets)
+        return report, SourceDescription(self.ssrc, "smartcam")
+
+    def _tell(self, now: float) -> None:
+        self._told_at = now
+        if self.delivery is not None:
+            self.delivery.report(compound(*self._report()))
+
+    def _look(self) -> None:
+        """See whether the client is still there."""
+        if self.delivery is None:
+            return
+        now = self._loop.time()
+        self._timer = self._loop.call_later(LOOK_INTERVAL, self._look)
+        alive = self.delivery.alive(now) if self.playing else None
+        if alive:
+            self.heard()
+        if alive is False:
+            self.stream.stalled += 1
+            self._end("")
+        elif now - self._heard_at >= TIMEOUT:
+            self.stream.silent += 1
+            self._end(f"nothing was heard for {TIMEOUT} s")
+        elif self.playing and now - self._told_at >= REPORT_INTERVAL:
+            self._tell(now)
+
+    def _end(self, why: str) -> None:
+        self.close(why)
+        self._ended(self, why)

@@ -1,0 +1,140 @@
+"""Answer a server that asks for a password: Basic (RFC 7617) and Digest (RFC 7616)."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import secrets
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+
+MAX_CHALLENGES: Final = 8
+"""Challenges of one answer that are looked at."""
+
+_HASHES: Final = {"MD5": hashlib.md5, "SHA-256": hashlib.sha256}
+"""Hashes by the names that challenges have for them; the last one is the best."""
+
+_PART: Final = re.compile(r'\s*([A-Za-z0-9_-]{1,32})\s*=\s*(?:"((?:[^"\\]|\\.)*)"|([^\s",]*))\s*,?')
+
+
+class Challenge(NamedTuple):
+    """The way in which a server wants the password.
+
+    Attributes:
+        scheme: in small letters.
+        parts: what it says, by names in small letters.
+    """
+
+    scheme: str
+    parts: dict[str, str]
+
+    @property
+    def algorithm(self) -> str:
+        """Name of the hash of Digest, without its mode of use."""
+        return self.parts.get("algorithm", "MD5").upper().removesuffix("-SESS")
+
+    @property
+    def rank(self) -> int:
+        """Rank of the challenge; 0: it cannot be answered."""
+        if self.scheme == "basic":
+            return 1
+        qop = re.split(r"[\s,]+", self.parts.get("qop", "auth").lower())
+        known = self.scheme == "digest" and "nonce" in self.parts and "auth" in qop
+        return 2 + list(_HASHES).index(self.algorithm) if known and self.algorithm in _HASHES else 0
+
+
+def challenge_of(headers: Sequence[str]) -> Challenge | None:
+    """Return the best challenge of an answer that can be answered; None: there is none."""
+    read = [_read(one) for one in headers[:MAX_CHALLENGES]]
+    best = max(read, key=lambda one: one.rank, default=None)
+    return best if best is not None and best.rank else None
+
+
+def _read(header: str) -> Challenge:
+    scheme, _, said = header.strip().partition(" ")
+    parts: dict[str, str] = {}
+    place = 0
+    while (found := _PART.match(said, place)) is not None:
+        value = found[3] if found[2] is None else re.sub(r"\\(.)", r"\1", found[2])
+        parts.setdefault(found[1].lower(), value)
+        place = found.end()
+    return Challenge(scheme.lower(), parts)
+
+
+class Credentials:
+    """A user with a password, and what the server last asked for.
+
+    Args:
+        user: "": none.
+        password: of the user.
+    """
+
+    def __init__(self, user: str, password: str) -> None:
+        self._user, self._password = user, password
+        self._challenge: Challenge | None = None
+        self._count = 0  # requests with the challenge's nonce
+
+    @property
+    def known(self) -> bool:
+        """True if there is a user."""
+        return bool(self._user)
+
+    def challenged(self, headers: Sequence[str]) -> bool:
+        """Take a refusal; return whether a request with what it asks for may do better."""
+        found = challenge_of(headers)
+        if not self.known or found is None:
+            return False
+        before, self._challenge = self._challenge, found
+        self._count = 0
+        stale = found.parts.get("stale", "").lower() == "true"
+        return before is None or stale or found.parts != before.parts
+
+    def header(self, method: str, uri: str) -> str:
+        """Return the value of ``Authorization``; "" where nobody asked for one."""
+        challenge = self._challenge
+        if challenge is None:
+            return ""
+        if challenge.scheme == "basic":
+            both = f"{self._user}:{self._password}".encode()
+            return f"Basic {base64.b64encode(both).decode()}"
+        self._count += 1
+        return self._digest(challenge, method, uri)
+
+    def _digest(self, challenge: Challenge, method: str, uri: str) -> str:
+        said, hashed = challenge.parts, _hash(challenge.algorithm)
+        realm, nonce = said.get("realm", ""), said["nonce"]
+        secret = hashed(f"{self._user}:{realm}:{self._password}")
+        count, mine = f"{self._count:08x}", secrets.token_hex(8)
+        session = said.get("algorithm", "").upper().endswith("-SESS")
+        if session:
+            secret = hashed(f"{secret}:{nonce}:{mine}")
+        asked, quality = hashed(f"{method}:{uri}"), "qop" in said
+        middle = f"{nonce}:{count}:{mine}:auth" if quality else nonce
+        parts = {"username": self._user, "realm": realm, "nonce": nonce, "uri": uri}
+        parts["response"] = hashed(f"{secret}:{middle}:{asked}")
+        shown = [f"{name}={_quoted(value)}" for name, value in parts.items()]
+        if "algorithm" in said:
+            shown.append(f"algorithm={said['algorithm']}")
+        if "opaque" in said:
+            shown.append(f"opaque={_quoted(said['opaque'])}")
+        if quality or session:
+            shown.append(f'cnonce="{mine}"')
+        if quality:
+            shown += ("qop=auth", f"nc={count}")
+        return f"Digest {', '.join(shown)}"
+
+
+def _hash(algorithm: str) -> Callable[[str], str]:
+    def hashed(text: str) -> str:
+        return _HASHES[algorithm](text.encode(), usedforsecurity=False).hexdigest()
+
+    return hashed
+
+
+def _quoted(text: str) -> str:
+    escaped = re.sub(r'(["\\])', r"\\\1", text)
+    return f'"{escaped}"'

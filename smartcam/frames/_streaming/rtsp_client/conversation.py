@@ -1,0 +1,357 @@
+"""Speak to a camera until it plays, meanwhile, and at the end (RFC 2326)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import unquote, urljoin, urlsplit
+
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._streaming.rtp.packets import ReceiverReport, RtpPacket
+from smartcam.frames._streaming.rtp.sockets import Endpoint, SocketPair
+from smartcam.frames._streaming.rtsp_client.authorization import Credentials
+from smartcam.frames._streaming.rtsp_client.description import VideoTrack, described, url_of
+from smartcam.frames._streaming.rtsp_client.link import RtspLink
+from smartcam.frames._streaming.rtsp_client.ways import ChannelWays, options_of, pair_of
+from smartcam.frames._video.redirects import MAX_REDIRECTS, REDIRECTS, followed, why
+
+if TYPE_CHECKING:
+    import ssl
+
+    from smartcam.frames._streaming.rtp.receiver import PacketWays
+    from smartcam.frames._streaming.rtsp_client.answers import ServerAnswer
+
+
+PORTS: Final = {"rtsp": 554, "rtsps": 322}
+
+CLOSE_TIMEOUT: Final = 0.5
+"""Seconds for a server to answer that it ended the session; then the connection is closed."""
+
+SESSION_TIMEOUT: Final = 60.0
+"""Seconds after which a session without a request ends, unless the server says otherwise."""
+
+MIN_SESSION_TIMEOUT: Final = 1.0
+"""Seconds: where a server says less, it is asked as often as if it had said so."""
+
+GONE_SESSION: Final = 454
+UNSUPPORTED_TRANSPORT: Final = 461
+INVALID_RANGE: Final = 457
+
+
+class OtherEncodingError(FrameFormatError):
+    """A stream that is encoded in a way that we do not receive."""
+
+
+class ConversationPlan(NamedTuple):
+    """Whom to ask, and for what.
+
+    Attributes:
+        name: of the source, for errors.
+        url: with user and password.
+        timeout: seconds until it plays, and for each answer after that.
+        transports: ``tcp`` and ``udp``, in the order in which they are tried.
+        elsewhere: whether a redirect to another host or port is followed.
+        tls: how a server shows who it is, where it is asked by TLS.
+    """
+
+    name: str
+    url: str
+    timeout: float
+    transports: tuple[str, ...]
+    elsewhere: bool = False
+    tls: ssl.SSLContext | None = None
+
+    def wrong(self, text: str) -> FrameSourceError:
+        """Return an error."""
+        return FrameSourceError(f"{self.name}: {text}", source=self.name)
+
+
+class RtspConversation:
+    """One session with a server.
+
+    Attributes:
+        track: the stream that it asked for, once that is known.
+        ways: how its packets come.
+    """
+
+    track: VideoTrack
+    ways: PacketWays
+
+    def __init__(self, plan: ConversationPlan) -> None:
+        self._plan, self._url = plan, plan.url
+        self._link: RtspLink | None = None
+        self._base = self._aggregate = ""
+        self._session = ""
+        self._timeout = SESSION_TIMEOUT
+        self._parameters = False  # whether the server takes GET_PARAMETER
+        self._doing = "the connection"
+        self._sockets: SocketPair | None = None
+        self._alive: asyncio.Task[None] | None = None
+
+    @property
+    def link(self) -> RtspLink:
+        """The connection."""
+        if self._link is None:
+            raise self._plan.wrong("it is not connected")
+        return self._link
+
+    async def set_up(self) -> None:
+        """Ask for the stream, and have its packets come to us once it plays.
+
+        Raises:
+            FrameSourceError: there is no such server or stream, or it refuses, or it is silent.
+
+        Cancellation: :meth:`close` ends what has begun.
+        """
+        plan = self._plan
+        try:
+            async with asyncio.timeout(plan.timeout):
+                await self._describe()
+                await self._choose_transport()
+        except FrameSourceError:
+            raise
+        except TimeoutError:
+            raise self._silent() from None
+        except OSError as exc:
+            raise plan.wrong(f"cannot be read: {why(exc)}") from None
+
+    async def play(self) -> None:
+        """Have it play, and keep the session alive until :meth:`close`.
+
+        Raises:
+            FrameSourceError: it refuses, or is silent.
+        """
+        try:
+            async with asyncio.timeout(self._plan.timeout):
+                await self._begin_to_play()
+        except TimeoutError:
+            raise self._silent() from None
+        keeping = self._keep_alive()
+        self._alive = asyncio.create_task(keeping, name=f"session of {self._plan.name}")
+
+    async def close(self) -> None:
+        """End the session and the connection. Idempotent."""
+        alive, self._alive = self._alive, None
+        link, self._link = self._link, None
+        if alive is not None:
+            alive.cancel()
+            await asyncio.wait([alive])
+        sockets, self._sockets = self._sockets, None
+        if sockets is not None:
+            sockets.close()
+        if link is None:
+            return
+        try:
+            if self._session and not link.ended:
+                link.on_packet = link.on_read = link.on_end = _ignore
+                with contextlib.suppress(FrameSourceError, TimeoutError):
+                    async with asyncio.timeout(CLOSE_TIMEOUT):
+                        await link.ask("TEARDOWN", self._aggregate, self._headers())
+        finally:
+            link.abort()
+
+    def _silent(self) -> FrameSourceError:
+        return self._plan.wrong(
+            f"expected an answer to {self._doing}, got none within {self._plan.timeout:g} s"
+        )
+
+    # until it is set up
+
+    async def _describe(self) -> None:
+        for _ in range(MAX_REDIRECTS):
+            await self._connect()
+            answer = await self._ask("OPTIONS", self._plain())
+            if answer.status not in REDIRECTS:
+                self._parameters = "GET_PARAMETER" in answer.header("public").upper()
+                accept = {"Accept": "application/sdp"}
+                answer = await self._ask("DESCRIBE", self._plain(), accept)
+            location = answer.header("location")
+            if answer.status not in REDIRECTS or not location:
+                self._take_description(answer)
+                return
+            self._redirected(location)
+        raise self._plan.wrong(f"more than {MAX_REDIRECTS} redirects")
+
+    async def _connect(self) -> None:
+        parts = urlsplit(self._url)
+        where = (parts.hostname or "", parts.port or PORTS[parts.scheme])
+        shown = Credentials(unquote(parts.username or ""), unquote(parts.password or ""))
+        self._doing = "the connection"
+        tls = self._plan.tls if parts.scheme == "rtsps" else None
+        self._link = await RtspLink.connect(self._plan.name, where, shown, tls)
+
+    def _plain(self) -> str:
+        """Return the URL without user and password."""
+        parts = urlsplit(self._url)
+        return parts._replace(netloc=parts.netloc.rpartition("@")[2], fragment="").geturl()
+
+    def _redirected(self, location: str) -> None:
+        link = self.link
+        if self._plan.elsewhere:
+            self._url = self._elsewhere(location)
+        else:
+            self._url = followed(self._url, location, str(link.peer[0]), self._plan.name)
+        link.abort()
+
+    def _elsewhere(self, location: str) -> str:
+        """Return the URL that a redirect leads to; another host gets no password of ours."""
+        try:
+            to = urlsplit(urljoin(self._url, location))
+            if to.scheme not in PORTS or not to.hostname or to.port == 0:
+                raise ValueError(location)
+        except ValueError:
+            text = f"expected a redirect to rtsp://HOST, got {location[:80]!r}"
+            raise self._plan.wrong(text) from None
+        before = urlsplit(self._url)
+        if to.hostname == before.hostname and "@" not in to.netloc and before.username:
+            user = before.netloc.rpartition("@")[0]
+            to = to._replace(netloc=f"{user}@{to.netloc}")
+        return to.geturl()
+
+    def _take_description(self, answer: ServerAnswer) -> None:
+        self._expect_ok("DESCRIBE", answer)
+        found = described(answer.body)
+        track = found.chosen()
+        if track is None:
+            raise self._none_of(found.tracks, found.others, answer)
+        base = answer.header("content-base") or answer.header("content-location")
+        if not re.match(r"(?i)rtsps?://", base):
+            base = self._plain()
+        self.track, self._base = track, base
+        self._aggregate = url_of(found.control, base)
+
+    def _none_of(
+        self, tracks: tuple[VideoTrack, ...], others: tuple[str, ...], answer: ServerAnswer
+    ) -> FrameFormatError:
+        got = [f"{'encrypted ' * one.secure}{one.encoding or one.payload_type}" for one in tracks]
+        shown = ", ".join((*got, *others)) or f"{len(answer.body)} bytes without a stream"
+        kind = FrameFormatError
+        if any(one.encoding and not one.secure for one in tracks):
+            kind = OtherEncodingError
+        text = f"{self._plan.name}: expected video in H264, H265 or JPEG, got {shown[:200]}"
+        return kind(text, source=self._plan.name)
+
+    async def _choose_transport(self) -> None:
+        first, *others = self._plan.transports
+        answer = await self._set_up(first)
+        for transport in others:
+            if answer.status == UNSUPPORTED_TRANSPORT:
+                answer = await self._set_up(transport)
+        self._expect_ok("SETUP", answer)
+
+    async def _set_up(self, transport: str) -> ServerAnswer:
+        return await (self._by_channels() if transport == "tcp" else self._by_ports())
+
+    async def _by_channels(self) -> ServerAnswer:
+        asked = "RTP/AVP/TCP;unicast;interleaved=0-1"
+        answer = await self._set_up_track(asked)
+        if answer.status == 200:
+            said = options_of(answer.header("transport") or asked)
+            self._check_transport(said, "RTP/AVP/TCP")
+            channels = pair_of(said.get("interleaved", ""), 255) or (0, 1)
+            self.ways = ChannelWays(self.link, channels, self.track.payload_type)
+        return answer
+
+    async def _by_ports(self) -> ServerAnswer:
+        link = self.link
+        pair = self._open_ports(link)
+        port = pair.rtp.getsockname()[1]
+        answer = await self._set_up_track(f"RTP/AVP;unicast;client_port={port}-{port + 1}")
+        if answer.status == 200:
+            said = options_of(answer.header("transport"))
+            self._check_transport(said, "RTP/AVP")
+            self.ways = pair
+            ports = pair_of(said.get("server_port", ""), 65535)
+            if ports is not None:
+                _open_firewall(pair, str(link.peer[0]), ports)
+        return answer
+
+    def _open_ports(self, link: RtspLink) -> SocketPair:
+        host = str(link.address[0])
+        family = link.family
+        if self._sockets is None:
+            self._sockets = SocketPair.waiting(Endpoint(family, host, 0))
+        return self._sockets
+
+    def _check_transport(self, said: dict[str, str], asked: str) -> None:
+        got = said[""].removesuffix("/UDP") or asked
+        if got != asked or "multicast" in said:
+            shown = f"{got}{';multicast' * ('multicast' in said)}"
+            raise self._plan.wrong(
+                f"SETUP: expected {asked};unicast, as it was asked for, got {shown[:80]!r}"
+            )
+
+    async def _set_up_track(self, transport: str) -> ServerAnswer:
+        url = url_of(self.track.control, self._base)
+        answer = await self._ask("SETUP", url, {"Transport": transport} | self._headers())
+        if answer.status == 404 and "?" in self._base and self.track.control not in ("", "*"):
+            path, _, query = self._base.partition("?")
+            url = f"{url_of(self.track.control, path)}?{query}"
+            answer = await self._ask("SETUP", url, {"Transport": transport} | self._headers())
+        self._take_session(answer)
+        return answer
+
+    def _take_session(self, answer: ServerAnswer) -> None:
+        session, _, options = answer.header("session").partition(";")
+        self._session = session.strip() or self._session
+        found = re.search(r"(?i)timeout\s*=\s*([0-9]{1,6})", options)
+        if found is not None and int(found[1]):
+            self._timeout = max(MIN_SESSION_TIMEOUT, float(found[1]))
+
+    # while it plays
+
+    async def _begin_to_play(self) -> None:
+        begin = {"Range": "npt=0.000-"}
+        answer = await self._ask("PLAY", self._aggregate, begin | self._headers())
+        if answer.status == INVALID_RANGE:
+            answer = await self._ask("PLAY", self._aggregate, self._headers())
+        track = url_of(self.track.control, self._base)
+        if answer.status in (404, 459) and track != self._aggregate:
+            answer = await self._ask("PLAY", track, begin | self._headers())
+        self._expect_ok("PLAY", answer)
+
+    async def _keep_alive(self) -> None:
+        """Say something now and then: in half of the time that the server waits."""
+        while True:
+            await asyncio.sleep(self._timeout / 2)
+            method = "GET_PARAMETER" if self._parameters else "OPTIONS"
+            try:
+                async with asyncio.timeout(min(self._plan.timeout, self._timeout)):
+                    answer = await self.link.ask(method, self._aggregate, self._headers())
+            except TimeoutError:
+                continue  # some do not answer while they play, and the packets tell who is gone
+            except FrameSourceError as error:
+                self.link.fail(str(error).removeprefix(f"{self._plan.name}: "))
+                return
+            if answer.status == GONE_SESSION:
+                self.link.fail(f"{method}: 454 Session Not Found")
+                return
+            self._parameters &= answer.status == 200
+
+    # both
+
+    def _headers(self) -> dict[str, str]:
+        return {"Session": self._session} if self._session else {}
+
+    async def _ask(
+        self, method: str, url: str, headers: dict[str, str] | None = None
+    ) -> ServerAnswer:
+        self._doing = method
+        return await self.link.ask(method, url, headers)
+
+    def _expect_ok(self, method: str, answer: ServerAnswer) -> None:
+        if answer.status != 200:
+            raise self._plan.wrong(f"{method}: {answer.status} {answer.reason}".rstrip())
+
+
+def _open_firewall(pair: SocketPair, host: str, ports: tuple[int, int]) -> None:
+    """Send something to where the packets come from: what lies between then lets them in."""
+    with contextlib.suppress(OSError):
+        pair.rtp.sendto(RtpPacket(False, 0, 0, 0, 0, b"").pack(), (host, ports[0]))
+        pair.rtcp.sendto(ReceiverReport(0).pack(), (host, ports[1]))
+
+
+def _ignore(*_: object) -> None:
+    pass

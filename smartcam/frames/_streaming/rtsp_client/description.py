@@ -1,0 +1,165 @@
+"""Read a server's description of its streams (SDP, RFC 8866) for the first video."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import urlsplit
+
+from smartcam.frames._streaming.rtp.assembling import START_CODE
+from smartcam.frames._streaming.rtp.codings import H264, H265, JPEG, Coding
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+MAX_LINES: Final = 1000
+"""Lines of a description that are read."""
+
+CODINGS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
+"""The encodings that can be received, by their names."""
+
+STATIC: Final = {26: "JPEG", 28: "NV", 31: "H261", 32: "MPV", 33: "MP2T", 34: "H263"}
+"""Encodings by payload types that need no name (RFC 3551)."""
+
+
+class VideoTrack(NamedTuple):
+    """A stream of video.
+
+    Attributes:
+        payload_type: of its packets.
+        encoding: name of the encoding, in capital letters; "": none.
+        control: where to ask for it, as it stands there; "": where one asked for the description.
+        parameters: of its encoding (fmtp), by names in small letters.
+        size: of the pictures where the description says so; None: it does not.
+        secure: whether its packets are encrypted (SRTP).
+    """
+
+    payload_type: int
+    encoding: str
+    control: str = ""
+    parameters: Mapping[str, str] = MappingProxyType({})
+    size: tuple[int, int] | None = None
+    secure: bool = False
+
+    @property
+    def coding(self) -> Coding | None:
+        """Coding of the stream; None for one that we do not receive."""
+        return CODINGS.get(self.encoding)
+
+    @property
+    def sets(self) -> bytes:
+        """The parameters that a decoder needs, as in a file; b"" where the description has none."""
+        names = ("sprop-vps", "sprop-sps", "sprop-pps", "sprop-parameter-sets")
+        units = [one for name in names for one in self.parameters.get(name, "").split(",")]
+        return b"".join(START_CODE + unit for one in units if (unit := _decoded(one)))
+
+
+class StreamDescription(NamedTuple):
+    """The stream that a server offers.
+
+    Attributes:
+        control: where to ask for all streams together, as it stands there; "": nowhere.
+        tracks: of video.
+        others: kinds of the other streams, such as audio.
+    """
+
+    control: str
+    tracks: tuple[VideoTrack, ...]
+    others: tuple[str, ...]
+
+    def chosen(self) -> VideoTrack | None:
+        """Return the first stream of video that we can receive; None: there is none."""
+        ours = (one for one in self.tracks if one.coding is not None and not one.secure)
+        return next(ours, None)
+
+
+def described(body: bytes) -> StreamDescription:
+    """Read a description; what cannot be understood is left out."""
+    lines = body.decode("utf-8", "replace").replace("\r", "\n").split("\n")[:MAX_LINES]
+    sections: list[list[str]] = [[]]
+    for line in lines:
+        if line.startswith("m="):
+            sections.append([])
+        sections[-1].append(line.strip())
+    session, *media = sections
+    kinds = [one[0][2:].split() for one in media]
+    tracks = [
+        _track(kind, one) for kind, one in zip(kinds, media, strict=True) if kind[:1] == ["video"]
+    ]
+    others = tuple(kind[0] for kind in kinds if kind and kind[0] != "video")
+    return StreamDescription(_attribute(session, "control"), tuple(tracks), others)
+
+
+def _track(kind: list[str], lines: list[str]) -> VideoTrack:
+    numbers = [int(one) for one in kind[3:] if re.fullmatch(r"[0-9]{1,3}", one)] or [-1]
+    names = {number: _encoding(number, lines) for number in numbers}
+    number = next((one for one in numbers if names[one] in CODINGS), numbers[0])
+    secure = len(kind) > 2 and kind[2].upper().startswith("RTP/SAVP")
+    parameters = _parameters(_of_type(lines, "fmtp", number))
+    encoding = names[number]
+    if not encoding and "sprop-parameter-sets" in parameters:
+        encoding = "H264"
+    return VideoTrack(
+        number, encoding, _attribute(lines, "control"), parameters, _size(lines), secure
+    )
+
+
+def _encoding(number: int, lines: list[str]) -> str:
+    said = _of_type(lines, "rtpmap", number)
+    return said.partition("/")[0].strip().upper() or STATIC.get(number, "")
+
+
+def _attribute(lines: list[str], name: str) -> str:
+    begins = f"a={name}:"
+    found = next((line for line in lines if line.lower().startswith(begins)), begins)
+    return found[len(begins) :].strip()
+
+
+def _of_type(lines: list[str], name: str, number: int) -> str:
+    """Return the text of an attribute about a payload type."""
+    for line in lines:
+        found = re.fullmatch(rf"(?i)a={name}:\s*([0-9]{{1,3}})\s+(.*)", line)
+        if found is not None and int(found[1]) == number:
+            return found[2]
+    return ""
+
+
+def _parameters(text: str) -> dict[str, str]:
+    parts = (one.partition("=") for one in text.split(";"))
+    return {key.strip().lower(): value.strip() for key, equals, value in parts if equals}
+
+
+def _size(lines: list[str]) -> tuple[int, int] | None:
+    """Return the size that some senders of large JPEGs tell."""
+    for name, between in (("x-dimensions", ","), ("framesize", "-")):
+        found = re.search(rf"([0-9]{{1,5}})\s*{between}\s*([0-9]{{1,5}})", _attribute(lines, name))
+        if found is not None and int(found[1]) and int(found[2]):
+            return int(found[1]), int(found[2])
+    return None
+
+
+def _decoded(text: str) -> bytes:
+    text = text.strip()
+    try:
+        return base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
+    except (binascii.Error, ValueError):
+        return b""
+
+
+def url_of(control: str, base: str) -> str:
+    """Return the URL of a stream: as it stands there, or behind the URL of them all.
+
+    It is only said to the server that sent it; nobody connects there.
+    """
+    if not control or control == "*":
+        return base
+    try:
+        whole = urlsplit(control).scheme.lower() in ("rtsp", "rtsps")
+    except ValueError:
+        whole = False
+    if whole:
+        return control
+    return f"{base}{control}" if base.endswith("/") else f"{base}/{control.removeprefix('/')}"

@@ -1,0 +1,247 @@
+"""Cameras that are asked by RTSP as sources of frames."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+from smartcam._extras import load
+from smartcam.frames._driver import FrameDriver, StreamFormat
+from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
+from smartcam.frames._streaming.rtp.driver import FirstPicture
+from smartcam.frames._streaming.rtp.jpeg import JpegUnits
+from smartcam.frames._streaming.rtp.receiver import RtpStatistics, StreamReceiver
+from smartcam.frames._streaming.rtsp_client.conversation import (
+    ConversationPlan,
+    OtherEncodingError,
+    RtspConversation,
+)
+from smartcam.frames._video.driver import VideoDriver, one_of, tls_of, wanted_format
+from smartcam.frames._video.frames import CONVERTIBLE
+
+if TYPE_CHECKING:
+    from smartcam.frames._address import FrameAddress
+    from smartcam.frames._driver import FrameSink
+    from smartcam.frames._streaming.rtp.assembling import UnitKind
+    from smartcam.frames._streaming.rtsp_client.description import VideoTrack
+
+
+KNOWN: Final = ("delay", "elsewhere", "format", "name", "timeout", "transport")
+
+
+class RtspDriver(FrameDriver):
+    """A camera that is asked by RTSP: ``rtsp://admin:PASSWORD@camera/stream?channel=1``.
+
+    H.264, H.265 and JPEG; what else a camera may send is left to FFmpeg. The query belongs to the
+    camera, so our parameters stand behind ``#``: ``...#transport=udp&timeout=3``.
+
+    ================= =============================================================================
+    ``transport``     ``tcp``, over the connection, or ``udp``; usual: over the connection, or by
+                      UDP where the camera refuses that
+    ``timeout``       seconds until it plays, for a first picture, and without a packet before it
+                      counts as gone; usual 5
+    ``format``        pixels are converted to ``RGB8``, ``BGR8`` or ``Mono8``; ``MJPEG`` or ``H264``
+                      hands the bytes on that came, where it is that; usual: as the decoder has them
+    ``delay``         longest time from exposure to arrival, seconds; usual 1
+    ``verify``        of TLS (``rtsps:``): ``no`` trusts any certificate
+    ``ca``            of TLS: file with the certificates that are trusted; usual: the system's
+    ``elsewhere``     ``yes`` follows a redirect to another host or port; usual ``no``
+    ``name``          of the camera
+    ================= =============================================================================
+
+    Only whole pictures come, each with its last packet. After a loss nothing is shown until the
+    picture is whole again: with the next key frame, for which the camera is asked, or at the end of
+    a refresh. ``frame.lost`` counts the frames that were lost or left out.
+
+    ``captured`` is when a frame's first packet arrived. As soon as the camera told what its clock
+    says (RTCP sender reports), ``device_time`` is the frame's time on it, in seconds since 1970.
+    """
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        secure = address.scheme == "rtsps"
+        said = address.parameters(
+            sorted((*KNOWN, "ca", "verify")) if secure else KNOWN, address.fragment
+        )
+        number = address.number
+        self._name = said.get("name") or address.shown.partition("#")[0].partition("?")[0]
+        self._delay = number("delay", said.get("delay", "1"), 0, 600)
+        wanted = wanted_format(address, said.get("format"))
+        self._format = "" if wanted is None else wanted.name
+        transport = one_of(address, "transport", said, ("tcp", "udp"))
+        transports = (transport,) if "transport" in said else ("tcp", "udp")
+        elsewhere = one_of(address, "elsewhere", said, ("no", "yes")) == "yes"
+        timeout = number("timeout", said.get("timeout", "5"), 0.1, 600)
+        url = address.url.partition("#")[0]
+        tls = tls_of(address, said)
+        if not address.host:
+            raise address.wrong("address", "rtsp://HOST/PATH", address.shown)
+        self._plan = ConversationPlan(self._name, url, timeout, transports, elsewhere, tls)
+        self._size: tuple[int, int] | None = None
+        self._proofs = 0
+        self._playing: _Playing | None = None
+        self._other: VideoDriver | None = None
+
+    @property
+    def name(self) -> str:
+        """The address without password, query and fragment, or as the URL says."""
+        return self._name
+
+    def statistics(self) -> RtpStatistics:
+        """Return the counts of packets since the driver last began to stream."""
+        return RtpStatistics() if self._playing is None else self._playing.statistics()
+
+    async def open(self) -> StreamFormat:
+        """Wait for a picture, and let the camera go again.
+
+        Raises:
+            FrameFormatError: there is no video.
+            FrameSourceError: it is not there, refuses, or is silent.
+            MissingExtraError: the extra ``video`` is not installed.
+        """
+        load("av")
+        first = FirstPicture()
+        try:
+            await self._start(first)
+            async with asyncio.timeout(self._plan.timeout):
+                frame = await first.came
+        except OtherEncodingError:
+            self._other = VideoDriver(self.address)
+            return await self._other.open()
+        except TimeoutError:
+            raise self._plan.wrong(
+                f"expected a whole picture, got none within {self._plan.timeout:g} s: "
+                f"{self.statistics()}"
+            ) from None
+        finally:
+            await self.stop()
+        self._size = (frame.width, frame.height)
+        return StreamFormat(frame.format, *self._size)
+
+    async def start(self, sink: FrameSink) -> None:
+        """Connect anew and play.
+
+        Raises:
+            FrameSourceError: it is gone, refuses, or is silent.
+        """
+        if self._other is not None:
+            await self._other.start(sink)
+        else:
+            await self._start(sink)
+
+    async def _start(self, sink: FrameSink) -> None:
+        await self.stop()
+        conversation = RtspConversation(self._plan)
+        try:
+            await conversation.set_up()
+            plan = self._decoding(conversation.track)
+            watched = self._size is not None
+            self._playing = _Playing(self._plan, plan, conversation, sink, watched, self._proofs)
+            await self._playing.begin()
+        except BaseException:
+            try:
+                await self.stop()
+            finally:
+                await conversation.close()
+            raise
+
+    def _decoding(self, track: VideoTrack) -> DecodingPlan:
+        coding = track.coding
+        assert coding is not None  # noqa: S101 - others are not chosen
+        passed_on = self._format in ("H264", "MJPEG")
+        comes = coding.format if coding.name != "H265" else coding.name
+        if passed_on and comes != self._format:
+            raise self._plan.wrong(f"expected {self._format}, got {comes}")
+        to = "" if passed_on or not self._format else CONVERTIBLE[self._format]
+        name, sets = self._name, track.sets
+        return DecodingPlan(name, coding, self._delay, self._size, sets, to, passed_on)
+
+    async def stop(self) -> None:
+        """End the session."""
+        if self._other is not None:
+            await self._other.stop()
+        playing, self._playing = self._playing, None
+        if playing is not None:
+            self._proofs = playing.proofs
+            await playing.end()
+
+    async def close(self) -> None:
+        """Have nothing left. Idempotent."""
+        await self.stop()
+
+
+class _Playing:
+    """The tasks and the connection of a driver while a camera plays.
+
+    Args:
+        watched: whether silence ends it; who opens it has a timeout of its own, and says more.
+        proofs: frames of the camera whose marker was right before.
+    """
+
+    def __init__(
+        self,
+        plan: ConversationPlan,
+        decoding: DecodingPlan,
+        conversation: RtspConversation,
+        sink: FrameSink,
+        watched: bool,
+        proofs: int,
+    ) -> None:
+        self._plan, self._conversation, self._watched = plan, conversation, watched
+        track = conversation.track
+        kind: UnitKind = decoding.coding.kind()
+        if isinstance(kind, JpegUnits):
+            kind.size = track.size
+        self._decoding = UnitDecoding(decoding, sink)
+        self._watching: asyncio.Task[None] | None = None
+        self._receiver = StreamReceiver(
+            *(conversation.ways, track.payload_type, 0.0, self._decoding.take, self._said_goodbye),
+            only=str(conversation.link.peer[0]).partition("%")[0],
+            kind=kind,
+            agreed=True,
+            proofs=proofs,
+        )
+        conversation.link.on_end = self._over
+
+    async def begin(self) -> None:
+        """Have it play, and decode what comes."""
+        await self._decoding.begin(self._receiver)
+        await self._conversation.play()
+        if self._watched:
+            watching = self._watch()
+            self._watching = asyncio.create_task(watching, name=f"silence of {self._plan.name}")
+
+    async def end(self) -> None:
+        """End all; the sink hears no more."""
+        watching, self._watching = self._watching, None
+        if watching is not None:
+            watching.cancel()
+        try:
+            if watching is not None:
+                await asyncio.wait([watching])
+            self._receiver.close()
+            await self._conversation.close()
+        finally:
+            self._receiver.close()
+            await self._decoding.end()
+
+    @property
+    def proofs(self) -> int:
+        """Frames of the camera whose marker was right."""
+        return self._receiver.proofs
+
+    def statistics(self) -> RtpStatistics:
+        """Return the counts of packets received."""
+        return self._receiver.statistics(self._decoding.overflows)
+
+    def _said_goodbye(self, reason: str) -> None:
+        self._over(f"the server ended the stream{f' ({reason})' if reason else ''}")
+
+    def _over(self, why: str) -> None:
+        self._decoding.over(self._plan.wrong(why))
+
+    async def _watch(self) -> None:
+        loop, longest = asyncio.get_running_loop(), self._plan.timeout
+        while (left := self._receiver.heard + longest - loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(left)
+        self._over(f"no packet came for {longest:g} s")

@@ -1,0 +1,243 @@
+"""One RTSP connection: requests and their answers, and the packets between them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.exceptions import FrameSourceError, MessageError
+from smartcam.frames._streaming.rtsp_client.answers import (
+    AnswerParser,
+    ChannelPacket,
+    ServerAnswer,
+    ServerRequest,
+)
+from smartcam.frames._streaming.rtsp_client.authorization import challenge_of
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import Callable
+
+    from smartcam.frames._streaming.rtsp_client.authorization import Credentials
+
+
+MAX_UNSENT_BYTES: Final = 64 << 10
+"""Bytes that may wait for a server; what would come on top, such as a report, is left out."""
+
+MAX_REFUSALS: Final = 3
+"""Refusals of one request for its password, such as by a nonce that is too old."""
+
+MAX_UNANSWERED: Final = 32
+"""Requests without an answer that are remembered, for theirs may come late."""
+
+_ALLOWED: Final = ("GET_PARAMETER", "OPTIONS", "SET_PARAMETER")
+_ENDING: Final = ("REDIRECT", "TEARDOWN")
+
+
+class RtspLink(asyncio.Protocol):
+    """A connection to a server; one task asks, and packets are handed on as they come.
+
+    Args:
+        name: of the source, for errors.
+        credentials: what to show who asks for a password.
+
+    Attributes:
+        on_packet: takes a channel and a packet.
+        on_read: is called after the packets that came together.
+        on_end: takes why the server ended it, once.
+    """
+
+    def __init__(self, name: str, credentials: Credentials) -> None:
+        self.name, self._credentials = name, credentials
+        self.on_packet: Callable[[int, bytes], None] = _ignore
+        self.on_read: Callable[[], None] = _ignore
+        self.on_end: Callable[[str], None] = _ignore
+        self.ended = ""  # why it did
+        self._parser = AnswerParser()
+        self._transport: asyncio.Transport | None = None
+        self._cseq = 0
+        self._waiting: tuple[int, asyncio.Future[ServerAnswer]] | None = None
+        self._unanswered: list[int] = []
+        self._turn = asyncio.Lock()
+
+    @classmethod
+    async def connect(
+        cls, name: str, where: tuple[str, int], credentials: Credentials, tls: ssl.SSLContext | None
+    ) -> RtspLink:
+        """Return a connection to a host and port.
+
+        Raises:
+            OSError: there is none.
+        """
+        loop = asyncio.get_running_loop()
+        _, link = await loop.create_connection(
+            lambda: cls(name, credentials),
+            *where,
+            ssl=tls,
+            server_hostname=where[0] if tls else None,
+        )
+        return link
+
+    @property
+    def peer(self) -> tuple[Any, ...]:
+        """The server's address."""
+        return tuple(self._of_socket("peername"))
+
+    @property
+    def address(self) -> tuple[Any, ...]:
+        """Our own address."""
+        return tuple(self._of_socket("sockname"))
+
+    @property
+    def family(self) -> socket.AddressFamily:
+        """The kind of the addresses."""
+        return socket.AF_INET6 if ":" in str(self.peer[0]) else socket.AF_INET
+
+    def fail(self, why: str) -> None:
+        """End it for a reason that :attr:`on_end` is told."""
+        self._end(why)
+
+    def _of_socket(self, what: str) -> Any:
+        found = None if self._transport is None else self._transport.get_extra_info(what)
+        if not found:
+            raise self._error(self.ended or "the connection is lost")
+        return found
+
+    async def ask(
+        self, method: str, url: str, headers: dict[str, str] | None = None
+    ) -> ServerAnswer:
+        """Send a request, and return its answer; a password is shown where it is asked for.
+
+        Raises:
+            FrameSourceError: the connection ended, or the password is wanted and not known.
+        """
+        async with self._turn:
+            for refusals in range(1, MAX_REFUSALS + 1):
+                answer = await self._asked(method, url, headers or {})
+                if answer.status != 401:
+                    return answer
+                challenges = answer.headers.get("www-authenticate", ())
+                if refusals == MAX_REFUSALS or not self._credentials.challenged(challenges):
+                    raise self._refused(method, answer)
+            raise AssertionError("MAX_REFUSALS is at least 1")
+
+    def _refused(self, method: str, answer: ServerAnswer) -> FrameSourceError:
+        challenges = answer.headers.get("www-authenticate", ())
+        shown = ", ".join(challenges)[:200] or "no challenge"
+        cure = f"expected Basic, or Digest with MD5 or SHA-256, got {shown!r}"
+        if not self._credentials.known:
+            cure = "put USER:PASSWORD@ before the host"
+        elif challenge_of(challenges) is not None:
+            cure = "wrong user or password"
+        return self._error(f"{method}: 401 Unauthorized: {cure}")
+
+    async def _asked(self, method: str, url: str, headers: dict[str, str]) -> ServerAnswer:
+        self._cseq += 1
+        lines = [f"{method} {url} RTSP/1.0", f"CSeq: {self._cseq}", "User-Agent: smartcam"]
+        shown = self._credentials.header(method, url)
+        lines += [f"Authorization: {shown}"] if shown else []
+        lines += (f"{name}: {value}" for name, value in headers.items())
+        answered: asyncio.Future[ServerAnswer] = asyncio.get_running_loop().create_future()
+        self._waiting = (self._cseq, answered)
+        try:
+            if not self.write("\r\n".join((*lines, "", "")).encode()):
+                raise self._error(self.ended or "it takes nothing any more")
+            return await answered
+        finally:
+            if self._waiting is not None and not answered.done():
+                self._unanswered = [*self._unanswered[1 - MAX_UNANSWERED :], self._waiting[0]]
+            self._waiting = None
+
+    def write(self, data: bytes) -> bool:
+        """Send bytes; return False where too many wait already, or it has ended."""
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return False
+        if transport.get_write_buffer_size() > MAX_UNSENT_BYTES:
+            return False
+        transport.write(data)
+        return True
+
+    def close(self) -> None:
+        """End it, when what was written is taken; nothing is handed on any more. Idempotent."""
+        self.on_packet, self.on_read, self.on_end = _ignore, _ignore, _ignore
+        self._end("it was closed")
+
+    def abort(self) -> None:
+        """End it at once. Idempotent."""
+        self.close()
+        if self._transport is not None:
+            self._transport.abort()
+
+    # asyncio
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Begin."""
+        assert isinstance(transport, asyncio.Transport)  # noqa: S101 - of a socket
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes."""
+        if self.ended:
+            return
+        self._parser.feed(data)
+        try:
+            while not self.ended and (came := self._parser.next()) is not None:
+                self._take(came)
+        except MessageError as error:
+            self._end(str(error))
+        self.on_read()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Tell whoever waits for an answer that none comes."""
+        why = getattr(exc, "strerror", None) if exc is not None else None
+        self._end(f"the connection is lost: {why}" if why else "the server closed the connection")
+
+    # what comes
+
+    def _take(self, came: ServerAnswer | ServerRequest | ChannelPacket) -> None:
+        if isinstance(came, ChannelPacket):
+            self.on_packet(came.channel, came.data)
+        elif isinstance(came, ServerAnswer):
+            self._answered(came)
+        else:
+            self._requested(came)
+
+    def _answered(self, answer: ServerAnswer) -> None:
+        """Hand an answer on; some servers say another number, or none."""
+        cseq = answer.cseq
+        if cseq in self._unanswered:
+            self._unanswered.remove(cseq)
+        elif self._waiting is not None and not self._waiting[1].done() and answer.status >= 200:
+            self._waiting[1].set_result(answer)
+
+    def _requested(self, request: ServerRequest) -> None:
+        """ServerAnswer what a server asks; some see whether somebody is there."""
+        known = request.method in (*_ALLOWED, *_ENDING)
+        cseq = next(iter(request.headers.get("cseq", ())), "0")[:16]
+        said = "200 OK" if known else "501 Not Implemented"
+        self.write(f"RTSP/1.0 {said}\r\nCSeq: {cseq}\r\n\r\n".encode("latin-1"))
+        if request.method in _ENDING:
+            self._end(f"the server ended the session ({request.method})")
+
+    def _end(self, why: str) -> None:
+        if self.ended:
+            return
+        self.ended = why
+        if self._waiting is not None and not self._waiting[1].done():
+            self._waiting[1].set_exception(self._error(why))
+            self._waiting[1].exception()  # nobody may wait for it any longer
+        told, self.on_end = self.on_end, _ignore
+        told(why)
+        if self._transport is not None:
+            with contextlib.suppress(RuntimeError):  # the loop is closed
+                self._transport.close()
+
+    def _error(self, text: str) -> FrameSourceError:
+        return FrameSourceError(f"{self.name}: {text}", source=self.name)
+
+
+def _ignore(*_: object) -> None:
+    pass

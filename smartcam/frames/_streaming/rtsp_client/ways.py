@@ -1,0 +1,83 @@
+"""Receive a stream's packets between the answers of a connection, or by UDP."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+from smartcam.frames._streaming.rtp.packets import is_rtcp
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.frames._streaming.rtsp_client.link import RtspLink
+
+
+def options_of(transport: str) -> dict[str, str]:
+    """Return the options of the first transport of a header, by names in small letters."""
+    protocol, *rest = transport.partition(",")[0].split(";")
+    parts = (one.strip().partition("=") for one in rest)
+    options = {name.lower(): value.strip().strip('"') for name, _, value in parts}
+    return {"": protocol.strip().upper()} | options
+
+
+def pair_of(text: str, most: int) -> tuple[int, int] | None:
+    """Return a pair of channels or ports; the second one is the next where it is not there."""
+    found = re.fullmatch(r"([0-9]{1,5})(?:-([0-9]{1,5}))?", text)
+    if found is None:
+        return None
+    first = int(found[1])
+    second = int(found[2]) if found[2] else first + 1
+    return (first, second) if max(first, second) <= most and first != second else None
+
+
+class ChannelWays:
+    """Packets on two channels of a connection.
+
+    Some servers use other channels than they say: as long as none came on those, a packet of the
+    stream's type on another one shows which it is.
+
+    Args:
+        link: the connection.
+        channels: of packets, and of reports.
+        payload_type: of the stream's packets.
+    """
+
+    def __init__(self, link: RtspLink, channels: tuple[int, int], payload_type: int) -> None:
+        self._link, self._channels, self._type = link, channels, payload_type
+        self._sure = False
+        self._rtp: Callable[[bytes, tuple[Any, ...]], None] | None = None
+        self._rtcp: Callable[[bytes, tuple[Any, ...]], None] | None = None
+        self._from = link.peer
+
+    def read(
+        self,
+        rtp: Callable[[bytes, tuple[Any, ...]], None] | None,
+        rtcp: Callable[[bytes, tuple[Any, ...]], None],
+        read: Callable[[], None],
+    ) -> None:
+        """Call for each packet and report, until :meth:`close`."""
+        self._rtp, self._rtcp = rtp, rtcp
+        self._link.on_packet, self._link.on_read = self._packet, read
+
+    def _packet(self, channel: int, data: bytes) -> None:
+        report = is_rtcp(data)
+        if not self._sure and channel not in self._channels and not report:
+            if len(data) < 2 or data[1] & 0x7F != self._type:
+                return
+            self._channels = (channel, channel ^ 1)
+        if channel not in self._channels:
+            return
+        self._sure |= not report and channel == self._channels[0]
+        take = self._rtcp if report else self._rtp
+        if take is not None:
+            take(data, self._from)
+
+    def report(self, data: bytes, _: tuple[Any, ...]) -> None:
+        """Send a report; where too much waits already it is left out, since the next comes soon."""
+        head = bytes((0x24, self._channels[1])) + len(data).to_bytes(2, "big")
+        self._link.write(head + data)
+
+    def close(self) -> None:
+        """Call no more."""
+        self._rtp = self._rtcp = None

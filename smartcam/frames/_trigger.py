@@ -1,0 +1,140 @@
+"""Triggers of a source: one at a time, each with the picture that it caused, or a typed error.
+
+A trigger that was sent and whose picture was not seen leaves the stream unsettled: the picture may
+still come. So the stream begins anew before the next trigger, and what comes of the old one is
+dropped with it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import CameraBusyError, FrameSourceError, TriggerTimeoutError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.exceptions import SmartCamError
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._source import FrameSource
+
+
+MAX_NOTES = 5
+"""Things that an error's text tells of what happened meanwhile."""
+
+
+class AwaitedTrigger:
+    """A trigger that is under way.
+
+    Attributes:
+        number: number of the trigger, counted by its source.
+        fired: time right before it was sent, seconds of ``time.monotonic()``; None: it was not.
+        outcome: the frame, or the error.
+        notes: what happened meanwhile, for the error's text.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.fired: float | None = None
+        self.outcome: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
+        self.notes: list[str] = []
+
+    def fire_begins(self) -> None:
+        """Note that the trigger is sent now."""
+        self.fired = time.monotonic()
+
+    def refused(self) -> None:
+        """Note that the device did not take the trigger, and causes no picture for it."""
+        self.fired = None
+
+
+class TriggerQueue:
+    """The triggers of a source, one after the other.
+
+    Args:
+        source: source that is triggered.
+
+    Attributes:
+        settled: whether no picture of an earlier trigger can still come.
+    """
+
+    def __init__(self, source: FrameSource) -> None:
+        self._source = source
+        self._lock = asyncio.Lock()
+        self._pending: AwaitedTrigger | None = None
+        self._number = 0
+        self.settled = True
+
+    async def trigger(
+        self, seconds: float, refuse: bool, fire: Callable[[], Awaitable[object]] | None
+    ) -> Frame:
+        """Trigger once, as :meth:`FrameSource.trigger` does."""
+        name = self._source.name
+        driver = self._source.driver
+        if fire is None and (frame := await driver.trigger_elsewhere(seconds, refuse=refuse)):
+            return frame
+        if refuse and self._lock.locked():
+            raise CameraBusyError(f"{name}: a trigger is under way, and waiting was not wanted")
+        doing = ["waiting for the triggers before it"]
+        pending = AwaitedTrigger(0)
+        try:
+            async with asyncio.timeout(seconds), self._lock:
+                doing.append("starting the stream")
+                async with self._source.reader(timeout=None) as reader:
+                    await self._source.wait_until_streaming(reader, anew=not self.settled)
+                    self._number += 1
+                    pending.number = self._number
+                    doing.append("triggering")
+                    return await self._one(pending, fire)
+        except FrameSourceError:
+            raise
+        except TimeoutError as exc:
+            notes = "".join(f"; {one}" for one in pending.notes[:MAX_NOTES])
+            waits = self._source.driver.waits_for
+            raise TriggerTimeoutError(
+                f"{name}: no picture of the trigger within {seconds:g} s, which ran out while "
+                f"{doing[-1]}{notes}{f'; {waits}' if waits else ''}",
+                waited=seconds,
+            ) from exc
+
+    async def _one(
+        self, pending: AwaitedTrigger, fire: Callable[[], Awaitable[object]] | None
+    ) -> Frame:
+        driver = self._source.driver
+        self._pending = pending
+        try:
+            try:
+                await driver.trigger(pending, fire)
+            except FrameSourceError:
+                if not _came(pending):  # only the answer to the trigger was lost
+                    raise
+            return await pending.outcome
+        finally:
+            self._pending = None
+            driver.disarm()
+            self.settled = self.settled and (pending.fired is None or _came(pending))
+            if not pending.outcome.cancel() and not pending.outcome.cancelled():
+                pending.outcome.exception()  # somebody was told already
+
+    def came(self, frame: Frame) -> None:
+        """Take the frame that the driver says a trigger caused."""
+        pending = self._pending
+        if (
+            pending is not None
+            and frame.trigger is not None
+            and frame.trigger.number == pending.number
+            and not pending.outcome.done()
+        ):
+            pending.outcome.set_result(frame)
+
+    def failed(self, error: SmartCamError) -> None:
+        """Take that the trigger under way has no picture."""
+        if self._pending is not None and not self._pending.outcome.done():
+            self._pending.outcome.set_exception(error)
+
+
+def _came(pending: AwaitedTrigger) -> bool:
+    outcome = pending.outcome
+    return outcome.done() and not outcome.cancelled() and outcome.exception() is None

@@ -1,0 +1,224 @@
+"""A V4L2 device's controls as features: by SFNC's names and units where it has the same thing.
+
+A control that SFNC does not know keeps its own name, its label in small letters with underscores.
+Both names of a control are known.
+
+Source: V4L2 documentation, user, camera and image process control classes (numbers and units:
+``V4L2_CID_EXPOSURE_ABSOLUTE`` counts 100 us); SFNC 2.7 (names; entries of ``...Auto``).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import FrameFeatureError
+from smartcam.frames._features import DeviceFeatures, Feature, FeatureValue, spelled
+from smartcam.frames._v4l2 import abi
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Literal
+
+    from smartcam.frames._features import FeatureKind
+    from smartcam.frames._v4l2.controls import DeviceControl
+    from smartcam.frames._v4l2.driver import V4L2Driver
+
+
+class SfncFeature(NamedTuple):
+    """The feature of SFNC that a control is.
+
+    Attributes:
+        name: name of the feature.
+        unit: unit of the feature.
+        factor: the control's number times this is the feature's value; 1: it stays a whole number.
+        entries: name in SFNC of each of the control's values; empty: they keep their own.
+    """
+
+    name: str
+    unit: str = ""
+    factor: int = 1
+    entries: Mapping[int, str] = {}
+
+
+_SWITCH: Final[Mapping[int, str]] = {0: "Off", 1: "Continuous"}
+
+SFNC: Final = {
+    0x009A0902: SfncFeature("ExposureTime", "us", 100),
+    0x009A0901: SfncFeature("ExposureAuto", entries={1: "Off", 0: "Continuous"}),
+    0x00980913: SfncFeature("Gain"),
+    0x00980912: SfncFeature("GainAuto", entries=_SWITCH),
+    0x0098090C: SfncFeature("BalanceWhiteAuto", entries=_SWITCH),
+    0x00980914: SfncFeature("ReverseX"),
+    0x00980915: SfncFeature("ReverseY"),
+    0x009F0903: SfncFeature("TestPattern"),
+}
+"""Features by the number of their control."""
+
+APERTURE_PRIORITY: Final = 3
+"""V4L2_EXPOSURE_APERTURE_PRIORITY: exposure time automatic, iris by hand, which most webcams have
+in place of V4L2_EXPOSURE_AUTO."""
+
+_KINDS: Final[Mapping[str, FeatureKind]] = {
+    "integer": "integer",
+    "bitmask": "integer",
+    "boolean": "boolean",
+    "menu": "enumeration",
+    "button": "command",
+}
+
+
+class ControlFeature:
+    """One control as a feature.
+
+    Args:
+        control: control of the device.
+    """
+
+    def __init__(self, control: DeviceControl) -> None:
+        self.control = control
+        known = SFNC.get(control.number)
+        self._known = known or SfncFeature(control.name)
+        entries = dict(self._known.entries)
+        if self.name == "ExposureAuto" and 0 not in control.menu:
+            entries[APERTURE_PRIORITY] = entries.pop(0)
+        values = control.menu or entries
+        self._entries = {value: entries.get(value, label) for value, label in values.items()}
+
+    @property
+    def name(self) -> str:
+        """Name of the feature."""
+        return self._known.name
+
+    @property
+    def spellings(self) -> set[str]:
+        """Spellings of all names of the feature."""
+        return {spelled(self.name), spelled(self.control.name)}
+
+    def value(self, number: int | None) -> FeatureValue | None:
+        """Return the feature's value for a number of the control."""
+        if number is None or self.control.kind == "button":
+            return None
+        if self._entries:
+            return self._entries.get(number, str(number))
+        if self.control.kind == "boolean":
+            return bool(number)
+        return number if self._known.factor == 1 else float(number * self._known.factor)
+
+    def number(self, value: FeatureValue) -> int | None:
+        """Return the control's number for a value; None: the device has no such value."""
+        if self._entries:
+            wanted = spelled(str(value))
+            names = self._entries.items()
+            return next((number for number, name in names if spelled(name) == wanted), None)
+        if isinstance(value, float) and self._known.factor == 1:
+            return self.control.number_of(int(value)) if value.is_integer() else None
+        if not isinstance(value, float) and self._known.factor == 1:
+            return self.control.number_of(value)
+        try:
+            number = round(float(value) / self._known.factor)
+        except (ValueError, OverflowError):
+            return None
+        inside = self.control.least <= number <= self.control.most
+        step = max(1, self.control.step)
+        return self.control.least + (number - self.control.least) // step * step if inside else None
+
+    def described(self) -> Feature:
+        """Return the feature with its range and its present value."""
+        control = self.control
+        access: Literal["rw", "ro", "wo"] = "rw"
+        if control.flags & abi.CTRL_READ_ONLY:
+            access = "ro"
+        elif control.flags & abi.CTRL_WRITE_ONLY or control.kind == "button":
+            access = "wo"
+        kind: FeatureKind = "enumeration" if self._entries else _KINDS[control.kind]
+        factor = self._known.factor
+        if factor != 1:
+            kind = "float"
+        ranged = kind in ("integer", "float") and control.kind != "bitmask"
+        return Feature(
+            self.name,
+            kind,
+            access,
+            value=self.value(control.value),
+            minimum=control.least * factor if ranged else None,
+            maximum=control.most * factor if ranged else None,
+            step=max(1, control.step) * factor if ranged else None,
+            unit=self._known.unit,
+            entries=tuple(self._entries.values()),
+            description=f"V4L2 control {control.name}",
+        )
+
+
+class V4L2Features(DeviceFeatures):
+    """The controls of a V4L2 device as features.
+
+    Args:
+        driver: driver of the device.
+    """
+
+    def __init__(self, driver: V4L2Driver) -> None:
+        self._driver = driver
+
+    async def _all(self) -> list[ControlFeature]:
+        return [ControlFeature(one) for one in (await self._driver.controls()).values()]
+
+    async def names(self) -> list[str]:
+        """Return the names of all features."""
+        return [one.name for one in await self._all()]
+
+    async def describe_all(self) -> dict[str, Feature]:
+        """Return all features with their values and ranges as they are now."""
+        return {one.name: one.described() for one in await self._all()}
+
+    async def describe(self, name: str) -> Feature:
+        """Return a feature with its value and range as they are now."""
+        return (await self._found(name)).described()
+
+    async def get(self, name: str) -> FeatureValue:
+        """Return the value of a feature."""
+        found = await self._found(name)
+        value = found.value(found.control.value)
+        if value is None:
+            raise self._wrong(found, "it has no value that can be read")
+        return value
+
+    async def set(self, name: str, value: FeatureValue) -> FeatureValue:
+        """Set a feature; return the value that the device has then."""
+        found = await self._found(name)
+        if found.control.kind == "button":
+            raise self._wrong(found, "it is a command: it is executed")
+        number = found.number(value)
+        if number is None:
+            raise self._wrong(found, f"expected {found.described().range}, got {value!r}")
+        has = await self._driver.set_control(found.control.name, number)
+        got = found.value(has)
+        return value if got is None else got
+
+    async def execute(self, name: str) -> None:
+        """Execute a command."""
+        found = await self._found(name)
+        if found.control.kind != "button":
+            raise self._wrong(found, "it is no command: it is set")
+        await self._driver.set_control(found.control.name, 1)
+
+    async def _found(self, name: str) -> ControlFeature:
+        features = await self._all()
+        wanted = spelled(name)
+        for one in features:
+            if wanted in one.spellings:
+                return one
+        names = [one.name for one in features]
+        raise FrameFeatureError(
+            f"{self._driver.name}: it has no feature {name!r}{did_you_mean(name, names)}; it has "
+            f"{', '.join(names) or 'none'}",
+            source=self._driver.name,
+            available=tuple(names),
+        )
+
+    def _wrong(self, found: ControlFeature, text: str) -> FrameFeatureError:
+        return FrameFeatureError(
+            f"{self._driver.name}: feature {found.name}: {text}",
+            source=self._driver.name,
+            available=(str(found.described()),),
+        )

@@ -1,0 +1,414 @@
+"""Pictures out of FFmpeg, one after the other: what runs in a video source's thread."""
+
+from __future__ import annotations
+
+import errno
+import glob
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam._extras import load
+from smartcam._natural import natural
+from smartcam.exceptions import FrameFormatError, FrameSourceError
+from smartcam.frames._video.frames import CONVERTIBLE, Pixels, from_video
+from smartcam.frames._video.redirects import follow_redirects
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import Callable, Mapping
+
+    from smartcam.frames._pixels.formats import PixelFormat
+
+
+PICTURES: Final = frozenset(
+    {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+)
+"""Suffixes of the files in a folder that count as pictures."""
+
+KNOWS_REDIRECTS: Final = (62, 0, 0)
+"""Version of libavformat from which on it can be told to follow no redirect."""
+
+UNBUFFERED_WAIT_TIME: Final = 0.01
+"""Seconds after which a packet that was waited for came just now, and not out of a buffer."""
+
+_PASSED_ON: Final = {"mjpeg": "MJPEG", "h264": "H264"}
+"""Codecs whose bytes are a format of ours, and so can be handed on as they are."""
+
+_ONE_BY_ONE: Final = frozenset({"mjpeg", "png", "rawvideo", "bmp", "jpeg2000", "ffv1", "huffyuv"})
+"""Codecs in which a damaged picture spoils no other picture."""
+
+_EXPLODES_AT_TAGS: Final = frozenset({"tiff"})
+"""Codecs that take each tag they do not know for damage if asked to be strict; a picture that is
+cut off, or whose strips are, is an error to them all the same."""
+
+FORMATS: Final = (
+    "asf,avi,dv,flv,gif,h264,hevc,ivf,m4v,matroska,mjpeg,mov,mpeg,mpegts,mpegvideo,mpjpeg,mxf,nut,"
+    "obu,ogg,rawvideo,vc1,wtv,yuv4mpegpipe,apng,webp,bmp_pipe,j2k_pipe,jpeg_pipe,jpegls_pipe,"
+    "jpegxl_pipe,pam_pipe,pbm_pipe,pgm_pipe,png_pipe,ppm_pipe,tiff_pipe,webp_pipe"
+)
+"""Formats for which FFmpeg may take bytes, all with the pictures in them. Playlists and
+descriptions (HLS, DASH, SDP, concat and others) name other places, which would be read."""
+
+PROTOCOLS: Final = {
+    "file": "file",
+    "http": "http,httpproxy,tcp",
+    "https": "http,https,httpproxy,tcp,tls",
+    "rtsp": "rtp,tcp,udp",
+    "rtsps": "rtp,tcp,tls,udp",
+}
+"""By what FFmpeg may read, by the URL's scheme; a proxy is one that the environment names."""
+
+ELSEWHERE: Final = "crypto,data,http,https,httpproxy,rtp,tcp,tls,udp"
+"""By what it may read where it may follow a server to other places: never this machine's files."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoPlan:
+    """The plan for reading a video: its URL, options and bounds.
+
+    Attributes:
+        name: name of the source for errors, without a password.
+        url: URL for FFmpeg.
+        options: options for FFmpeg.
+        timeout: seconds for connecting, and for every wait after that.
+        format: format that pixels are converted to, or bytes are handed on in; None: the decoder's
+            own.
+        network: True if the video comes from a server; without a length it is a live stream.
+        elsewhere: whether FFmpeg may go where the server sends it, by a redirect or a playlist.
+        tls: context that checks the server's certificate; None: the default check.
+    """
+
+    name: str
+    url: str
+    options: Mapping[str, str] = field(default_factory=dict)
+    timeout: float = 5.0
+    format: PixelFormat | None = None
+    network: bool = False
+    elsewhere: bool = False
+    tls: ssl.SSLContext | None = None
+
+    def wrong(self, text: str) -> FrameFormatError:
+        """Return the error of bytes that are not as they should be."""
+        return FrameFormatError(f"{self.name}: {text}", source=self.name)
+
+
+class Read(NamedTuple):
+    """A picture.
+
+    Attributes:
+        pixels: of it.
+        time: seconds by the stream's own clock; None: it has none.
+        arrived: seconds of ``time.monotonic()``, before it was decoded, or earlier.
+        lost: damaged ones that came before it.
+        clock: ``time`` is the camera's, not one that was counted up here.
+    """
+
+    pixels: Pixels
+    time: float | None
+    arrived: float
+    lost: int
+    clock: bool = False
+
+
+class PictureReading(ABC):
+    """Something that pictures are read from; its methods block, and one thread calls them.
+
+    Attributes:
+        stopped: set by whoever wants no more; then a picture that is looked for is given up.
+    """
+
+    def __init__(self, plan: VideoPlan) -> None:
+        self.plan = plan
+        self.stopped = threading.Event()
+
+    @property
+    @abstractmethod
+    def live(self) -> bool:
+        """True if the pictures go on by themselves, so that none of them can wait."""
+
+    @property
+    @abstractmethod
+    def rate(self) -> float | None:
+        """Pictures a second; None: unknown."""
+
+    @abstractmethod
+    def read(self) -> Read | None:
+        """Return the next picture; None at the end, or when it is stopped.
+
+        Raises:
+            FrameSourceError: it is gone, silent, or something else than it was.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give it back. Idempotent."""
+
+
+class VideoReading(PictureReading):
+    """A stream or file, opened.
+
+    Raises:
+        FrameFormatError: there is no video in it.
+        FrameSourceError: it is not there, refuses, or is silent.
+        MissingExtraError: the extra ``video`` is not installed.
+    """
+
+    def __init__(self, plan: VideoPlan) -> None:
+        super().__init__(plan)
+        self._given_any = False
+        self._start_codes: Any = None
+        self._began = time.monotonic()
+        self._container = self._opened()
+        self._open_from = time.monotonic()
+        self._behind = True  # what comes has waited while FFmpeg looked what it is
+        try:
+            self._stream = self._first_stream()
+            self._packets = self._container.demux(self._stream)
+            rate = self._stream.average_rate  # nothing may be asked for once it is closed
+            self._rate = float(rate) if rate else None
+            self._live = self.plan.network and self._container.duration is None
+        except BaseException:
+            self.close()
+            raise
+        self._pictures: deque[tuple[Any, float]] = deque()
+        self._lost = 0
+
+    def _opened(self) -> Any:
+        """Return the container that FFmpeg opens, which reads nothing but what the URL names."""
+        plan, scheme = self.plan, self.plan.url.partition(":")[0]
+        if plan.elsewhere:
+            return self._open(plan.url, {"protocol_whitelist": ELSEWHERE})
+        formats = {"file": f"{FORMATS},image2", "rtsp": "rtsp", "rtsps": "rtsp"}
+        bounds = {
+            "protocol_whitelist": PROTOCOLS[scheme],
+            "format_whitelist": formats.get(scheme, FORMATS),
+        }
+        if scheme.startswith("rtsp"):
+            return self._open(self._followed(), bounds)
+        if scheme == "file":
+            return self._open(plan.url, bounds)
+        bounds["max_redirects"] = "0"
+        if load("av").library_versions["libavformat"] < KNOWS_REDIRECTS:
+            return self._open(self._followed(), bounds)
+        try:
+            return self._open(plan.url, bounds)
+        except FrameSourceError as error:
+            cause = error.__cause__
+            if not isinstance(cause, OSError) or cause.errno != errno.EIO:
+                raise
+            url = self._followed()
+            if url == plan.url:
+                raise
+        return self._open(url, bounds)
+
+    def _followed(self) -> str:
+        plan = self.plan
+        return follow_redirects(plan.url, name=plan.name, timeout=plan.timeout, tls=plan.tls)
+
+    def _open(self, url: str, bounds: Mapping[str, str]) -> Any:
+        options = {**self.plan.options, **bounds}
+        limits = (self.plan.timeout, self.plan.timeout)
+        try:
+            return self._tried(lambda: load("av").open(url, options=options, timeout=limits))
+        except FrameFormatError as error:
+            cause = error.__cause__
+            if isinstance(cause, OSError) and cause.errno == errno.EINVAL:
+                cure = "; #elsewhere=yes follows a playlist" if self.plan.network else ""
+                raise self.plan.wrong(
+                    "expected a format with the pictures in it, got one that FFmpeg may not take: "
+                    f"a playlist or another list of places{cure}"
+                ) from cause
+            raise
+
+    def _tried(self, do: Callable[[], Any]) -> Any:
+        """Return the result of a call to FFmpeg, None at the end of the video."""
+        begun = time.monotonic()
+        try:
+            return do()
+        except EOFError as exc:
+            failure: Exception = exc
+        except load("av").FFmpegError as exc:
+            failure = exc
+        if isinstance(failure, EOFError) and self._given_any:
+            return None
+        # raised here and not above, for what failed has the URL in its text, and so the password
+        raise self._error(failure, time.monotonic() - begun) from _plain(failure)
+
+    def _first_stream(self) -> Any:
+        streams = self._container.streams.video
+        if not streams:
+            raise self.plan.wrong(f"expected video, got {self._container.format.long_name}")
+        stream = streams[0]
+        stream.codec_context.thread_count = 1  # more of them hold frames back
+        if stream.codec_context.name not in _EXPLODES_AT_TAGS:
+            stream.codec_context.options = {"err_detect": "explode"}  # half a picture is none
+        wanted = self.plan.format
+        if wanted is not None and wanted.compressed:
+            comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
+            if comes != wanted.name:
+                raise self.plan.wrong(f"expected {wanted.name}, got {comes}")
+            if comes == "H264":  # files have lengths where V4L2, and our H264, has start codes
+                bitstream = load("av.bitstream").BitStreamFilterContext
+                self._start_codes = bitstream("h264_mp4toannexb", stream)
+        return stream
+
+    @property
+    def live(self) -> bool:
+        """True if a server sends the pictures, and does not know how many there are."""
+        return self._live
+
+    @property
+    def rate(self) -> float | None:
+        """As the stream says."""
+        return self._rate
+
+    def read(self) -> Read | None:
+        """Return the next picture."""
+        begun = time.monotonic()
+        while not self._pictures and not self.stopped.is_set():
+            if self.plan.network and time.monotonic() - begun > self.plan.timeout:
+                raise self.plan.wrong(
+                    f"expected a picture, got bytes that make none for {self.plan.timeout:g} s"
+                )
+            asked = time.monotonic()
+            packet = self._tried(lambda: next(self._packets, None))
+            if packet is None:
+                self._end()
+                return None
+            self._take(packet, self._arrival(asked, time.monotonic()))
+        if not self._pictures or self.stopped.is_set():
+            return None
+        picture, arrived = self._pictures.popleft()
+        lost, self._lost = self._lost, 0
+        self._given_any = True
+        base = picture.time_base or self._stream.time_base
+        at = None if picture.pts is None else float(picture.pts * base)
+        clock = at is not None and self._container.format.name == "rtsp" and arrived > self._began
+        return Read(self._pixels(picture), at, arrived, lost, clock)
+
+    def _arrival(self, asked: float, now: float) -> float:
+        """Return when a packet came; at the earliest, where it waited in FFmpeg since."""
+        if self._behind:
+            drained = now - self._open_from > self._open_from - self._began
+            self._behind = not drained and now - asked < UNBUFFERED_WAIT_TIME
+        return self._began if self._behind else now
+
+    def _end(self) -> None:
+        if self.live:
+            raise FrameSourceError(
+                f"{self.plan.name}: the server ended the stream", source=self.plan.name
+            )
+        if not self._given_any:
+            raise self.plan.wrong("expected pictures, it ended without one")
+
+    def _take(self, packet: Any, arrived: float) -> None:
+        """Decode what came, or hand it on."""
+        if self.plan.format is not None and self.plan.format.compressed:
+            if packet.is_corrupt:
+                self._lost += self._given_any
+            elif packet.size:
+                filtered = self._start_codes.filter(packet) if self._start_codes else [packet]
+                self._pictures.extend((one, arrived) for one in filtered)
+            return
+        damaged = bool(packet.is_corrupt)
+        try:
+            pictures = packet.decode()
+        except load("av").FFmpegError:
+            damaged, pictures = True, []
+        whole = [picture for picture in pictures if not picture.is_corrupt]
+        if damaged or len(whole) < len(pictures):
+            self._lost += self._given_any  # before the first one it may have come in midway
+            if self._stream.codec_context.name not in _ONE_BY_ONE:
+                whole = []
+                self._stream.codec_context.flush_buffers()  # what follows rests on what is damaged
+        self._pictures.extend((picture, arrived) for picture in whole)
+
+    def _pixels(self, picture: Any) -> Pixels:
+        wanted = self.plan.format
+        if wanted is not None and wanted.compressed:
+            context = self._stream.codec_context
+            return Pixels(wanted, context.width, context.height, 0, bytes(picture))
+        try:
+            if wanted is not None:
+                picture = picture.reformat(format=CONVERTIBLE[wanted.name])
+            return from_video(picture)
+        except FrameFormatError as exc:
+            raise self.plan.wrong(f"{exc}; #format=RGB8 converts") from exc
+
+    def close(self) -> None:
+        """Close it."""
+        self._container.close()
+
+    def _error(self, failure: Exception, took: float) -> FrameSourceError:
+        """Return the error of what FFmpeg could not do; its own text has the password in it."""
+        name, limit = self.plan.name, self.plan.timeout
+        late = self.plan.network and took >= limit and isinstance(failure, ValueError)
+        if late or isinstance(failure, load("av").ExitError):  # the first is RTSP's way to say it
+            text = f"{name}: expected an answer, got none within {limit:g} s"
+            return FrameSourceError(text, source=name)
+        kind = FrameFormatError if isinstance(failure, ValueError) else FrameSourceError
+        return kind(f"{name}: cannot be read: {_reason(failure)}", source=name)
+
+
+def _reason(failure: Exception) -> str:
+    return getattr(failure, "strerror", None) or type(failure).__name__
+
+
+def _plain(failure: Exception) -> OSError:
+    """Return an error's cause without the URL, in which a password may stand."""
+    return OSError(getattr(failure, "errno", None) or errno.EIO, _reason(failure))
+
+
+class PictureFiles(PictureReading):
+    """Pictures in files, by their names' order, each as a source of one picture."""
+
+    def __init__(self, plan: VideoPlan) -> None:
+        super().__init__(plan)
+        self._files = deque(picture_files(plan.url))
+        if not self._files:
+            raise FrameSourceError(f"{plan.name}: there is no picture", source=plan.name)
+
+    @property
+    def live(self) -> bool:
+        """No."""
+        return False
+
+    @property
+    def rate(self) -> float | None:
+        """None: files do not say."""
+        return None
+
+    def read(self) -> Read | None:
+        """Return the next picture."""
+        if not self._files or self.stopped.is_set():
+            return None
+        path = self._files.popleft()
+        plan = VideoPlan(name=path, url=f"file:{path}", format=self.plan.format)
+        one = VideoReading(plan)
+        try:
+            read = one.read()
+        finally:
+            one.close()
+        return None if read is None else read._replace(time=None)
+
+    def close(self) -> None:
+        """Have nothing left."""
+        self._files.clear()
+
+
+def picture_files(path: str) -> list[str]:
+    """Return the pictures of a folder or a pattern, sorted."""
+    if Path(path).is_dir():
+        found = [str(one) for one in Path(path).iterdir() if one.suffix.lower() in PICTURES]
+        return sorted(found, key=natural)
+    return sorted(glob.glob(path), key=natural)  # noqa: PTH207 - a pattern with its folder in one string
+
+
+def is_pictures(path: str) -> bool:
+    """Return True if a path is a folder or a pattern, not a file."""
+    return Path(path).is_dir() or (glob.has_magic(path) and not Path(path).exists())

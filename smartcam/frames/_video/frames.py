@@ -1,0 +1,404 @@
+"""Frames of FFmpeg, and ours: which pixel format is which, and whose bytes are whose."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames._pixels.colours import MATRICES, yuv_to_rgb
+from smartcam.frames._pixels.formats import PIXEL_FORMATS, find_format, with_matrix
+from smartcam.frames._pixels.layouts import Planes, YuvPairs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.frames._frame import Frame
+    from smartcam.frames._pixels.formats import PixelFormat
+
+
+_SAMPLES: Final = {
+    "gray": "Mono8",
+    "gray10le": "Mono10",
+    "gray12le": "Mono12",
+    "gray14le": "Mono14",
+    "gray16le": "Mono16",
+    "rgb24": "RGB8",
+    "bgr24": "BGR8",
+    "rgb48le": "RGB16",
+    "rgba": "RGBa8",
+    "bgra": "BGRa8",
+    "rgba64le": "RGBa16",
+    "bayer_rggb8": "BayerRG8",
+    "bayer_bggr8": "BayerBG8",
+    "bayer_gbrg8": "BayerGB8",
+    "bayer_grbg8": "BayerGR8",
+    "bayer_rggb16le": "BayerRG16",
+    "bayer_bggr16le": "BayerBG16",
+    "bayer_gbrg16le": "BayerGB16",
+    "bayer_grbg16le": "BayerGR16",
+}
+_SUBSAMPLING: Final = {(2, 2): "420", (2, 1): "422", (1, 1): "444"}
+"""Pixels along a row, and rows, that share a U and a V; and what FFmpeg and we call that."""
+
+_YUV: Final = {
+    f"{begin}{digits}p{end}": f"I{digits}{ours}"
+    for digits in _SUBSAMPLING.values()
+    for begin, end, ours in (
+        ("yuv", "", ""),
+        ("yuvj", "", "_full"),
+        *(("yuv", f"{depth}le", f"_{depth}") for depth in (10, 12, 16)),
+    )
+} | {"nv12": "NV12", "yuyv422": "YUV422_8", "uyvy422": "YUV422_8_UYVY"}
+"""FFmpeg's formats of Y, U and V whose bytes are those of a format of ours."""
+
+_TRANSPARENT: Final = {"yuva420p": "yuv420p", "yuva422p": "yuv422p", "yuva444p": "yuv444p"}
+"""FFmpeg's formats with a plane of alpha behind Y, U and V, and the same without."""
+
+CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
+"""Formats that FFmpeg converts to for who asks, and what it calls them."""
+
+LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
+_RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them
+BT709, BT601, BT2020 = 1, 6, 9  # AVCOL_SPC_BT709, AVCOL_SPC_SMPTE170M, AVCOL_SPC_BT2020_NCL
+
+MATRIX_OF_SPACE: Final = {
+    BT709: "709", 2: "601", 3: "601", 4: "601", 5: "601", BT601: "601", BT2020: "2020",
+}  # fmt: skip
+"""Matrix of an AVColorSpace. What says nothing (2) is BT.601's, as FFmpeg takes it; the one of the
+FCC (4) is BT.601's to a third of a grey level. 0 says that there is no Y."""
+
+
+class Pixels(NamedTuple):
+    """The pixels of a decoded frame, in one of our formats.
+
+    Attributes:
+        format: of the pixels.
+        width: pixels.
+        height: pixels.
+        stride: bytes from row to row.
+        data: the decoder's own where its layout is ours, else a copy.
+    """
+
+    format: PixelFormat
+    width: int
+    height: int
+    stride: int
+    data: bytes | memoryview
+
+
+@lru_cache(maxsize=256)  # asked for each frame
+def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
+    """Return our format of one of FFmpeg's.
+
+    Args:
+        name: as ``yuv420p``.
+        colour_range: AVColorRange; 0, which is unknown, is the limited one.
+        space: AVColorSpace.
+
+    Raises:
+        FrameFormatError: we have none, or the space is of another kind than ours.
+    """
+    if name in _SAMPLES:
+        return find_format(_SAMPLES[name])
+    if name not in _YUV:
+        known = (*_SAMPLES, *_YUV)
+        raise FrameFormatError(
+            f"FFmpeg's pixel format {name}: expected one that converts without loss to one of "
+            f"{', '.join(known)}",
+            available=known,
+        )
+    matrix = MATRIX_OF_SPACE.get(space)
+    if matrix is None:
+        raise FrameFormatError(
+            f"FFmpeg's pixel format {name}: expected Y, U and V by BT.601, BT.709 or BT.2020, got "
+            f"those of AVColorSpace {space}"
+        )
+    full = name.startswith("yuvj") or colour_range == FULL
+    base = find_format(_YUV[name].removesuffix("_full"))
+    return with_matrix(base, f"{matrix} full" if full else matrix)
+
+
+def from_video(video: Any) -> Pixels:
+    """Return a decoded frame's pixels; where we have no such format, in one that holds all of it.
+
+    A palette becomes its colours, planes of red, green and blue become samples, and Y, U and V
+    whose sharing we do not have are repeated to one of each a pixel.
+
+    Raises:
+        FrameFormatError: we have no such format; the text names what was not to be lost.
+    """
+    name = video.format.name
+    if name in _TRANSPARENT and not _opaque(video):
+        return _with_alpha(video)
+    if name not in _SAMPLES and name not in _YUV:
+        video = _repacked(video)
+    found = format_of(video.format.name, video.color_range, video.colorspace)
+    planes = video.planes
+    stride = planes[0].line_size
+    if len(planes) == 1:
+        data = memoryview(planes[0]).toreadonly()
+        return Pixels(found, video.width, video.height, stride, data)
+    layout = found.layout
+    fits = isinstance(layout, Planes) and all(
+        plane.line_size == layout.chroma_stride(stride) for plane in planes[1:]
+    )
+    joined = b"".join(planes) if fits else b"".join(_tight(plane, found) for plane in planes)
+    if not fits:
+        stride = found.stride(video.width)
+    return Pixels(found, video.width, video.height, stride, joined)
+
+
+def _repacked(video: Any) -> Any:
+    """Return the frame in a format that we have and that holds all of it, or as it is."""
+    kind = video.format
+    parts = kind.components
+    deep = max(part.bits for part in parts)
+    alpha = any(part.is_alpha for part in parts)
+    if deep > 16 or kind.name.startswith("xyz"):
+        return video
+    if kind.has_palette or kind.is_rgb or len(parts) == 2:
+        to = ("rgba" if alpha or kind.has_palette else "rgb24", "rgba64le" if alpha else "rgb48le")
+        return video.reformat(format=to[deep > 8])
+    if len(parts) == 1:
+        return video.reformat(format=_wider_grey(kind.name, deep))
+    return _with_known_sharing(video, deep, alpha=alpha)
+
+
+def _wider_grey(name: str, deep: int) -> str:
+    little = f"{name.removesuffix('be')}le"
+    return "gray" if deep <= 8 else little if little in _SAMPLES else "gray16le"
+
+
+def _with_known_sharing(video: Any, deep: int, *, alpha: bool) -> Any:
+    """Return Y, U and V in planes of a format that we have."""
+    kind, size = video.format, (video.width, video.height)
+    across, down = (round(one / part) for one, part in zip(size, _chroma(video), strict=True))
+    bits = next(one for one in (8, 10, 12, 16) if deep <= one)
+    end = "" if bits == 8 else f"{bits}le"
+    digits = _SUBSAMPLING.get((across, down))
+    if alpha and kind.name not in _TRANSPARENT:
+        return video
+    if digits is not None:
+        return _same_colours(video, f"yuv{digits}p{end}")
+    if bits > 8 or not kind.is_planar or len(video.planes) < 3:
+        return video
+    made = _new(*size, "yuv444p")
+    for to, plane in zip(made.planes, video.planes, strict=False):
+        rows = _rows(plane)
+        for axis, times in enumerate((-(-size[1] // plane.height), -(-size[0] // plane.width))):
+            rows = np.repeat(rows, times, axis=axis)
+        _fill(to, rows[: size[1], : size[0]])
+    return _told(made, video, full=kind.name.startswith("yuvj"))
+
+
+def _chroma(video: Any) -> tuple[float, float]:
+    """Return a share of the size: what of U and V stands for each side of a large picture."""
+    kind, whole = video.format, 1 << 10
+    return (
+        video.width * kind.chroma_width(whole) / whole,
+        video.height * kind.chroma_height(whole) / whole,
+    )
+
+
+def _same_colours(video: Any, name: str) -> Any:
+    """Return a frame whose samples lie otherwise, and mean the same."""
+    full = video.format.name.startswith("yuvj")
+    return _told(video.reformat(format=name), video, full=full)
+
+
+def _told(made: Any, video: Any, *, full: bool) -> Any:
+    made.color_range = FULL if full else video.color_range
+    made.colorspace = video.colorspace
+    return made
+
+
+def _opaque(video: Any) -> bool:
+    """Return True if the last plane, which is alpha, hides nothing."""
+    return bool((_rows(video.planes[3]) == 255).all())
+
+
+def _with_alpha(video: Any) -> Pixels:
+    """Return Y, U, V and alpha as red, green, blue and alpha."""
+    meant = format_of(_TRANSPARENT[video.format.name], video.color_range, video.colorspace)
+    matrix = MATRICES[cast("Planes", meant.layout).matrix]
+    y, u, v, alpha = (_rows(plane) for plane in video.planes)
+    data = np.dstack([yuv_to_rgb(y, u, v, matrix), alpha]).tobytes()
+    return Pixels(find_format("RGBa8"), video.width, video.height, 4 * video.width, data)
+
+
+def _rows(plane: Any) -> NDArray[np.uint8]:
+    """Return the samples of a plane of 8 bits, a view."""
+    rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
+    return rows[:, : plane.width]
+
+
+def _tight(plane: Any, found: PixelFormat) -> bytes:
+    """Return the rows of a plane without padding."""
+    layout: Any = found.layout
+    size = layout.size_of * (2 if layout.woven and plane.index else 1)
+    rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
+    return rows[:, : plane.width * size].tobytes()
+
+
+def colour_properties(found: PixelFormat) -> tuple[int, int]:
+    """Return AVColorRange and AVColorSpace of a format."""
+    matrix = getattr(found.layout, "matrix", "601 full")  # without one: grey, or red, green, blue
+    space = next((one for one in (BT709, BT2020) if MATRIX_OF_SPACE[one] in matrix), BT601)
+    return FULL if matrix.endswith("full") else LIMITED, space
+
+
+def to_video(frame: Frame, before: Any = None) -> Any:
+    """Return a frame for an encoder of 4:2:0: its Y as it is; U and V of more pixels averaged.
+
+    Grey gets a U and a V without colour. RGB becomes BT.601 of limited range.
+
+    Args:
+        frame: frame to encode.
+        before: frame that was returned for another one, which the encoder has done with; grey of
+            the same size is written into it.
+
+    Raises:
+        FrameFormatError: the encoder knows no way from this format, or the size is odd.
+    """
+    name = _encodable(frame.format)
+    if name is None:
+        known = tuple(one.name for one in PIXEL_FORMATS if _encodable(one) is not None)
+        raise FrameFormatError(
+            f"{frame.source}: {frame.format.name} cannot become video as it is; what can: "
+            f"{', '.join(known)}; see Codecs.converted",
+            source=frame.source,
+            available=known,
+        )
+    if frame.width % 2 or frame.height % 2:
+        raise FrameFormatError(
+            f"{frame.source}: video wants an even width and height, got "
+            f"{frame.width}x{frame.height}",
+            source=frame.source,
+        )
+    if name == "gray":
+        return _from_grey(frame, before)
+    video = _filled(frame, name)
+    if name in ("yuv420p", "nv12"):
+        return video
+    kept, space = colour_properties(frame.format)
+    to = LIMITED if name in ("rgb24", "bgr24") else kept
+    made = video.reformat(
+        format="yuv420p", src_color_range=_RANGES[kept], dst_color_range=_RANGES[to]
+    )
+    made.color_range, made.colorspace = to, space
+    return made
+
+
+def to_lossless_video(frame: Frame) -> Any:
+    """Return a frame for an encoder that loses nothing, FFV1's: each value as it is.
+
+    Samples that share bytes are unpacked, Y, U and V are parted, and red, green and blue change
+    places.
+
+    Raises:
+        FrameFormatError: a video says less than the format does: whose a value of a Bayer pattern
+            is, that a value is a distance, what is compressed.
+    """
+    name = _lossless(frame.format)
+    if name is None:
+        known = tuple(one.name for one in PIXEL_FORMATS if _lossless(one) is not None)
+        raise FrameFormatError(
+            f"{frame.source}: {frame.format.name} cannot become a video without loss; what can: "
+            f"{', '.join(known)}",
+            source=frame.source,
+            available=known,
+        )
+    video = _filled(frame, name)
+    to = _REPACKED.get(name, name)
+    if to == name:
+        return video
+    made = video.reformat(format=to)
+    made.color_range, made.colorspace = colour_properties(frame.format)
+    return made
+
+
+_REPACKED: Final = {
+    "rgb24": "bgr0",
+    "bgr24": "bgr0",
+    "rgba": "bgra",
+    "nv12": "yuv420p",
+    "yuyv422": "yuv422p",
+    "uyvy422": "yuv422p",
+}
+"""Formats of FFV1 that hold the same values in another order."""
+
+
+def _lossless(found: PixelFormat) -> str | None:
+    """Return FFmpeg's name for the unpacked values of a format, where a video can say them."""
+    layout = found.layout
+    if found.name.startswith("Mono"):
+        return "gray" if found.depth == 8 else f"gray{_DEPTHS[found.depth]}le"
+    if isinstance(layout, Planes) and layout.depth > 8:
+        digits = _SUBSAMPLING[layout.across, layout.down]
+        return f"yuv{digits}p{layout.depth}le"
+    if found.name in ("RGBa8", "BGRa8"):
+        return "rgba" if found.name == "RGBa8" else "bgra"
+    return _encodable(found)
+
+
+_DEPTHS: Final = {10: 10, 12: 12, 14: 16, 16: 16}
+"""Bits of FFV1's grey that hold so many."""
+
+
+def _encodable(found: PixelFormat) -> str | None:
+    """Return FFmpeg's name for the bytes of a format that can become video, or None."""
+    layout = found.layout
+    if isinstance(layout, YuvPairs):
+        return "uyvy422" if layout.y else "yuyv422"
+    if isinstance(layout, Planes) and layout.depth == 8:
+        return "nv12" if layout.woven else f"yuv{_SUBSAMPLING[layout.across, layout.down]}p"
+    return {"Mono8": "gray", "RGB8": "rgb24", "BGR8": "bgr24"}.get(found.name)
+
+
+def _new(width: int, height: int, name: str) -> Any:
+    return load("av").VideoFrame(width, height, name)
+
+
+def _from_grey(frame: Frame, before: Any) -> Any:
+    size = frame.width, frame.height, *colour_properties(frame.format)
+    if before is not None and size == (
+        *(before.width, before.height),
+        *(before.color_range, before.colorspace),
+    ):
+        _fill(before.planes[0], frame.array())  # a new one has a page fault for every 4 kB
+        return before
+    video = _new(frame.width, frame.height, "yuv420p")
+    _fill(video.planes[0], frame.array())
+    for plane in video.planes[1:]:
+        plane.update(_without_colour(plane.buffer_size))
+    video.color_range, video.colorspace = colour_properties(frame.format)
+    return video
+
+
+@lru_cache(maxsize=16)
+def _without_colour(size: int) -> bytes:
+    return b"\x80" * size
+
+
+def _filled(frame: Frame, name: str) -> Any:
+    video = _new(frame.width, frame.height, name)
+    layout = frame.format.layout
+    if isinstance(layout, Planes):
+        y, u, v = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
+        parts = [y, np.stack((u, v), axis=-1)] if layout.woven else [y, u, v]
+    else:
+        parts = [frame.array()]
+    for plane, part in zip(video.planes, parts, strict=True):
+        rows = part.reshape(part.shape[0], -1)
+        _fill(plane, rows if rows.itemsize == 1 else np.ascontiguousarray(rows).view(np.uint8))
+    video.color_range, video.colorspace = colour_properties(frame.format)
+    return video
+
+
+def _fill(plane: Any, rows: Any) -> None:
+    whole = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
+    whole[: rows.shape[0], : rows.shape[1]] = rows

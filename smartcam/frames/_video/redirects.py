@@ -1,0 +1,250 @@
+"""Follow a server's redirects for a URL, on the server's own host and port only.
+
+FFmpeg goes wherever a server's redirect points, also to this machine's own ports. It is kept from
+that in HTTP; in RTSP it cannot be, so a server is asked before FFmpeg asks it.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import re
+import socket
+import ssl
+import time
+import urllib.request
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import SplitResult, unquote, urljoin, urlsplit
+
+from smartcam.exceptions import FrameSourceError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+MAX_REDIRECTS: Final = 5
+
+LARGEST_HEAD: Final = 64 << 10
+"""Bytes of the head of an answer, or of a body that is skipped."""
+
+REDIRECTS: Final = range(300, 400)
+"""Statuses with which FFmpeg follows a ``Location``."""
+
+_PORTS: Final = {"http": 80, "https": 443, "rtsp": 554, "rtsps": 322}
+
+
+class _Answer(NamedTuple):
+    status: int
+    headers: Mapping[str, Sequence[str]]  # by their names in small letters
+    peer: str  # the address that it came from
+
+
+def follow_redirects(
+    url: str, *, name: str, timeout: float, tls: ssl.SSLContext | None = None
+) -> str:
+    """Return the URL that a server's redirects lead to; the same one where it sends none.
+
+    It blocks. A server that does not answer is not opened: what it would tell FFmpeg is not known.
+
+    Args:
+        url: ``http:``, ``https:``, ``rtsp:`` or ``rtsps:``; may have user and password.
+        name: of the source, for errors; without a password.
+        timeout: seconds for all of it.
+        tls: how the server shows who it is, where it is asked by TLS.
+
+    Raises:
+        FrameSourceError: a redirect leads to another host or port, there are too many, or there is
+            no answer.
+    """
+    end = time.monotonic() + timeout
+    for _ in range(MAX_REDIRECTS):
+        try:
+            answer = _asked(urlsplit(url), end, tls)
+        except TimeoutError:
+            text = f"{name}: expected an answer, got none within {timeout:g} s"
+            raise FrameSourceError(text, source=name) from None
+        except (OSError, ValueError) as exc:
+            # not with the error itself, whose text may have a URL with a password
+            raise FrameSourceError(f"{name}: cannot be read: {why(exc)}", source=name) from None
+        location = next(iter(answer.headers.get("location", ())), "")
+        if answer.status not in REDIRECTS or not location:
+            return url
+        url = followed(url, location, answer.peer, name)
+    raise FrameSourceError(f"{name}: more than {MAX_REDIRECTS} redirects", source=name)
+
+
+def why(failure: Exception) -> str:
+    """Return why there is no answer, in the system's words and without a URL."""
+    number = getattr(failure, "errno", None)
+    if number is not None and number > 0:
+        return os.strerror(number)
+    said = getattr(failure, "strerror", None)
+    return str(said or "it gives no answer that can be understood")
+
+
+def followed(url: str, location: str, peer: str, name: str) -> str:
+    """Return the URL that a redirect leads to, with the user of the URL that was asked.
+
+    Args:
+        url: URL that was asked.
+        location: header of the answer.
+        peer: address that the answer came from.
+        name: of the source, for errors.
+
+    Raises:
+        FrameSourceError: it leads to another host or port.
+    """
+    before = urlsplit(url)
+    try:
+        after = urlsplit(urljoin(url, location))
+        there, here = _place(after), _place(before)
+    except ValueError:
+        after, there, here = before, None, None
+    hosts = {here[1], peer} if here is not None else set[str]()
+    if there is None or here is None or there[::2] != here[::2] or there[1] not in hosts:
+        raise FrameSourceError(
+            f"{name}: expected pictures, or a redirect on the same host and port, got one to "
+            f"{re.sub('//[^/]*@', '//***@', location)[:200]!r}; #elsewhere=yes follows it",
+            source=name,
+        )
+    user, at, _ = before.netloc.rpartition("@")
+    return after._replace(netloc=f"{user}{at}{after.netloc.rpartition('@')[2]}").geturl()
+
+
+def _place(parts: SplitResult) -> tuple[str, str, int]:
+    """Return scheme, host and port of a URL."""
+    return parts.scheme, parts.hostname or "", parts.port or _PORTS.get(parts.scheme, 0)
+
+
+def _asked(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
+    """Return the answer to the requests that FFmpeg begins with: the first redirect, or the last.
+
+    Raises:
+        OSError, ValueError: there is none, or it cannot be read.
+    """
+    scheme, host, port = _place(url)
+    plain = url._replace(netloc=url.netloc.rpartition("@")[2], fragment="")
+    web = scheme.startswith("http")
+    challenges: Sequence[str] = ()
+    answer, number = _Answer(0, {}, ""), 0
+    with contextlib.ExitStack() as opened:
+        link: socket.socket | None = None
+        for method in ("GET",) if web else ("OPTIONS", "DESCRIBE"):
+            while True:
+                # a web server may end what it refused; an RTSP server's challenge is for this one
+                if link is None or web:
+                    link = opened.enter_context(_connected(scheme, host, port, end, tls))
+                number += 1
+                shown = _authorization(url, plain, method, challenges)
+                link.settimeout(_left(end))
+                peer = str(link.getpeername()[0])  # none any more once it has hung up
+                link.sendall(_head(method, plain, number, shown).encode())
+                answer = _read(link, peer, end, web=web)
+                if answer.status in REDIRECTS:
+                    return answer
+                challenged = answer.headers.get("www-authenticate", ())
+                if answer.status != 401 or challenges or not challenged or url.username is None:
+                    break
+                challenges = challenged
+        return answer
+
+
+def _connected(
+    scheme: str, host: str, port: int, end: float, tls: ssl.SSLContext | None
+) -> socket.socket:
+    made = socket.create_connection((host, port), timeout=_left(end))
+    if scheme not in {"https", "rtsps"}:
+        return made
+    with contextlib.ExitStack() as undone:
+        undone.callback(made.close)
+        link = (tls or ssl.create_default_context()).wrap_socket(made, server_hostname=host)
+        undone.pop_all()
+        return link
+
+
+def _authorization(
+    url: SplitResult, plain: SplitResult, method: str, challenges: Sequence[str]
+) -> str:
+    """Return the header that answers a challenge; "" where there is none that we know."""
+    user, password = unquote(url.username or ""), unquote(url.password or "")
+    for challenge in challenges:
+        scheme, _, said = challenge.partition(" ")
+        if scheme.lower() == "digest":
+            passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+            passwords.add_password(None, plain.geturl(), user, password)
+            request = urllib.request.Request(plain.geturl(), method=method)  # noqa: S310 - not sent
+            if method != "GET":
+                request.selector = plain.geturl()
+            words = (one.partition("=") for one in urllib.request.parse_http_list(said))
+            parts = {key: value.removeprefix('"').removesuffix('"') for key, _, value in words}
+            made = urllib.request.HTTPDigestAuthHandler(passwords).get_authorization(request, parts)
+            return f"Authorization: Digest {made}" if made else ""
+        if scheme.lower() == "basic":
+            return (
+                "Authorization: Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
+            )
+    return ""
+
+
+def _left(end: float) -> float:
+    left = end - time.monotonic()
+    if left <= 0:
+        raise TimeoutError("no answer in time")
+    return left
+
+
+def _head(method: str, url: SplitResult, number: int, authorization: str) -> str:
+    if method == "GET":
+        path = url._replace(scheme="", netloc="").geturl() or "/"
+        lines = [f"GET {path} HTTP/1.1", f"Host: {url.netloc}", "Accept: */*"]
+    else:
+        lines = [f"{method} {url.geturl()} RTSP/1.0", f"CSeq: {number}"]
+        lines += ["Accept: application/sdp"] if method == "DESCRIBE" else []
+    lines.append("User-Agent: smartcam")
+    return "\r\n".join((*lines, *([authorization] if authorization else ()), "", ""))
+
+
+def _read(link: socket.socket, peer: str, end: float, *, web: bool) -> _Answer:
+    """Return an answer; its body is skipped where another answer may follow it.
+
+    A server may end its lines by one character, or put more of the other in, as FFmpeg takes it.
+    """
+    head = bytearray()  # without carriage returns
+    size = 0
+    while True:
+        came = _receive(link, end, size)
+        size += len(came)
+        begin = max(0, len(head) - 1)
+        head += came.replace(b"\r", b"")
+        found = head.find(b"\n\n", begin)
+        if found >= 0:
+            break
+    status, *lines = head[:found].decode("latin-1").split("\n")
+    headers: dict[str, list[str]] = {}
+    for line in lines:
+        key, _, value = line.partition(":")
+        headers.setdefault(key.strip().lower(), []).append(value.strip())
+    answer = _Answer(int(status.partition(" ")[2][:3]), headers, peer)
+    if not web:
+        left = int(headers.get("content-length", ("0",))[0])
+        # the last piece holds the body's beginning, carriage returns included, behind these lines
+        lines_of_head = came.count(b"\n") - head.count(b"\n", found + 2)
+        left -= len(came.split(b"\n", lines_of_head)[-1])
+        while left > 0:
+            came = _receive(link, end, size)
+            size += len(came)
+            left -= len(came)
+    return answer
+
+
+def _receive(link: socket.socket, end: float, before: int) -> bytes:
+    """Return the next bytes of an answer, of which so many came before.
+
+    Raises:
+        OSError, ValueError: there are none, or too many.
+    """
+    link.settimeout(_left(end))
+    came = link.recv(4096)
+    if not came or before + len(came) > LARGEST_HEAD:
+        raise ValueError("no end of an answer")
+    return came

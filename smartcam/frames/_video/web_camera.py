@@ -1,0 +1,207 @@
+"""Web cameras: streams of JPEGs on our own, and what else a web server has through FFmpeg."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import urllib.request
+from typing import TYPE_CHECKING
+
+from smartcam._extras import load
+from smartcam.exceptions import FrameFormatError, FrameSourceError, MessageError
+from smartcam.frames._codecs.jpeg import jpeg_header
+from smartcam.frames._driver import StreamFormat
+from smartcam.frames._streaming.rtp.assembling import AccessUnit
+from smartcam.frames._streaming.rtp.codings import JPEG
+from smartcam.frames._streaming.rtp.decoding import DecodingPlan, UnitDecoding
+from smartcam.frames._streaming.rtp.driver import FirstPicture
+from smartcam.frames._video.driver import VideoDriver
+from smartcam.frames._video.frames import CONVERTIBLE
+from smartcam.frames._video.multipart import PictureCutter
+from smartcam.frames._video.redirects import why
+from smartcam.frames._video.web_request import WebStream
+
+if TYPE_CHECKING:
+    from smartcam.frames._driver import FrameSink
+
+
+class WebDriver(VideoDriver):
+    """A web camera or a recording on a web server; parameters as :class:`VideoDriver` has them.
+
+    The parts of a stream of JPEGs are cut here, so that each picture comes with its last byte.
+    """
+
+    _playing: _PartsStream | None = None
+    _is_parts = False
+    _size: tuple[int, int] | None = None
+
+    async def open(self) -> StreamFormat:
+        """Read a picture of it, and let it go again.
+
+        Raises:
+            FrameFormatError: it is no video, or has pixels that we have no name for.
+            FrameSourceError: it is not there, refuses, or is silent.
+            MissingExtraError: the extra ``video`` is not installed.
+        """
+        load("av")
+        first = FirstPicture()
+        try:
+            self._is_parts = await self._begin_parts(first)
+            if not self._is_parts:
+                return await super().open()
+            if self._fps:
+                raise self.address.wrong("fps", "a recording, which alone has it", "a live stream")
+            frame = await first.came
+        finally:
+            await self.stop()
+        self._size = (frame.width, frame.height)
+        return StreamFormat(frame.format, *self._size)
+
+    async def start(self, sink: FrameSink) -> None:
+        """Connect anew and read; a recording begins at its beginning.
+
+        Raises:
+            FrameSourceError: it is gone, or silent.
+        """
+        if not self._is_parts:
+            await super().start(sink)
+        elif not await self._begin_parts(sink):
+            raise FrameFormatError(
+                f"{self.name}: expected parts, as it was opened, got something else: open it anew",
+                source=self.name,
+            )
+
+    async def stop(self) -> None:
+        """Read no longer."""
+        playing, self._playing = self._playing, None
+        if playing is not None:
+            await playing.end()
+        await super().stop()
+
+    async def _begin_parts(self, sink: FrameSink) -> bool:
+        """Begin to read; return False where it is no stream of JPEGs, or a proxy's to ask for."""
+        if self._elsewhere or _by_proxy(self.address.scheme, self.address.host):
+            return False
+        url = self.address.url.partition("#")[0]
+        stream = WebStream(self.name, url, self._tls)
+        try:
+            async with asyncio.timeout(self._timeout):
+                await stream.open()
+            self._check(stream)
+            if stream.answer.is_multipart:
+                self._playing = _PartsStream(stream, self._plan(), self._timeout, sink)
+                await self._playing.begin()
+        except FrameSourceError:
+            raise
+        except TimeoutError:
+            raise self._wrong(f"expected an answer, got none within {self._timeout:g} s") from None
+        except (OSError, ValueError) as exc:
+            raise self._wrong(f"cannot be read: {why(exc)}") from None
+        finally:
+            if self._playing is None:
+                stream.close()
+        return self._playing is not None
+
+    def _check(self, stream: WebStream) -> None:
+        answer = stream.answer
+        if answer.status != 200:
+            shown = f"{answer.status} {answer.reason}".strip()
+            raise self._wrong(f"cannot be read: {shown}")
+        if answer.is_multipart and self._format is not None and self._format.name == "H264":
+            raise self._wrong("expected H264, got MJPEG")
+
+    def _plan(self) -> DecodingPlan:
+        wanted = "" if self._format is None else self._format.name
+        passed_on = wanted == "MJPEG"
+        to = "" if passed_on or not wanted else CONVERTIBLE[wanted]
+        coding = JPEG._replace(size_in=_size_in)
+        return DecodingPlan(self.name, coding, self._delay, self._size, b"", to, passed_on)
+
+    def _wrong(self, text: str) -> FrameSourceError:
+        return FrameSourceError(f"{self.name}: {text}", source=self.name)
+
+
+class _PartsStream:
+    """The tasks and the connection of a driver while a camera sends parts."""
+
+    def __init__(
+        self, stream: WebStream, plan: DecodingPlan, timeout: float, sink: FrameSink
+    ) -> None:
+        self._stream, self._name, self._timeout = stream, plan.name, timeout
+        self._loop = asyncio.get_running_loop()
+        self._decoding = UnitDecoding(plan, sink)
+        self._tasks: list[asyncio.Task[None]] = []
+        self._shown = self._heard = self._loop.time()
+
+    async def begin(self) -> None:
+        """Cut and decode what comes."""
+        await self._decoding.begin(self)
+        self._tasks = [
+            asyncio.create_task(work, name=f"{what} of {self._name}")
+            for work, what in ((self._read(), "parts"), (self._watch(), "silence"))
+        ]
+
+    async def end(self) -> None:
+        """End all; the sink hears no more."""
+        self._stream.close()
+        for task in self._tasks:
+            task.cancel()
+        try:
+            if self._tasks:
+                await asyncio.wait(self._tasks)
+        finally:
+            await self._decoding.end()
+
+    def utc(self, timestamp: int) -> float | None:
+        """Return None: parts have no time."""
+        return None
+
+    def want_picture(self) -> None:
+        """Do nothing: each picture is whole."""
+
+    def shown(self) -> None:
+        """Note that a picture could be decoded."""
+        self._shown = self._loop.time()
+
+    async def _read(self) -> None:
+        cutter, begins = PictureCutter(), True
+        error: FrameSourceError
+        try:
+            async with contextlib.aclosing(self._stream.pieces()) as pieces:
+                async for piece in pieces:
+                    self._heard = self._loop.time()
+                    for picture in cutter.feed(piece):
+                        damaged, cutter.damaged = cutter.damaged, 0
+                        unit = AccessUnit(picture, 0, 0, damaged, self._heard, begins)
+                        self._decoding.take([unit])
+                        begins = False
+            error = FrameSourceError(f"{self._name}: the server ended the stream")
+        except MessageError as exc:
+            error = FrameFormatError(f"{self._name}: expected JPEGs, got {exc}")
+        except OSError as exc:
+            error = FrameSourceError(f"{self._name}: cannot be read: {why(exc)}")
+        await self._decoding.finish(error)
+
+    async def _watch(self) -> None:
+        while (left := self._shown + self._timeout - self._loop.time()) > 0:  # noqa: ASYNC110
+            await asyncio.sleep(left)
+        seconds = f"{self._timeout:g} s"
+        if self._loop.time() - self._heard < self._timeout:
+            text = f"expected a picture, got bytes that make none for {seconds}"
+            self._decoding.over(FrameFormatError(f"{self._name}: {text}"))
+        else:
+            text = f"expected an answer, got none within {seconds}"
+            self._decoding.over(FrameSourceError(f"{self._name}: {text}"))
+
+
+def _size_in(picture: bytes) -> tuple[int, int] | None:
+    try:
+        width, height, _ = jpeg_header(picture, "a part")
+    except FrameFormatError:
+        return None  # of the last one: what is wrong shows when it is decoded
+    return width, height
+
+
+def _by_proxy(scheme: str, host: str) -> bool:
+    """Return True if the environment names a proxy for a host, which FFmpeg asks."""
+    return bool(urllib.request.getproxies().get(scheme)) and not urllib.request.proxy_bypass(host)

@@ -1,0 +1,194 @@
+"""One request for a web camera's stream: redirects on its own host, passwords, and the bytes."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import unquote, urlsplit
+
+from smartcam.exceptions import FrameSourceError, MessageError
+from smartcam.frames._streaming.rtsp_client.authorization import Credentials
+from smartcam.frames._video.redirects import MAX_REDIRECTS, REDIRECTS, followed
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import AsyncGenerator, Mapping, Sequence
+
+MAX_HEAD_BYTES: Final = 64 << 10
+"""Bytes of an answer's lines at most."""
+
+MAX_REFUSALS: Final = 3
+"""Refusals for a password, such as by a nonce that is too old."""
+
+MAX_LINE_BYTES: Final = 4096
+"""Bytes of a line before a chunk."""
+
+PIECE_BYTES: Final = 64 << 10
+"""Bytes that are taken at a time."""
+
+PORTS: Final = {"http": 80, "https": 443}
+
+_HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
+
+
+class WebAnswer(NamedTuple):
+    """An answer whose body goes on; the names of its headers are in small letters."""
+
+    status: int
+    reason: str
+    headers: Mapping[str, Sequence[str]]
+
+    def header(self, name: str) -> str:
+        """Return a header's first value, or ""."""
+        return next(iter(self.headers.get(name, ())), "")
+
+    @property
+    def is_multipart(self) -> bool:
+        """True if the answer is a stream of parts."""
+        return self.header("content-type").lower().lstrip().startswith("multipart/")
+
+
+class WebStream:
+    """The body of an answer to GET.
+
+    Args:
+        name: of the source, for errors.
+        url: with user and password.
+        tls: how the server shows who it is, where it is asked by TLS.
+
+    Attributes:
+        answer: once :meth:`open` has returned.
+    """
+
+    answer: WebAnswer
+
+    def __init__(self, name: str, url: str, tls: ssl.SSLContext | None) -> None:
+        self._name, self._url, self._tls = name, url, tls
+        self._writer: asyncio.StreamWriter | None = None
+        self._reader: asyncio.StreamReader | None = None
+        self._rest = b""
+
+    async def open(self) -> None:
+        """Ask for it; redirects on its host and port are followed, and a password is shown.
+
+        Raises:
+            FrameSourceError: a redirect elsewhere, or too many.
+            OSError: there is no connection.
+            ValueError: it is no web server.
+
+        Cancellation: :meth:`close` ends what has begun.
+        """
+        parts = urlsplit(self._url)
+        credentials = Credentials(unquote(parts.username or ""), unquote(parts.password or ""))
+        redirects = refused = 0
+        while redirects <= MAX_REDIRECTS:
+            self.answer = answer = await self._ask(credentials)
+            challenges = answer.headers.get("www-authenticate", ())
+            if (
+                answer.status == 401
+                and refused < MAX_REFUSALS
+                and credentials.challenged(challenges)
+            ):
+                refused += 1
+                continue
+            location = answer.header("location")
+            if answer.status not in REDIRECTS or not location:
+                return
+            peer = self._writer.get_extra_info("peername") if self._writer else None
+            redirects += 1
+            self._url = followed(self._url, location, str((peer or ("",))[0]), self._name)
+        raise FrameSourceError(
+            f"{self._name}: more than {MAX_REDIRECTS} redirects", source=self._name
+        )
+
+    def close(self) -> None:
+        """End it. Idempotent."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.transport.abort()
+
+    async def pieces(self) -> AsyncGenerator[bytes, None]:
+        """Yield the body as it comes.
+
+        Raises:
+            MessageError: its chunks are none.
+            OSError: the connection is lost.
+        """
+        if "chunked" not in self.answer.header("transfer-encoding").lower():
+            while piece := await self._some():
+                yield piece
+            return
+        while size := await self._chunk_size():
+            while size:
+                piece = await self._some(size)
+                if not piece:
+                    return
+                size -= len(piece)
+                yield piece
+
+    async def _ask(self, credentials: Credentials) -> WebAnswer:
+        self.close()
+        parts = urlsplit(self._url)
+        host, port = parts.hostname or "", parts.port or PORTS[parts.scheme]
+        tls = self._tls if parts.scheme == "https" else None
+        self._reader, self._writer = await asyncio.open_connection(
+            host, port, ssl=tls, limit=PIECE_BYTES, server_hostname=host if tls else None
+        )
+        path = parts._replace(scheme="", netloc="", fragment="").geturl() or "/"
+        path = path if path.startswith("/") else f"/{path}"
+        shown = credentials.header("GET", path)
+        lines = [
+            *(f"GET {path} HTTP/1.1", f"Host: {parts.netloc.rpartition('@')[2]}", "Accept: */*"),
+            *("User-Agent: smartcam", "Connection: close"),
+            *([f"Authorization: {shown}"] if shown else ()),
+        ]
+        self._writer.write("\r\n".join((*lines, "", "")).encode())
+        return await self._head()
+
+    async def _head(self) -> WebAnswer:
+        self._rest = b""
+        came = bytearray()
+        looked = 0
+        while (ends := _HEAD_ENDS.search(came, max(0, looked - 10))) is None:
+            looked = len(came)
+            piece = await self._some()
+            came += piece
+            if not piece or len(came) > MAX_HEAD_BYTES:
+                raise ValueError("no head")
+        self._rest = bytes(came[ends.end() :])
+        return _answer(bytes(came[: ends.start()]))
+
+    async def _some(self, most: int = PIECE_BYTES) -> bytes:
+        if self._rest:
+            piece, self._rest = self._rest[:most], self._rest[most:]
+            return piece
+        return b"" if self._reader is None else await self._reader.read(most)
+
+    async def _chunk_size(self) -> int:
+        """Return the size of the next chunk; 0 at the end."""
+        line = bytearray()
+        while not line.strip() or not line.endswith(b"\n"):
+            byte = await self._some(1)
+            line += byte
+            if not byte:
+                return 0
+            if len(line) > MAX_LINE_BYTES:
+                raise MessageError("HTTP: a chunk: expected its size, got a line without an end")
+        said = bytes(line).partition(b";")[0].strip()
+        if not re.fullmatch(rb"[0-9A-Fa-f]{1,8}", said):
+            raise MessageError(f"HTTP: a chunk: expected its size, got {said[:20]!r}")
+        return int(said, 16)
+
+
+def _answer(head: bytes) -> WebAnswer:
+    first, *lines = head.decode("latin-1").replace("\r", "").split("\n")
+    found = re.match(r"(?:HTTP/\d(?:\.\d)?|ICY)[ \t]+(\d{3})[ \t]*(.{0,200})", first)
+    if found is None:
+        raise ValueError("no answer")
+    headers: dict[str, list[str]] = {}
+    for line in lines:
+        key, colon, value = line.partition(":")
+        if colon:
+            headers.setdefault(key.strip().lower(), []).append(value.strip())
+    return WebAnswer(int(found[1]), found[2].strip(), headers)

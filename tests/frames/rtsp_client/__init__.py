@@ -1,0 +1,1 @@
+"""The RTSP client against cameras made by hand, and other people's servers."""

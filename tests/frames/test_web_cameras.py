@@ -1,0 +1,146 @@
+"""Web cameras that send JPEGs in parts, as real ones do, and each picture at once."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from smartcam import frames
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameFormatError,
+    FrameSourceError,
+)
+from smartcam.frames._inside import read_stamp
+from tests.frames.pictures import PARTS, jpeg, served
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+pytestmark = pytest.mark.usefixtures("no_leaks")
+
+PICTURES = [jpeg(number) for number in range(8)]
+
+HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: %s\r\n%s\r\n"
+
+
+@asynccontextmanager
+async def camera(
+    head: bytes, wrap: Callable[[bytes], bytes] = PARTS["as it should be"], **said: Any
+) -> AsyncIterator[str]:
+    """Give the URL of a camera that sends a picture whenever the loop's time moves by 0.2 s."""
+    chunked = b"chunked" in head
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(head)
+        for number in range(10_000):
+            data = wrap(PICTURES[number % 8])
+            if chunked:
+                half = len(data) // 2
+                parts = (data[:half], data[half:])
+                data = b"".join(b"%x;a=b\r\n%s\r\n" % (len(part), part) for part in parts)
+            said.setdefault("sent", []).append(asyncio.get_running_loop().time())
+            writer.write(data)
+            await asyncio.sleep(0.2)
+
+    async with served(serve) as port:
+        yield f"http://127.0.0.1:{port}/video"
+
+
+@pytest.mark.parametrize(
+    ("kind", "more"),
+    [
+        (b"multipart/x-mixed-replace; boundary=b", b""),
+        (b"multipart/x-mixed-replace;boundary=--b", b"Transfer-Encoding: chunked\r\n"),
+        (b'Multipart/x-mixed-replace; boundary="b"', b"Connection: close\r\n"),
+        (b"multipart/x-mixed-replace", b""),
+        (b"multipart/mixed", b""),
+    ],
+)
+async def test_cameras_of_all_kinds_are_read(kind: bytes, more: bytes) -> None:
+    async with camera(HEAD % (kind, more)) as url, frames.open(url) as source:
+        got = []
+        async with source.reader() as reader:
+            async for frame in reader:
+                got.append(read_stamp(frame.grey()))
+                if len(got) == 8:
+                    break
+            assert reader.statistics().lost == 0
+    numbers = [stamp[0] for stamp in got if stamp is not None]
+    assert numbers == [(numbers[0] + place) % 8 for place in range(8)]
+
+
+@pytest.mark.parametrize("way", ["as it should be", "no length", "the boundary behind it"])
+@pytest.mark.real_time
+async def test_no_picture_waits_for_the_next_one(way: str) -> None:
+    sent: list[float] = []
+    head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
+    async with (
+        camera(head, PARTS[way], sent=sent) as url,
+        frames.open(url) as source,
+        source.reader() as reader,
+    ):
+        await anext(reader)
+        for _ in range(5):
+            await anext(reader)
+            late = asyncio.get_running_loop().time() - sent[-1]
+            assert late < 0.15, "a picture came with the next one, or later"
+
+
+async def test_what_is_no_stream_of_parts_is_left_to_others() -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(
+            b"HTTP/1.1 200 OK\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n"
+            % len(PICTURES[3])
+        )
+        writer.write(PICTURES[3])
+        await writer.drain()
+        await reader.read()
+
+    async with served(serve) as port, frames.open(f"http://127.0.0.1:{port}/shot") as source:
+        stamp = read_stamp((await source.newest(max_age=100)).grey())
+        assert stamp is not None
+        assert stamp[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("fragment", "error", "said"),
+    [
+        ("#format=H264", FrameSourceError, "expected H264, got MJPEG"),
+        ("#fps=3", ConfigurationError, "a recording, which alone has it"),
+    ],
+)
+async def test_what_a_stream_of_parts_cannot_do_is_told(
+    fragment: str, error: type[Exception], said: str
+) -> None:
+    head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
+    async with camera(head) as url:
+        with pytest.raises(error, match=said):
+            await frames.open(url + fragment).__aenter__()
+
+
+async def test_pixels_and_bytes_come_as_they_are_wanted() -> None:
+    head = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
+    async with camera(head) as url:
+        async with frames.open(f"{url}#format=MJPEG") as source:
+            frame = await source.newest()
+            assert bytes(frame.data) in PICTURES
+        async with frames.open(f"{url}#format=RGB8") as source:
+            assert (await source.newest()).format.name == "RGB8"
+
+
+@pytest.mark.parametrize("line", [b"zz\r\n", b"1" * 5000, b"-1\r\n"])
+async def test_chunks_that_are_none_are_told(line: bytes) -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(HEAD % (b"multipart/mixed", b"Transfer-Encoding: chunked\r\n") + line)
+        await reader.read()
+
+    async with served(serve) as port:
+        with pytest.raises(FrameFormatError, match="a chunk: expected its size"):
+            await frames.open(f"http://127.0.0.1:{port}/").__aenter__()
