@@ -11,15 +11,23 @@
 The container is MCAP, which Foxglove and others open. It needs the extra ``record``.
 """
 
-from smartcam.recording._bag_items import BagCounts
-from smartcam.recording._bag_recorder import BagRecorder
-from smartcam.recording._bag_recording import write_bag
-from smartcam.recording._fleet_recorder import FleetRecorder
-from smartcam.recording._fleet_replay import FleetReplay
-from smartcam.recording._pcap import write_pcap
-from smartcam.recording._reader import Recording, load_recording
-from smartcam.recording._recorder import Recorder
-from smartcam.recording._replay import ReplayedCamera, replay
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.recording._bags.conversion import write_bag
+    from smartcam.recording._bags.items import BagCounts
+    from smartcam.recording._bags.recorder import BagRecorder
+    from smartcam.recording._folders.recorder import FleetRecorder
+    from smartcam.recording._folders.replay import FleetReplay
+    from smartcam.recording._pcap import write_pcap
+    from smartcam.recording._pictures.folder import RotatingRecorder
+    from smartcam.recording._reader import Recording, load_recording
+    from smartcam.recording._recorder import Recorder
+    from smartcam.recording._replays.replay import ReplayedCamera, replay
 
 __all__ = [
     "BagCounts",
@@ -29,8 +37,26 @@ __all__ = [
     "Recorder",
     "Recording",
     "ReplayedCamera",
+    "RotatingRecorder",
     "load_recording",
     "replay",
     "write_bag",
     "write_pcap",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_bags.conversion": "write_bag",
+            "_bags.items": "BagCounts",
+            "_bags.recorder": "BagRecorder",
+            "_folders.recorder": "FleetRecorder",
+            "_folders.replay": "FleetReplay",
+            "_pcap": "write_pcap",
+            "_pictures.folder": "RotatingRecorder",
+            "_reader": "Recording load_recording",
+            "_recorder": "Recorder",
+            "_replays.replay": "ReplayedCamera replay",
+        },
+    )

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam._locks import try_lock
 from smartcam.exceptions import ConfigurationError
-from smartcam.recording._form import EPOCH, PROFILE
-from smartcam.recording._records import MAGIC
+from smartcam.recording._mcap.form import EPOCH, PROFILE
+from smartcam.recording._mcap.records import MAGIC
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,18 +31,18 @@ _AT = "%Y%m%dT%H%M%S.%f"
 
 _HEAD = MAGIC + b"\x01"
 _PROFILE_AT = len(_HEAD) + 8
-"""Where the length of the header's profile stands, behind the record's own."""
+"""Place in the file, in bytes, of the length of the header's profile, behind the record's own."""
 
 LOCK = ".smartcam.lock"
 """The file that is locked where a folder cannot be: on Windows."""
 
 
 class FileName(NamedTuple):
-    """What a file's name says.
+    """The parts of a file's name.
 
     Attributes:
-        camera: its camera.
-        at: when the first in it came, UTC, in whole milliseconds; later where the clock went back.
+        camera: name of the camera.
+        at: time of the first record, UTC, in whole milliseconds; later where the clock went back.
     """
 
     camera: str
@@ -50,7 +50,7 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return what a name says; None where it is no name of a recorder's."""
+        """Return the parts of a name; None where no recorder gives such a name."""
         found = _NAME.fullmatch(name)
         if found is None:
             return None
@@ -70,9 +70,9 @@ class KnownFile:
     """A file of the folder; the oldest is the least.
 
     Attributes:
-        at: when it was begun.
-        name: its name.
-        size: its bytes.
+        at: time at which the file was begun.
+        name: name of the file.
+        size: size of the file, bytes.
     """
 
     at: datetime
@@ -81,7 +81,7 @@ class KnownFile:
 
 
 def is_ours(path: Path) -> bool:
-    """Return whether a file has the form of a recording of smartcam's; an empty one has not."""
+    """Return True if a file begins as smartcam's recordings do; an empty file does not."""
     try:
         with path.open("rb") as stream:
             head = stream.read(_PROFILE_AT + 4 + len(PROFILE))
@@ -179,11 +179,11 @@ class RecordingFolder:
         self._last[name.camera] = max(name.at, self._last.get(name.camera, EPOCH))
 
     def next_path(self, camera: str, at: datetime) -> Path:
-        """Return the path of a camera's next file: it sorts behind all that were.
+        """Return the path of a camera's next file, which sorts behind all earlier ones.
 
         Args:
-            camera: its name.
-            at: when what comes first in it came.
+            camera: name of the camera.
+            at: time at which the first record of the file came.
         """
         whole = max(EPOCH, at - timedelta(microseconds=at.microsecond % 1000))
         last = self._last.get(camera)
@@ -201,7 +201,7 @@ class RecordingFolder:
             self.files[path.name] = KnownFile(name.at, path.name, 0)
 
     def grown(self, path: Path, size: int) -> None:
-        """Say how large a file is now."""
+        """Note the present size of a file, bytes."""
         if path.name in self.files:
             self.files[path.name].size = size
 

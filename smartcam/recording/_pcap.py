@@ -9,33 +9,38 @@ segments, and how a link that was lost came to its end.
 from __future__ import annotations
 
 import ipaddress
-from dataclasses import dataclass
-from decimal import Decimal
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._arguments import check_flag, check_path
 from smartcam.exceptions import ConfigurationError, RecordingError, UnsupportedError
 from smartcam.models import Disconnected
 from smartcam.observers import TraceEntry
-from smartcam.protocols._base import Transport
-from smartcam.recording._form import load_extra, nanoseconds
+from smartcam.protocols import Transport
+from smartcam.recording._mcap.form import nanoseconds
+from smartcam.recording._packets import (
+    ACK,
+    FIN,
+    PUSH,
+    SYN,
+    Side,
+    file_header,
+    file_record,
+    tcp_packet,
+    udp_packet,
+)
+from smartcam.recording._reader import check_recording
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
-    from smartcam.recording._form import Item
+    from smartcam.recording._mcap.form import Item
     from smartcam.recording._reader import RecordedCamera, Recording
 
 MSS = {4: 1460, 6: 1440}
 """Bytes of a TCP segment, by the version of IP: what fits into an Ethernet frame."""
-
-SCALE = 7
-"""Window scale: a window of 8 MB, more than the largest frame."""
-
-MAX_PACKET = 1 << 18
-"""Snapshot length that the file's header tells: Wireshark's own default."""
 
 FIRST_PORT, PORTS = 49_152, 16_384
 """The ports that a system gives to clients (RFC 6335); each link takes the next."""
@@ -43,7 +48,7 @@ FIRST_PORT, PORTS = 49_152, 16_384
 MAX_DATAGRAM = 65_507
 """Bytes of a UDP datagram over IPv4."""
 
-MAX_TIME = (1 << 32) * 10**9
+MAX_TIME_NS = (1 << 32) * 10**9
 """Nanoseconds since 1970 that a packet's time stays below: pcap counts seconds in 32 bits."""
 
 _ADDRESSES = {4: ("192.0.2.1", "192.0.2.2"), 6: ("2001:db8::1", "2001:db8::2")}
@@ -53,8 +58,6 @@ _CLIENT_MAC, _CAMERA_MAC = bytes.fromhex("020000000001"), bytes.fromhex("0200000
 
 _HANDSHAKE = 3000  # nanoseconds before the first frame
 
-_FIN, _SYN, _RST, _PUSH, _ACK = 0x01, 0x02, 0x04, 0x08, 0x10
-
 
 class _Packet(NamedTuple):
     """A packet and its time, nanoseconds since 1970."""
@@ -63,25 +66,15 @@ class _Packet(NamedTuple):
     data: bytes
 
 
-@dataclass(slots=True, eq=False)
-class _Side:
-    """One end of a link."""
-
-    mac: bytes
-    ip: bytes
-    port: int
-    sequence: int = 0
-
-
 def write_pcap(
     recording: Recording, path: str | Path, *, camera: str | None = None, overwrite: bool = False
 ) -> int:
     """Write the frames of a recording as packets to a pcap file.
 
     Args:
-        recording: where from.
+        recording: recording to read.
         path: the file; the usual ending is ``.pcap``.
-        camera: whose frames; default all cameras'.
+        camera: name of the camera whose frames to write; default all cameras.
         overwrite: take the place of a file that is there.
 
     Returns:
@@ -92,16 +85,16 @@ def write_pcap(
         UnsupportedError: a camera is a fleet's, whose frames are its agent's.
         RecordingError: it cannot be written to its end: the disk is full, or a frame fits into no
             packet.
-        MissingExtraError: dpkt is not installed.
     """
-    dpkt = load_extra("dpkt")
+    check_recording(recording, "pcap")
+    path = check_path(path, "path", "pcap")
+    overwrite = check_flag(overwrite, "overwrite", "pcap")
     for known in [*recording.cameras.values()] if camera is None else [recording.camera(camera)]:
         if is_fleet(known.url):
             raise UnsupportedError(
                 f"recording {recording.path}: camera {known.name!r} is a fleet's, so no frames of "
                 "it are recorded, which packets are made of"
             )
-    path = Path(path)
     try:
         stream = path.open("wb" if overwrite else "xb")
     except FileExistsError as exc:
@@ -114,9 +107,9 @@ def write_pcap(
     count = 0
     try:
         with stream:
-            writer = dpkt.pcap.Writer(stream, snaplen=MAX_PACKET)
-            for packet in _packets(recording, camera, dpkt):
-                writer.writepkt_time(packet.data, Decimal(packet.time // 1000) / 1_000_000)
+            stream.write(file_header())
+            for packet in _packets(recording, camera):
+                stream.write(file_record(packet.time, packet.data))
                 count += 1
     except RecordingError as exc:
         raise RecordingError(f"pcap {path}: {exc}") from exc
@@ -125,11 +118,11 @@ def write_pcap(
     return count
 
 
-def _packets(recording: Recording, camera: str | None, dpkt: Any) -> Iterator[_Packet]:
+def _packets(recording: Recording, camera: str | None) -> Iterator[_Packet]:
     wires: dict[str, _Capture] = {}
     for index, known in enumerate(recording.cameras.values()):
         if not is_fleet(known.url):
-            wires[known.name] = _Capture(known, dpkt, index)
+            wires[known.name] = _Capture(known, index)
     for item in recording.items(camera):
         if item.camera in wires:
             yield from wires[item.camera].packets(item)
@@ -140,15 +133,14 @@ def _packets(recording: Recording, camera: str | None, dpkt: Any) -> Iterator[_P
 class _Capture:
     """Everything that one camera's links carry; ``index`` is the camera's in the recording."""
 
-    def __init__(self, camera: RecordedCamera, dpkt: Any, index: int) -> None:
-        self._dpkt = dpkt
+    def __init__(self, camera: RecordedCamera, index: int) -> None:
         host, port, self._tcp = _where(camera)
         address = _address(host, index)
         client = address
         if not address.is_loopback:
             client = ipaddress.ip_address(_ADDRESSES[address.version][0])
-        self._camera = _Side(_CAMERA_MAC, address.packed, port)
-        self._client = _Side(_CLIENT_MAC, client.packed, FIRST_PORT + 512 * index)
+        self._camera = Side(_CAMERA_MAC, address.packed, port)
+        self._client = Side(_CLIENT_MAC, client.packed, FIRST_PORT + 512 * index)
         self._ids = 0
         self._mss = MSS[address.version]
         self._open = False
@@ -156,7 +148,7 @@ class _Capture:
         self._now = 0
 
     def packets(self, item: Item) -> Iterator[_Packet]:
-        """Yield what an item makes."""
+        """Yield the packets that an item makes."""
         if isinstance(item, Disconnected):
             self._now = max(self._now, nanoseconds(item.at))
             yield from self._held()
@@ -165,7 +157,7 @@ class _Capture:
             yield from self._frame(item)
 
     def end(self) -> Iterator[_Packet]:
-        """Yield what ends a link that is still there."""
+        """Yield the packets that end a link which is still open."""
         yield from self._held()
         yield from self._end(by_client=True)
 
@@ -206,9 +198,9 @@ class _Capture:
         for begin in range(0, len(data), self._mss):
             part = data[begin : begin + self._mss]
             last = begin + self._mss >= len(data)
-            yield self._segment(sender, receiver, _ACK | (_PUSH if last else 0), part)
+            yield self._segment(sender, receiver, ACK | (PUSH if last else 0), part)
             sender.sequence += len(part)
-        yield self._segment(receiver, sender, _ACK)
+        yield self._segment(receiver, sender, ACK)
 
     # ------------------------------------------------------------------ a link's begin and end
 
@@ -220,13 +212,13 @@ class _Capture:
             return
         client.sequence, camera.sequence = 1000, 2000
         now, self._now = self._now, self._now - _HANDSHAKE
-        yield self._segment(client, camera, _SYN)
+        yield self._segment(client, camera, SYN)
         client.sequence += 1
         self._now += 1000
-        yield self._segment(camera, client, _SYN | _ACK)
+        yield self._segment(camera, client, SYN | ACK)
         camera.sequence += 1
         self._now += 1000
-        yield self._segment(client, camera, _ACK)
+        yield self._segment(client, camera, ACK)
         self._now = now
 
     def _end(self, *, by_client: bool) -> Iterator[_Packet]:
@@ -236,53 +228,29 @@ class _Capture:
         if not self._tcp:
             return
         first, second = (self._client, self._camera) if by_client else (self._camera, self._client)
-        yield self._segment(first, second, _FIN | _ACK)
+        yield self._segment(first, second, FIN | ACK)
         first.sequence += 1
-        yield self._segment(second, first, _FIN | _ACK)
+        yield self._segment(second, first, FIN | ACK)
         second.sequence += 1
-        yield self._segment(first, second, _ACK)
+        yield self._segment(first, second, ACK)
 
     # ------------------------------------------------------------------ packets
 
-    def _segment(self, sender: _Side, receiver: _Side, flags: int, data: bytes = b"") -> _Packet:
-        tcp = self._dpkt.tcp.TCP(
-            sport=sender.port,
-            dport=receiver.port,
-            seq=sender.sequence & 0xFFFFFFFF,
-            ack=receiver.sequence & 0xFFFFFFFF if flags & _ACK else 0,
-            flags=flags,
-            win=65_535,
-            data=data,
-        )
-        if flags & _SYN:  # maximum segment size; no operation; window scale
-            size = self._mss.to_bytes(2, "big")
-            tcp.opts = b"\x02\x04" + size + b"\x01\x03\x03" + bytes([SCALE])
-            tcp.off = (20 + len(tcp.opts)) // 4
-        return self._packet(sender, receiver, self._dpkt.ip.IP_PROTO_TCP, tcp)
+    def _segment(self, sender: Side, receiver: Side, flags: int, data: bytes = b"") -> _Packet:
+        number = self._next_number()
+        return self._packet(tcp_packet(sender, receiver, flags, number, data, self._mss))
 
-    def _datagram(self, sender: _Side, receiver: _Side, data: bytes) -> _Packet:
-        udp = self._dpkt.udp.UDP(
-            sport=sender.port, dport=receiver.port, ulen=8 + len(data), data=data
-        )
-        return self._packet(sender, receiver, self._dpkt.ip.IP_PROTO_UDP, udp)
+    def _datagram(self, sender: Side, receiver: Side, data: bytes) -> _Packet:
+        return self._packet(udp_packet(sender, receiver, self._next_number(), data))
 
-    def _packet(self, sender: _Side, receiver: _Side, protocol: int, payload: Any) -> _Packet:
-        dpkt = self._dpkt
-        if len(sender.ip) == 4:
-            self._ids = (self._ids + 1) & 0xFFFF
-            ip = dpkt.ip.IP(
-                src=sender.ip, dst=receiver.ip, p=protocol, id=self._ids, df=1, data=payload
-            )
-            ip.len = len(ip)
-            kind = dpkt.ethernet.ETH_TYPE_IP
-        else:
-            ip = dpkt.ip6.IP6(src=sender.ip, dst=receiver.ip, nxt=protocol, hlim=64, data=payload)
-            ip.plen = len(payload)
-            kind = dpkt.ethernet.ETH_TYPE_IP6
-        if self._now >= MAX_TIME:
+    def _next_number(self) -> int:
+        self._ids = (self._ids + 1) & 0xFFFF
+        return self._ids
+
+    def _packet(self, data: bytes) -> _Packet:
+        if self._now >= MAX_TIME_NS:
             raise RecordingError("a frame of the year 2106 or later, which pcap cannot tell")
-        frame = dpkt.ethernet.Ethernet(src=sender.mac, dst=receiver.mac, type=kind, data=ip)
-        return _Packet(self._now, bytes(frame))
+        return _Packet(self._now, data)
 
 
 def _where(camera: RecordedCamera) -> tuple[str, int, bool]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar, overload
 
+from smartcam._arguments import check_instant, check_kind, check_path, check_text
+from smartcam._extras import from_part
 from smartcam.exceptions import (
     ConfigurationError,
     MissingExtraError,
@@ -15,24 +17,26 @@ from smartcam.exceptions import (
 )
 from smartcam.models import CameraEvent, Result
 from smartcam.observers import TraceEntry
-from smartcam.recording._bodies import LastBodies
 from smartcam.recording._folder import ENDING, FileName, files_of
-from smartcam.recording._form import (
+from smartcam.recording._judged import judged
+from smartcam.recording._mcap.bodies import LastBodies
+from smartcam.recording._mcap.form import (
     CAMERA_METADATA,
     EPOCH,
     FILE_METADATA,
     FORMATS,
     KINDS,
     MAX_CAMERAS,
+    PICTURE_SCHEMAS,
     RecordedError,
+    RecordedPicture,
     body_of,
     camera_name,
     count_values,
     message_fields,
     optional,
 )
-from smartcam.recording._recorder import Counts
-from smartcam.recording._records import (
+from smartcam.recording._mcap.records import (
     Channel,
     CutOffError,
     McapMessage,
@@ -40,14 +44,17 @@ from smartcam.recording._records import (
     RecordReader,
     Schema,
 )
+from smartcam.recording._recorder import Counts
 from smartcam.recording._state import STATE_METADATA, RecordedState
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sized
+    from collections.abc import Callable, Iterator, Sized
     from datetime import datetime
 
-    from smartcam.recording._form import Item, Kind
-    from smartcam.recording._records import Record
+    from smartcam.frames import Frame
+    from smartcam.recording._judged import JudgedResult
+    from smartcam.recording._mcap.form import Item, Kind
+    from smartcam.recording._mcap.records import Record
 
 MIN_VALUES = 10_000_000
 """Values in the messages of a file that every file may have: ten seconds of work."""
@@ -60,15 +67,15 @@ T = TypeVar("T")
 
 
 class RecordedCamera(NamedTuple):
-    """What a recording says about a camera.
+    """A recording's facts about a camera.
 
     Attributes:
-        name: its name.
-        url: its address, without a password; "" where there was never a session.
-        protocol: name of its protocol; "" where there was never a session.
-        dialect: name of its dialect, None where none is known.
+        name: name of the camera.
+        url: address of the camera, without a password; "" where there was never a session.
+        protocol: name of the protocol; "" where there was never a session.
+        dialect: name of the dialect; None where none is known.
         quirks: deviations from the dialect.
-        interpret_as: how its results were read, as text; None where the recorder was not told.
+        interpret_as: interpreter of the results, as text; None where the recorder was not told.
         facts: everything that was told, by name.
     """
 
@@ -90,9 +97,9 @@ class Recording:
 
     Attributes:
         path: the file, or the folder.
-        version: of the smartcam that wrote it.
+        version: version of the smartcam that wrote the recording.
         cameras: the cameras in it, by name, in the order in which they appear.
-        counts: how many items of each kind there are.
+        counts: numbers of items of each kind.
         began: time of the first item, UTC; None where there is none.
         ended: time of the last item, UTC.
         remark: "" for a whole file; otherwise where it stops being readable, and why. Of a folder
@@ -126,6 +133,8 @@ class Recording:
         Raises:
             ConfigurationError: there is none of that name, or there are several; names them.
         """
+        if name is not None:
+            name = check_text(name, "camera", f"recording {self.path}")
         names = ", ".join(self.cameras)
         if not names:
             raise ConfigurationError(f"recording {self.path}: no camera is in it")
@@ -149,10 +158,12 @@ class Recording:
                 yield found
 
     def all_items(self, camera: str | None = None) -> Iterator[Item | RecordedState]:
-        """Yield what a replay wants: also what is before ``since``, and what a camera was.
+        """Yield the items for a replay, those before ``since`` and the states of cameras included.
 
-        Where the rest of a file could not be read it is not known what the camera was then.
+        Where the rest of a file could not be read, an unknown state of the camera follows.
         """
+        if camera is not None:
+            camera = check_text(camera, "camera", f"recording {self.path}")
         for path in self._files_of(camera):
             scan, last = _Scan(path), None
             try:
@@ -193,8 +204,35 @@ class Recording:
         """Yield the errors."""
         return self._of_type(RecordedError, camera)
 
+    def pictures(self, camera: str | None = None) -> Iterator[Frame]:
+        """Yield the pictures as their source gave them: with its times, numbers and losses.
+
+        ``lost`` also counts those that the recorder had to leave out before the picture.
+        """
+        return (frame_of(item) for item in self._of_type(RecordedPicture, camera))
+
+    def judged(self, camera: str | None = None) -> Iterator[JudgedResult]:
+        """Yield each result with the picture that it was made of, as far as the recording tells.
+
+        The recorder was told which one that is, or it is found by the times: the first picture of
+        the camera that was surely exposed after the trigger, and before the result came. A
+        result that its client did not trigger has one only if the recorder was told.
+        """
+        return judged(self.items(camera))
+
     def _of_type(self, kind: type[T], camera: str | None) -> Iterator[T]:
         return (item for item in self.items(camera) if isinstance(item, kind))
+
+
+def frame_of(picture: RecordedPicture) -> Frame:
+    """Return the frame of a picture, which also counts as lost what was left out before it."""
+    frame = picture.frame
+    return replace(frame, lost=frame.lost + picture.left_out) if picture.left_out else frame
+
+
+def check_recording(value: Recording, who: str) -> Recording:
+    """Return a recording; anything else is a ConfigurationError."""
+    return check_kind(value, Recording, "recording", "what load_recording() returns", who)
 
 
 def load_recording(
@@ -214,10 +252,9 @@ def load_recording(
         RecordingError: it goes beyond a bound that no recording comes near, or the disk fails.
         MissingExtraError: what inflates its chunks is not installed.
     """
-    path = Path(path)
-    for at in (since, until):
-        if at is not None and at.tzinfo is None:
-            raise ConfigurationError(f"recording {path}: the time {at} has no time zone")
+    path = check_path(path, "path", "recording")
+    since = check_instant(since, "since", f"recording {path}")
+    until = check_instant(until, "until", f"recording {path}")
     look = _FolderLook(path, since, until)
     if not path.is_dir():
         look.take(_Scan(path))
@@ -233,6 +270,24 @@ def load_recording(
     if not look.version:
         raise ConfigurationError("\n".join(look.remarks))
     return look.recording(tuple(files))
+
+
+def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
+    """Yield each item of a file or of a folder that can be read, without a look through it before.
+
+    Args:
+        path: the file or folder.
+        note: called with what cannot be read, and why.
+
+    Raises:
+        ConfigurationError: a file cannot be read, or is no recording of ours.
+        RecordingError: it goes beyond a bound, or the disk fails.
+    """
+    for file in _files_in(path, None, None) if path.is_dir() else [path]:
+        scan = _Scan(file)
+        yield from scan.items()
+        if scan.remark:
+            note(f"{file}: {scan.remark}")
 
 
 def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> list[Path]:
@@ -260,12 +315,12 @@ def _files_in(folder: Path, since: datetime | None, until: datetime | None) -> l
 
 @dataclass(slots=True)
 class _FolderLook:
-    """What is found while files are looked through."""
+    """The findings while files are looked through."""
 
     path: Path
     since: datetime | None
     until: datetime | None
-    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(Counts._fields, 0))
     began: datetime | None = None
     ended: datetime | None = None
     version: str = ""
@@ -297,11 +352,13 @@ class _FolderLook:
         if self.since is not None and at < self.since:
             return
         self.counts[_kind(item)] += 1
+        if isinstance(item, RecordedPicture):
+            self.counts["left_out"] += item.left_out
         self.began = at if self.began is None else min(self.began, at)
         self.ended = at if self.ended is None else max(self.ended, at)
 
     def recording(self, files: tuple[Path, ...]) -> Recording:
-        """Return what was found."""
+        """Return the recording, with everything that was found in its files."""
         return Recording(
             path=self.path,
             version=self.version,
@@ -336,6 +393,8 @@ def _kind(item: Item) -> str:
             return "results"
         case RecordedError():
             return "errors"
+        case RecordedPicture():
+            return "pictures"
         case _:
             return "events"
 
@@ -390,7 +449,7 @@ class _Scan:
             self._check_magic(stream.read(8))
             stream.seek(0)
             count = 0
-            kinds: dict[int, Kind] = {}
+            kinds: dict[int, Kind | str] = {}
             schemas: dict[int, str] = {}
             reader = RecordReader(stream, self.path)
             records = reader.records()
@@ -417,7 +476,11 @@ class _Scan:
             self._check_ours(schemas)
 
     def _take(
-        self, record: Record, schemas: dict[int, str], kinds: dict[int, Kind], reader: RecordReader
+        self,
+        record: Record,
+        schemas: dict[int, str],
+        kinds: dict[int, Kind | str],
+        reader: RecordReader,
     ) -> Item | RecordedState | None:
         match record:
             case Schema(number, name):
@@ -427,12 +490,17 @@ class _Scan:
                 kind = next((one for one in KINDS.values() if one.schema == name), None)
                 if kind is not None:
                     kinds[number] = kind
+                elif name in PICTURE_SCHEMAS:
+                    kinds[number] = name
             case McapMessage(channel, sequence, data) if channel in kinds:
+                said = kinds[channel]
+                if isinstance(said, str):
+                    return self._picture(said, data)
                 body = bytes(data)
                 self._count_values(count_values(body), reader.place)
                 fields = message_fields(body)
                 self._find_raw(fields, reader)
-                item = kinds[channel].from_json(fields)
+                item = said.from_json(fields)
                 if isinstance(item, TraceEntry) and (hex_data := body_of(item)):
                     self.bodies.add((item.camera, sequence), hex_data, len(hex_data))
                 return item
@@ -447,6 +515,12 @@ class _Scan:
             case _:
                 pass
         return None
+
+    @staticmethod
+    def _picture(schema: str, data: memoryview) -> RecordedPicture:
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._pictures.messages import picture_of
+        return picture_of(schema, data)
 
     def _find_raw(self, fields: dict[str, Any], reader: RecordReader) -> None:
         """Put a result's bytes where they belong, if they stand in its frame."""

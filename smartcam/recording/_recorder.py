@@ -17,37 +17,45 @@ import os
 import stat
 import threading
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import IO, TYPE_CHECKING, NamedTuple, Protocol
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import smartcam
-from smartcam._locks import try_lock
+from smartcam._arguments import check_flag, check_kind, check_path, check_text
+from smartcam._extras import from_part, load
+from smartcam._forks import tell_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Connected, Reconnected, Result
 from smartcam.observers import Observer, TraceEntry
-from smartcam.recording._bodies import LastBodies
-from smartcam.recording._form import (
+from smartcam.recording._exclusive_files import opened
+from smartcam.recording._mcap.bodies import LastBodies
+from smartcam.recording._mcap.form import (
     CAMERA_METADATA,
     FILE_METADATA,
     FORMAT,
     KINDS,
+    MAX_NAME,
+    MAX_PICTURE_SIZE_BYTES,
+    PICTURES,
     PROFILE,
     RecordedError,
+    RecordedPicture,
     body_of,
     load_compress,
     message_of,
     nanoseconds,
     topic_of,
 )
-from smartcam.recording._mcap import McapWriter
+from smartcam.recording._mcap.writer import McapWriter
 from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
     from types import TracebackType
     from typing import Self
 
-    from smartcam.recording._form import Item
+    from smartcam.frames import Frame, FrameSource, ReaderStatistics
+    from smartcam.recording._mcap.form import Item
 
 INTERVAL = 0.5
 """Seconds that anything waits for its chunk: a crash loses at most a second, writing included. The
@@ -56,8 +64,15 @@ index of the chunks is kept in memory until the end: about 25 MB for a day witho
 CHUNK = 1 << 20
 """Bytes that wait before a chunk is written sooner; also the largest chunk."""
 
-MAX_WAITING = 1 << 26
+MAX_WAITING_BYTES = 1 << 26
 """Bytes that wait for the disk before the recording gives up: a minute of a fast camera."""
+
+MAX_WAITING_PICTURE_BYTES = 1 << 26
+"""Bytes of pictures that wait for the disk before further ones are left out; one may wait however
+large it is."""
+
+VIDEO_SUFFIX = ".mkv"
+"""Suffix of a file that becomes a video."""
 
 CLOSE_TIMEOUT = 30.0
 """Seconds that :meth:`Recorder.close` waits for the disk."""
@@ -67,19 +82,23 @@ OVERHEAD = 512
 
 
 class Counts(NamedTuple):
-    """What was recorded so far, written or waiting.
+    """The counts of what was recorded so far, written or waiting.
 
     Attributes:
         frames: frames and bytes that make none.
         results: interpreted results.
         events: events of cameras.
         errors: errors.
+        pictures: pictures.
+        left_out: pictures that were not written, since too much waited for the disk.
     """
 
     frames: int = 0
     results: int = 0
     events: int = 0
     errors: int = 0
+    pictures: int = 0
+    left_out: int = 0
 
 
 class Description(NamedTuple):
@@ -89,7 +108,7 @@ class Description(NamedTuple):
 
 
 class _Written(Protocol):
-    """What the thread writes to."""
+    """The file or folder that the thread writes to."""
 
     def start(self) -> None: ...
 
@@ -115,6 +134,11 @@ class Recorder(Observer):
     Before it is opened and after it is closed it takes nothing. A result's value is turned to JSON
     a moment later in the recorder's thread: do not change it in place.
 
+    A file that ends in ``.mkv`` becomes a video of one camera's pictures, without loss: JPEGs as
+    they came, pixels packed by FFV1. The times are those of the captures, in whole milliseconds,
+    from the first picture on, whose time is the file's ``creation_time``. When size or format
+    change, a further file begins: ``run-2.mkv``. Results and events are not in it.
+
     Args:
         path: the file; the usual ending is ``.mcap``.
         overwrite: take the place of a file that is there.
@@ -124,17 +148,20 @@ class Recorder(Observer):
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
-        self.path: Path = Path(path)
-        self._overwrite = overwrite
+        self.path: Path = check_path(path, "path", "recording")
+        self._overwrite = check_flag(overwrite, "overwrite", "recording")
         self._more = threading.Condition()
         self._items: list[Item | Description] = []
-        self._waiting = 0  # bytes in it
-        self._counts = dict.fromkeys(KINDS, 0)
+        self._waiting = 0  # bytes in it, without pictures
+        self._waiting_pictures = 0  # bytes of pictures in it
+        self._left_out: dict[str, int] = {}  # pictures since the last one, by camera
+        self._counts = dict.fromkeys(Counts._fields, 0)
         self._taking = False
         self._closing = False
         self._file: _Written | None = None
         self._thread: threading.Thread | None = None
         self._failure: concurrent.futures.Future[RecordingError] = concurrent.futures.Future()
+        tell_of_forks(self)
 
     # ------------------------------------------------------------------ life
 
@@ -158,9 +185,19 @@ class Recorder(Observer):
 
     def _make_file(self) -> _Written:
         """Make the file; raises as :meth:`open`."""
+        if self.path.suffix.lower() == VIDEO_SUFFIX:
+            with from_part("frames", "videos need"):
+                from smartcam.recording._pictures.video import VideoFile
+
+            load("av", "videos need")
+            return VideoFile(self._open_stream(), self.path, overwrite=self._overwrite)
         compress = load_compress()
+        return RecordingFile(self._open_stream(), compress, self.path)
+
+    def _open_stream(self) -> IO[bytes]:
+        """Make the empty file; raises as :meth:`open`."""
         try:
-            stream = opened(self.path, overwrite=self._overwrite)
+            return opened(self.path, overwrite=self._overwrite)
         except FileExistsError as exc:
             raise ConfigurationError(
                 f"recording {self.path}: the file is there already; overwrite (--force) takes its "
@@ -171,7 +208,6 @@ class Recorder(Observer):
         except (OSError, ValueError) as exc:
             reason = exc.strerror if isinstance(exc, OSError) else exc
             raise ConfigurationError(f"recording {self.path}: {reason}") from exc
-        return RecordingFile(stream, compress, self.path)
 
     def close(self) -> None:
         """Write what waits and end the file; idempotent.
@@ -204,14 +240,22 @@ class Recorder(Observer):
         with contextlib.suppress(RecordingError):  # the first error is the one that is told
             self.close()
 
+    def forked(self) -> None:
+        """Record nothing in a fork of the process that writes the file."""
+        self._more, self._failure = threading.Condition(), concurrent.futures.Future()
+        self._thread, self._items, self._waiting = None, [], 0
+        self._waiting_pictures = 0
+        if self._file is not None:
+            self._fail("this process is a fork of the one that writes it, which goes on")
+
     @property
     def counts(self) -> Counts:
-        """What was recorded so far."""
+        """Counts of what was recorded so far."""
         return Counts(**self._counts)
 
     @property
     def error(self) -> RecordingError | None:
-        """Why the recording ended before it was closed; None where it did not."""
+        """Error that ended the recording before it was closed; None where there was none."""
         return self._failure.result() if self._failure.done() else None
 
     async def wait_failed(self) -> RecordingError:
@@ -253,6 +297,135 @@ class Recorder(Observer):
             "errors",
         )
 
+    def add_picture(
+        self, frame: Frame, *, camera: str = "", result: Result[Any] | None = None
+    ) -> bool:
+        """Keep a picture, beside what else is recorded of its camera; it never waits.
+
+        Where more than 64 MiB of pictures wait for the disk, the picture is left out and counted:
+        the next one that is kept says how many were. Results are never left out for pictures.
+
+        Args:
+            frame: picture of a source of frames; its bytes are kept until they are written.
+            camera: name of the camera in the file; default the frame's source.
+            result: result that was made of the picture.
+
+        Returns:
+            True if the picture is kept.
+
+        Raises:
+            ConfigurationError: an argument is of another kind; or it becomes a video, and the
+                picture is another camera's.
+            FrameFormatError: it becomes a video, which cannot hold the picture without loss.
+            MissingExtraError: the distribution of frames is not installed.
+        """
+        with from_part("frames", "pictures need"):
+            from smartcam.frames import Frame
+
+        check_kind(frame, Frame, "frame", "a Frame", "recording")
+        if result is not None:
+            check_kind(result, Result, "result", "a Result, or None", "recording")
+        name = check_text(camera, "camera", "recording", least=0, most=MAX_NAME) or frame.source
+        made = (None, None) if result is None else (result.number, result.received_at)
+        if (check := getattr(self._file, "check_picture", None)) is not None:
+            check(frame, name)
+        size = memoryview(frame.data).nbytes
+        with self._more:
+            if not self._taking:
+                return False
+            waiting = self._waiting_pictures
+            room = MAX_WAITING_PICTURE_BYTES - waiting if waiting else size
+            if size > min(room, MAX_PICTURE_SIZE_BYTES):
+                self._counts["left_out"] += 1
+                self._left_out[name] = self._left_out.get(name, 0) + 1
+                return False
+            left_out = self._left_out.pop(name, 0)
+            self._counts["pictures"] += 1
+            at = datetime.fromtimestamp(max(0.0, frame.utc), UTC)
+            self._items.append(RecordedPicture(name, at, frame, left_out, *made))
+            self._waiting_pictures += size + OVERHEAD
+            if not waiting or waiting < CHUNK <= self._waiting_pictures:
+                self._more.notify()
+        return True
+
+    def add_image(self, camera: str, image: bytes, *, result: Result[Any] | None = None) -> bool:
+        """Keep a picture that a camera was asked for, as ``read_image()`` returns it.
+
+        ::
+
+            result = await camera.trigger()
+            recorder.add_image(camera.name, await camera.read_image(), result=result)
+
+        Args:
+            camera: name of the camera in the file.
+            image: bytes of a bitmap file.
+            result: result that was made of the picture.
+
+        Returns:
+            True if the picture is kept, as :meth:`add_picture` says.
+
+        Raises:
+            ConfigurationError: an argument is of another kind.
+            FrameFormatError: it is no bitmap.
+            MissingExtraError: the distribution of frames is not installed.
+        """
+        camera = check_text(camera, "camera", "recording", least=1, most=MAX_NAME)
+        check_kind(image, bytes, "image", "bytes", "recording")
+        if result is not None:
+            check_kind(result, Result, "result", "a Result, or None", "recording")
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._pictures.images import frame_of_image
+
+        return self.add_picture(frame_of_image(camera, image, result), camera=camera, result=result)
+
+    async def record(
+        self,
+        source: FrameSource,
+        *,
+        camera: str = "",
+        count: int | None = None,
+        on_start: Callable[[], None] = lambda: None,
+    ) -> ReaderStatistics:
+        """Record every picture of a source until it ends, or until there are so many.
+
+        The source streams for the recording, and readers see it meanwhile as ever. One that can
+        wait, such as a file with ``pace=none``, waits for the disk; of others pictures are left
+        out and counted where the disk is too slow.
+
+        Args:
+            source: open source.
+            camera: name of the camera in the recording; default the source's.
+            count: pictures after which it ends; None: it ends with the source.
+            on_start: called when the first picture is kept.
+
+        Returns:
+            Counts of what came, and what was lost before it came; ``skipped`` are those left out.
+
+        Raises:
+            ConfigurationError: an argument is wrong.
+            LocalProtocolError: the source is not open.
+            FrameFormatError: it becomes a video, which cannot hold the pictures without loss.
+            FrameSourceError: the source is gone, or stuck; what came before is recorded.
+            RecordingError: the recording ended, such as on a full disk.
+            MissingExtraError: the distribution of frames is not installed.
+
+        Cancellation: safe; everything until then is recorded.
+        """
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._pictures.recorder import record_frames
+
+        return await record_frames(source, self, camera, count, on_start)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Paths of the files that were begun so far; a video may have several."""
+        return tuple(getattr(self._file, "paths", (self.path,)))
+
+    @property
+    def has_room(self) -> bool:
+        """True if less than half of the pictures wait that may wait for the disk."""
+        return self._waiting_pictures < MAX_WAITING_PICTURE_BYTES // 2
+
     def _put(self, item: Item | Description, size: int, kind: str | None = None) -> None:
         with self._more:
             if not self._taking:
@@ -264,7 +437,7 @@ class Recorder(Observer):
             self._waiting += size + OVERHEAD
             if not before or before < CHUNK <= self._waiting:
                 self._more.notify()
-            full = self._waiting > MAX_WAITING
+            full = self._waiting > MAX_WAITING_BYTES
         if full:
             self._fail(f"the disk is too slow: {self._waiting >> 20} MiB wait to be written")
 
@@ -277,7 +450,7 @@ class Recorder(Observer):
         with self._more:
             self._taking = False
             self._items.clear()
-            self._waiting = 0
+            self._waiting = self._waiting_pictures = 0
             first = not self._failure.done()
         if first:
             with contextlib.suppress(concurrent.futures.InvalidStateError):
@@ -303,46 +476,25 @@ class Recorder(Observer):
         """Wait for something, write it; return whether that was the last."""
         with self._more:
             self._more.wait_for(lambda: self._items or self._closing)
-            self._more.wait_for(lambda: self._closing or self._waiting > CHUNK, INTERVAL)
+            self._more.wait_for(
+                lambda: self._closing or self._waiting + self._waiting_pictures > CHUNK, INTERVAL
+            )
             items, self._items = self._items, []
             self._waiting, over = 0, self._closing
+            self._waiting_pictures = 0
         for item in items:
             file.add(item)
         file.flush()
         return over
 
 
-def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
-    """Open a file for one recorder; what was in it is gone when it is ours, not before.
-
-    Raises:
-        ConfigurationError: another recorder writes it.
-        FileExistsError: it is there already.
-        OSError: it cannot be made.
-    """
-    stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
-    try:
-        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):  # a pipe may have many writers
-            if try_lock(stream.fileno()) is False:
-                raise ConfigurationError(f"recording {path}: another recorder is writing this file")
-            stream.truncate()
-    except BaseException:
-        stream.close()
-        raise
-    return stream
-
-
-def _open_whole(path: str, flags: int) -> int:
-    return os.open(path, flags & ~os.O_TRUNC, 0o666)
-
-
 class RecordingFile:
     """An MCAP file that is being written.
 
     Args:
-        stream: it, open.
-        compress: packs a chunk; of :func:`load_compress`.
-        path: where it is.
+        stream: the open file, closed at the end.
+        compress: function that packs a chunk, from :func:`load_compress`.
+        path: path of the file.
     """
 
     def __init__(self, stream: IO[bytes], compress: Callable[[bytes], bytes], path: Path) -> None:
@@ -380,6 +532,8 @@ class RecordingFile:
                 self._describe(facts)
             case RecordedError():
                 self._message("errors", item.camera, item.at, item)
+            case RecordedPicture():
+                self._picture(item)
             case _:
                 if isinstance(item, (Connected, Reconnected)):
                     self._describe({"camera": item.camera, **address_facts(item.url)})
@@ -442,6 +596,30 @@ class RecordingFile:
         self._writer.add_message(channel, when, message_of(kind, item, raw_from), number)
         return number
 
+    def _picture(self, picture: RecordedPicture) -> None:
+        """Write a picture as it is: its chunk is not packed."""
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._pictures import messages
+
+        schema = messages.schema_of(picture)
+        key = picture.camera, schema
+        if key not in self._channels:
+            if schema not in self._schemas:
+                data = messages.schema_data(schema)
+                self._schemas[schema] = self._writer.register_schema(schema, "protobuf", data)
+            self._channels[key] = channel = self._writer.register_channel(
+                f"/{picture.camera}/{PICTURES}",
+                "protobuf",
+                self._schemas[schema],
+                {"camera": picture.camera},
+            )
+            self._numbers[channel] = 0
+        channel = self._channels[key]
+        self._numbers[channel] = number = self._numbers[channel] + 1 & 0xFFFFFFFF
+        data = messages.picture_message(picture)
+        at = nanoseconds(picture.at)
+        self._writer.add_message(channel, at, data, number, packs=False)
+
     def _channel(self, camera: str, kind: str) -> int:
         known = self._channels.get((camera, kind))
         if known is not None:
@@ -468,7 +646,7 @@ class RecordingFile:
 
 
 def address_facts(url: str) -> dict[str, str]:
-    """Return what an address says of a camera."""
+    """Return the facts about a camera that its address tells."""
     if is_fleet(url):  # its own dialect is known to the agent
         return {"url": url, "protocol": "fleet"}
     try:

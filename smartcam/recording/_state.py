@@ -1,4 +1,4 @@
-"""What a camera was at a place in a recording, for who does not read what came before."""
+"""Tell a camera's state at a place in a recording without reading what came before."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from smartcam.models import (
     Status,
     StatusChanged,
 )
-from smartcam.recording._form import MAX_NAME, time_of
+from smartcam.recording._mcap.form import MAX_NAME, time_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -25,15 +25,15 @@ begins while there is a session, and behind a gap."""
 
 
 class RecordedState(NamedTuple):
-    """What a camera was at a place in the file.
+    """The state of a camera at a place in the file.
 
     Attributes:
         camera: name of the camera.
-        connected: there was a session.
-        application: id of the active one, None where it was not known.
-        status: None where it was not known.
-        endian: that the last status told.
-        at: when, UTC; None until it is written.
+        connected: whether there was a session.
+        application: id of the active application; None where it was not known.
+        status: status of the camera; None where it was not known.
+        endian: byte order that the last status told.
+        at: time of the state, UTC; None until the state is written.
     """
 
     camera: str
@@ -44,7 +44,7 @@ class RecordedState(NamedTuple):
     at: datetime | None = None
 
     def after(self, event: CameraEvent) -> RecordedState:
-        """Return what it is after an event."""
+        """Return the state of the camera after an event."""
         match event:
             case Connected() | Reconnected():
                 return self._replace(connected=True)
@@ -58,7 +58,7 @@ class RecordedState(NamedTuple):
                 return self
 
     def facts(self, endian: int) -> dict[str, str]:
-        """Return what stands in the file, now."""
+        """Return the texts by which a file tells the state, with the present time."""
         found = {
             "camera": self.camera,
             "at": datetime.now(UTC).isoformat(),
@@ -73,10 +73,10 @@ class RecordedState(NamedTuple):
 
     @classmethod
     def of(cls, facts: Mapping[str, str]) -> RecordedState:
-        """Return what stands in a file.
+        """Return the state that the texts of a file tell.
 
         Raises:
-            ValueError: it is none.
+            ValueError: the texts tell no state.
         """
         application, status = facts.get("application"), facts.get("status")
         camera, endian = facts.get("camera", ""), facts.get("endian", "0")

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._recording_file import RecordSection
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._inside import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
 from smartcam.recording._folder import FileName, files_of
 from tests.fleet.fleetkit import LAYOUT, PATIENCE

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import smartcam
-from smartcam.models import CameraEvent, Connected, Result
+from smartcam.models import CameraEvent, Connected, Disconnected, Result
 from smartcam.observers import TraceEntry
 from smartcam.recording import Recorder, load_recording
 
@@ -100,3 +100,23 @@ def containers(recording: Recording) -> list[tuple[int | None, str]]:
         for entry in recording.frames()
         if entry.message == "ResultContainer"
     ]
+
+
+PACKET_URLS = {
+    "tcp4": URL,
+    "udp4": "bvs+udp://192.168.0.10:36701?dialect=handbook",
+    "tcp6": "bvs://[2001:db8::7]:36701?dialect=handbook",
+    "udp6": "bvs+udp://[2001:db8::7]:36701?dialect=handbook",
+}
+"""A camera's URL, by what its frames are carried in."""
+
+
+def packet_items(url: str) -> list[TraceEntry | CameraEvent]:
+    """Return what is known of two links: frames of all sizes, a loss, an end."""
+    sizes = (1, 2, 3, 1440, 1441, 2921)
+    frames = [
+        container(1 + size / 1e4, b"")._replace(hex=(bytes(range(256)) * 12)[:size].hex())
+        for size in sizes
+    ]
+    gone = Disconnected(camera="left", at=at(3), reason="gone", expected=False)
+    return [*session(url), *frames, gone, frame(4, "> Connect"), frame(5, "< ConnectAnswer")]

@@ -88,9 +88,11 @@ def test_bag_command_tells_what_could_not_be_read(recorded: Path, tmp_path: Path
 def test_bag_command_with_a_calibration_wants_what_it_was_made_with(
     recorded: Path, tmp_path: Path
 ) -> None:
-    corners = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2]])
-    lifted = np.pad(corners, ((0, 0), (0, 1)), constant_values=0.125)
-    fit_plane(corners, lifted, model="rigid", y_down=True).save(tmp_path / "cal.json")
+    marks = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2], [0.1, 0.05], [0.22, 0.16]])
+    lifted = np.pad(marks, ((0, 0), (0, 1)), constant_values=0.125)
+    found = fit_plane(marks, lifted, model="rigid", y_down=True, tool_z=(0, 0, -1))
+    assert found.verdict.level == "good"  # else each command says that it is not
+    found.save(tmp_path / "cal.json")
     command = ["bag", str(recorded / "run.mcap"), "-o", str(tmp_path / "bag")]
     command += ["--calibration", str(tmp_path / "cal.json")]
     run(*command).failed(2, "y_down")

@@ -17,15 +17,16 @@ from mcap.reader import make_reader
 from smartcam.emulator import EmulatedCamera
 from smartcam.models import Result
 from smartcam.observers import TraceEntry
-from smartcam.recording import Recorder, _bodies, load_recording
-from smartcam.recording._bodies import LastBodies
-from smartcam.recording._form import KINDS
+from smartcam.recording import Recorder, load_recording
+from smartcam.recording._mcap import bodies as _bodies
+from smartcam.recording._mcap.bodies import LastBodies
+from smartcam.recording._mcap.form import KINDS
 from tests.recording.recordingkit import COUNTER, at, containers, record
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from smartcam.recording._form import Item
+    from smartcam.recording._mcap.form import Item
 
 CAMERAS = ("left", "right")
 

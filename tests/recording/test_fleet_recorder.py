@@ -18,18 +18,18 @@ from typing import Any
 
 import pytest
 
-from smartcam._client.triggering import TriggerRequest
+from smartcam._client._inside import TriggerRequest
 from smartcam.exceptions import ConfigurationError, NotRunningError, RecordingError
-from smartcam.fleet._shared import Carrier
+from smartcam.fleet._agent.shared import Carrier
 from smartcam.models import ApplicationChanged, Connected, Status, StatusChanged
 from smartcam.recording import FleetRecorder, Recorder, load_recording
-from smartcam.recording import _folder_files as folder_files
-from smartcam.recording import _folder_writer as folder_writer
 from smartcam.recording._folder import RecordingFolder
-from smartcam.recording._folder_files import FolderFiles, Limits
-from smartcam.recording._folder_track import CameraTrack
-from smartcam.recording._form import GAP, load_compress
-from smartcam.recording._schedule import plan_replay
+from smartcam.recording._folders import files as folder_files
+from smartcam.recording._folders import writer as folder_writer
+from smartcam.recording._folders.files import FolderFiles, Limits
+from smartcam.recording._folders.track import CameraTrack
+from smartcam.recording._mcap.form import GAP, load_compress
+from smartcam.recording._replays.schedule import plan_replay
 from smartcam.recording._state import RecordedState
 from tests.fleet.fleetkit import NumberedCamera
 from tests.recording.folderkit import (
@@ -52,7 +52,7 @@ pytestmark = pytest.mark.real_time
 def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the thread take what came a hundred times a second."""
     monkeypatch.setattr(folder_writer, "INTERVAL", 0.01)
-    monkeypatch.setattr(folder_writer, "RETRIES", (0.02,))
+    monkeypatch.setattr(folder_writer, "RETRY_DELAYS", (0.02,))
     monkeypatch.setattr(folder_writer, "ROOM", 0)
 
 
@@ -342,7 +342,7 @@ async def test_folder_that_cannot_be_made_is_tried_again(tmp_path: Path) -> None
 async def test_slow_disk_costs_records_and_neither_memory_nor_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_writer, "MAX_WAITING", 20_000)
+    monkeypatch.setattr(folder_writer, "MAX_WAITING_BYTES", 20_000)
     disk = Disk(monkeypatch)
     async with NumberedCamera() as box:
         async with recording(tmp_path, box.url) as (recorder, agent):

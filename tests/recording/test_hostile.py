@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import struct
 import subprocess
 import sys
@@ -15,16 +16,28 @@ from typing import Any
 import lz4.frame  # type: ignore[import-untyped]
 import pytest
 import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import Connected, Disconnected, Status, StatusChanged
 from smartcam.recording import Recorder, ReplayedCamera, load_recording, write_pcap
-from smartcam.recording import _form as forms
 from smartcam.recording import _reader as reader
-from smartcam.recording import _records as bounds
-from smartcam.recording import _schedule as plans
-from smartcam.recording._form import FORMAT, KINDS, MAX_VALUES, message_fields, message_of
-from tests.recording.recordingkit import container, frame, session, status, write
+from smartcam.recording._mcap import form as forms
+from smartcam.recording._mcap import records as bounds
+from smartcam.recording._mcap.form import (
+    FORMAT,
+    KINDS,
+    MAX_VALUES,
+    PICTURE_SCHEMAS,
+    RecordedPicture,
+    message_fields,
+    message_of,
+)
+from smartcam.recording._pictures import messages as pictures
+from smartcam.recording._replays import schedule as plans
+from tests.recording.picturekit import VARIED, all_formats, same, shot
+from tests.recording.recordingkit import at, container, frame, session, status, write
 
 RESULT = {
     "camera": "left",
@@ -347,3 +360,42 @@ def test_recorder_file_of_another_process_is_refused_until_that_is_killed(tmp_pa
     with Recorder(path, overwrite=True) as recorder:
         recorder.on_frame(frame(0, "> Connect"))
     assert load_recording(path).counts.frames == 1
+
+
+# ---------------------------------------------------------------------- pictures
+
+
+@pytest.mark.parametrize("form", all_formats())
+def test_message_of_each_format_is_the_picture_again(form: str) -> None:
+    for number, other in enumerate(VARIED):
+        picture = RecordedPicture("left", at(number / 10), shot(number, form, **other), 4, 7, at(3))
+        data = pictures.picture_message(picture)
+        found = pictures.picture_of(pictures.schema_of(picture), memoryview(data))
+        assert same(picture.frame, found.frame)
+        assert found._replace(frame=picture.frame) == picture
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.binary(max_size=200), schema=st.sampled_from(PICTURE_SCHEMAS))
+def test_bytes_of_no_picture_are_refused(data: bytes, schema: str) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - whatever it is
+        pictures.picture_of(schema, memoryview(data))
+
+
+@settings(max_examples=300, deadline=None)
+@given(place=st.integers(0, 200), byte=st.integers(0, 255), cut=st.booleans())
+def test_damaged_picture_is_a_picture_of_its_size_or_refused(
+    place: int, byte: int, cut: bool
+) -> None:
+    picture = RecordedPicture("left", at(0), shot(1))
+    data = bytearray(pictures.picture_message(picture))
+    data[place] = byte
+    if cut:
+        del data[-place - 1 :]
+    try:
+        found = pictures.picture_of(pictures.RAW, memoryview(bytes(data))).frame
+    except ValueError:
+        return
+    found.format.check(found.data, found.width, found.height, found.stride)
+    assert math.isfinite(found.utc)
+    assert math.isfinite(found.captured)

@@ -16,6 +16,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from smartcam._json import MIN_HEX_CHARACTERS as LONG
+from smartcam._json import object_text, plain, text_of
 from smartcam.interpreters import Context, resolve
 from smartcam.layout import Layout
 from smartcam.models import (
@@ -29,12 +31,11 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._form import KINDS, message_fields, message_of, nanoseconds
-from smartcam.recording._json import LONG
+from smartcam.recording._mcap.form import KINDS, message_fields, message_of, nanoseconds
 from tests.recording.recordingkit import at
 
 if TYPE_CHECKING:
-    from smartcam.recording._form import Item
+    from smartcam.recording._mcap.form import Item
 
 Pair = namedtuple("Pair", "left right")  # noqa: PYI024 - as somebody's plug-in has it
 
@@ -84,6 +85,14 @@ LOCALIZATIONS = st.builds(
     ),
 )
 PART: Any = Localization("a", 1.0, 0, Pose(Header(1, at(1), "x"), Position(1, 2, 3), Quaternion()))
+
+
+@given(st.dictionaries(st.text(), VALUES | st.lists(LOCALIZATIONS) | LOCALIZATIONS))
+@example({"value": [PART], "at": at(1), "raw": b"\x00\xff", "nan": [math.nan], "-": -0.0})
+def test_text_is_that_of_the_standard_library(fields: dict[str, Any]) -> None:
+    text = json.dumps(jsonable(fields), separators=(",", ":"))
+    assert object_text(fields) == text_of(fields) == text
+    assert object_text(plain(fields)) == text
 
 
 @given(VALUES | st.lists(LOCALIZATIONS) | st.lists(VALUES | LOCALIZATIONS))

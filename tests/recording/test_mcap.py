@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from smartcam.recording._mcap import McapWriter
+from smartcam.recording._mcap.writer import McapWriter
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

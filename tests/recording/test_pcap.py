@@ -5,21 +5,26 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from smartcam.emulator import EmulatedCamera
-from smartcam.exceptions import ConfigurationError, MissingExtraError, RecordingError
+from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import Connected, Disconnected
 from smartcam.observers import TraceEntry
 from smartcam.recording import Recording, write_pcap
 from tests.recording.recordingkit import (
     COUNTER,
+    PACKET_URLS,
     URL,
     at,
     container,
     frame,
+    packet_items,
     record,
     session,
     status,
@@ -176,11 +181,50 @@ def test_pcap_full_disk_is_told(tmp_path: Path) -> None:
         write_pcap(recording, "/dev/full", overwrite=True)
 
 
-def test_pcap_without_the_library_names_the_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", PACKET_URLS)
+def test_pcap_is_to_the_byte_what_dpkt_made(tmp_path: Path, name: str) -> None:
+    """The golden files were written with dpkt 1.9.8, before its place was taken."""
+    recording = write(tmp_path / "run.mcap", packet_items(PACKET_URLS[name]))
+    write_pcap(recording, tmp_path / "run.pcap")
+    golden = Path(__file__).parent / "golden" / f"{name}.pcap"
+    assert (tmp_path / "run.pcap").read_bytes() == golden.read_bytes()
+
+
+@needs_tshark
+@pytest.mark.parametrize("name", PACKET_URLS)
+def test_pcap_of_frames_of_all_sizes_has_nothing_wrong_for_tshark(
+    tmp_path: Path, name: str
 ) -> None:
-    recording = write(tmp_path / "run.mcap", [status(0)])
-    monkeypatch.setitem(sys.modules, "dpkt", None)
-    text = r'recordings need dpkt: pip install "smartcam\[record\]"'
-    with pytest.raises(MissingExtraError, match=text):
-        write_pcap(recording, tmp_path / "run.pcap")
+    recording = write(tmp_path / "run.mcap", packet_items(PACKET_URLS[name]))
+    assert write_pcap(recording, tmp_path / "run.pcap") == len(packets(tmp_path / "run.pcap"))
+
+
+@needs_tshark
+@settings(max_examples=5)
+@given(st.lists(st.binary(min_size=1, max_size=70) | st.just(b"\xff\xff" * 8), min_size=20))
+@pytest.mark.parametrize("scheme", ["bvs", "bvs+udp"])
+def test_pcap_checksums_are_those_that_tshark_works_out(scheme: str, data: list[bytes]) -> None:
+    with TemporaryDirectory() as folder:
+        frames = [container(1, b"")._replace(hex=one.hex()) for one in data]
+        url = f"{scheme}://192.168.0.10:36701?dialect=handbook"
+        recording = write(Path(folder, "run.mcap"), [*session(url), *frames])
+        count = write_pcap(recording, Path(folder, "run.pcap"))
+        assert count == len(packets(Path(folder, "run.pcap")))
+
+
+def test_pcap_checksum_of_0_is_written_as_all_ones(tmp_path: Path) -> None:
+    """RFC 768: 0 says that a datagram has none."""
+
+    def checksum(payload: bytes) -> bytes:
+        frame_ = container(1, b"")._replace(hex=payload.hex())
+        recording = write(
+            tmp_path / f"{payload.hex()}.mcap",
+            [Connected(camera="left", at=at(0), url=PACKET_URLS["udp4"]), frame_],
+        )
+        write_pcap(recording, tmp_path / f"{payload.hex()}.pcap")
+        begin = 24 + 16 + 14 + 20 + 6  # file, record, Ethernet, IP, the header's first fields
+        return (tmp_path / f"{payload.hex()}.pcap").read_bytes()[begin : begin + 2]
+
+    needed = checksum(b"\0\0")
+    assert needed not in {b"\0\0", b"\xff\xff"}
+    assert checksum(needed) == b"\xff\xff"

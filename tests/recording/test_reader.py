@@ -12,7 +12,7 @@ from mcap.writer import Writer
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
 from smartcam.recording import load_recording
-from smartcam.recording._form import FORMAT, FORMATS
+from smartcam.recording._mcap.form import FORMAT, FORMATS
 from tests.recording.recordingkit import COUNTER, at, frame, record, session, write
 
 
@@ -175,4 +175,4 @@ def test_load_recording_other_topics_are_left_alone(tmp_path: Path) -> None:
         writer.add_message(writer.register_channel("/mine", "json", schema), 0, b"{}", 0)
         writer.finish()
     recording = load_recording(path)
-    assert (recording.counts, recording.remark) == ((0, 0, 0, 0), "")
+    assert (recording.counts, recording.remark) == ((0, 0, 0, 0, 0, 0), "")

@@ -16,8 +16,7 @@ from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
 
 import smartcam
-from smartcam.emulator import EmulatedCamera
-from smartcam.emulator._insight.camera import EmulatedInSight
+from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.emulator._insight.job import BUILTIN_JOBS
 from smartcam.exceptions import (
     ConfigurationError,
@@ -28,7 +27,7 @@ from smartcam.exceptions import (
 from smartcam.models import Connected, Disconnected, Result, StatusChanged
 from smartcam.recording import Recorder, load_recording
 from smartcam.recording import _recorder as recorder
-from smartcam.recording._form import KINDS
+from smartcam.recording._mcap.form import KINDS
 from tests.recording.recordingkit import COUNTER, at, frame, record, write
 
 
@@ -157,7 +156,7 @@ async def test_recorder_counts_what_it_took(tmp_path: Path) -> None:
         made.on_frame(frame(0, "> Connect"))
         made.on_state(Connected(camera="left", at=at(0), url="bvs://h"))
         made.on_error("left", TriggerTimeoutError("none came"), at(1))
-        assert made.counts == (1, 0, 1, 1)
+        assert made.counts == (1, 0, 1, 1, 0, 0)
         assert made.error is None
 
 
@@ -202,7 +201,7 @@ def test_recorder_file_that_is_there_is_refused(tmp_path: Path) -> None:
     assert path.read_text() == "precious"
     with Recorder(path, overwrite=True):
         pass
-    assert load_recording(path).counts == (0, 0, 0, 0)
+    assert load_recording(path).counts == (0, 0, 0, 0, 0, 0)
 
 
 def test_recorder_place_that_is_not_there_is_refused(tmp_path: Path) -> None:
@@ -269,7 +268,7 @@ async def test_recorder_wait_failed_can_be_cancelled(tmp_path: Path) -> None:
 def test_recorder_disk_too_slow_ends_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder, "MAX_WAITING", 2 * recorder.OVERHEAD)
+    monkeypatch.setattr(recorder, "MAX_WAITING_BYTES", 2 * recorder.OVERHEAD)
     monkeypatch.setattr(recorder, "INTERVAL", 60.0)
     made = Recorder(tmp_path / "run.mcap").open()
     for _ in range(5):

@@ -386,7 +386,7 @@ async def test_replay_stopped_in_the_middle_leaves_nothing(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("speed", [0, -1, 1001, float("nan")])
 def test_replay_speed_out_of_range_is_refused(tmp_path: Path, speed: float) -> None:
-    with pytest.raises(ConfigurationError, match=r"a speed from 0\.001 to 1000 was expected, got"):
+    with pytest.raises(ConfigurationError, match=r"speed: expected a number, 0\.001 to 1000, got"):
         ReplayedCamera(triggered(tmp_path), speed=speed)
 
 

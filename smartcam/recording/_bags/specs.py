@@ -1,27 +1,25 @@
-"""How results were read, by what a recorder was told: whether they are poses in metres."""
+"""Tell from a recorder's notes how results were read: whether they are poses in metres."""
 
 from __future__ import annotations
 
 import ast
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client.interpretation import without_poses
+from smartcam._client._inside import in_pixels, localizations_of, without_poses
 from smartcam.exceptions import SmartCamError
-from smartcam.interpreters._base import resolve
-from smartcam.ros2._camera_reading import in_pixels
-from smartcam.ros2._messages import localizations_of
+from smartcam.interpreters import resolve
 
 if TYPE_CHECKING:
-    from smartcam.interpreters._base import Interpreter
+    from smartcam.interpreters import Interpreter
     from smartcam.models import Localization, Result
 
 
 class Specs:
-    """What ``interpret_as`` says, for all applications or for each.
+    """The interpreters that ``interpret_as`` names, for all applications or for each.
 
     Args:
-        said: as a client takes it, or its text; "" where it was not told.
-        pixels: places are pixels, whatever it says.
+        said: value of ``interpret_as``, or its text; "" where it was not told.
+        pixels: whether places are in pixels, whatever ``said`` is.
     """
 
     def __init__(self, said: Any = "", *, pixels: bool = False) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client.interpretation import Interpretation
+from smartcam._arguments import check_flag, check_path
+from smartcam._client._inside import Interpretation
 from smartcam.exceptions import (
     ConfigurationError,
     InterpretationError,
@@ -16,18 +16,20 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.observers import TraceEntry
-from smartcam.protocols._bvs import BVS
+from smartcam.protocols import BVS
 from smartcam.protocols.messages import ResultContainer
-from smartcam.recording._bag import remove_folder
-from smartcam.recording._bag_items import BagCounts, BagItems, ReadResult, parts_from_json
-from smartcam.recording._bag_recorder import DISTRIBUTION, open_bag
-from smartcam.ros2._types import RosTypes
+from smartcam.recording._bags.items import BagCounts, BagItems, ReadResult, parts_from_json
+from smartcam.recording._bags.recorder import DISTRIBUTION, open_bag
+from smartcam.recording._bags.writer import remove_folder
+from smartcam.recording._reader import check_recording
+from smartcam.ros2 import RosTypes
 
 if TYPE_CHECKING:
     from collections.abc import Generator
+    from pathlib import Path
 
     from smartcam.models import Result
-    from smartcam.recording._form import Item
+    from smartcam.recording._mcap.form import Item
     from smartcam.recording._reader import RecordedCamera, Recording
 
 
@@ -47,9 +49,9 @@ def write_bag(
     each result's bytes are read again; those that do not fit go in with why, and are counted.
 
     Args:
-        recording: where from.
+        recording: recording to read.
         path: the bag's folder.
-        camera: whose; default all cameras'.
+        camera: name of the camera to write; default all cameras.
         interpret_as: how to read results, as :func:`smartcam.connect` takes it; default what was
             recorded of it, or localizations where there is a calibration.
         y_down: the camera's y axis points down; default as recorded.
@@ -68,7 +70,13 @@ def write_bag(
         MissingExtraError: a library is not installed.
     """
     conversion = BagConversion(
-        recording, Path(path), camera, interpret_as, y_down, calibration, overwrite
+        check_recording(recording, "bag"),
+        check_path(path, "path", "bag"),
+        camera,
+        interpret_as,
+        None if y_down is None else check_flag(y_down, "y_down", "bag"),
+        calibration,
+        check_flag(overwrite, "overwrite", "bag"),
     )
     for _ in conversion.steps():
         pass
@@ -102,7 +110,7 @@ class BagConversion:
 
     @property
     def counts(self) -> BagCounts:
-        """What is in the bag."""
+        """Counts of what is in the bag."""
         return self._items.counts
 
     def steps(self) -> Generator[None, None, None]:
@@ -133,7 +141,7 @@ class BagConversion:
             raise
 
     def _spec(self, camera: RecordedCamera) -> Any:
-        """Return how a camera's results are read again."""
+        """Return the interpreter, as given or recorded, that reads a camera's results again."""
         if self.interpret_as is not None:
             return self.interpret_as
         return camera.interpret_as or "localizations"
@@ -152,6 +160,7 @@ class BagConversion:
             lenient=camera.facts.get("lenient") == "True",
             y_down=y_down,
             calibration=self.calibration,
+            own=self.interpret_as is not None,
         )
         endian = camera.facts.get("endian", "0")
         if endian not in {"0", "1"}:

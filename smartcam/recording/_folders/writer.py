@@ -17,15 +17,16 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from smartcam._forks import tell_of_forks
 from smartcam.exceptions import ConfigurationError, RecordingError
 from smartcam.models import CameraEvent
-from smartcam.recording._folder_files import FolderFiles, Limits
-from smartcam.recording._folder_track import CameraTrack, Gap
+from smartcam.recording._folders.files import FolderFiles, Limits
+from smartcam.recording._folders.track import CameraTrack, Gap
 from smartcam.recording._recorder import (
     CHUNK,
     CLOSE_TIMEOUT,
     INTERVAL,
-    MAX_WAITING,
+    MAX_WAITING_BYTES,
     OVERHEAD,
     Description,
 )
@@ -34,24 +35,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from smartcam.recording._folder import RecordingFolder
-    from smartcam.recording._folder_track import RecordingAccount
-    from smartcam.recording._form import Item
+    from smartcam.recording._folders.track import RecordingAccount
+    from smartcam.recording._mcap.form import Item
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
 ROOM = 4 * CHUNK
 """Bytes that must be free on a disk that was full before it is tried again."""
 
-RETRIES = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
+RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
 """Seconds until a disk that did not take something is tried again; the last for ever."""
 
 EVENT_ROOM = 2
-"""How much more may wait before events are left out, too: they say what the camera is."""
+"""Factor by which more may wait before events are left out, too: they tell the camera's state."""
 
 
 @dataclass(eq=False)
 class _Trouble:
-    """Why nothing is written at the time."""
+    """The reason for which nothing is written at the time."""
 
     error: RecordingError
     reason: str  # without the folder
@@ -62,7 +63,7 @@ class _Trouble:
 
 @dataclass(eq=False)
 class _DiskQueue:
-    """What waits for the thread."""
+    """The records that wait for the thread."""
 
     items: list[tuple[CameraTrack, Any]] = field(default_factory=list[tuple[CameraTrack, Any]])
     bytes: int = 0
@@ -72,11 +73,11 @@ class FolderWriter:
     """Writes what is put in.
 
     Args:
-        folder: that the files are in.
-        limits: of files.
-        compress: packs a chunk.
+        folder: folder that holds the files.
+        limits: bounds on the files.
+        compress: function that packs a chunk.
         tell: called in the thread with why nothing is written, and with None when it is again.
-        clock: seconds, for the files' age and delays.
+        clock: function that returns seconds, for the files' age and delays.
 
     Attributes:
         trouble: why nothing is written at the time; None where all is well.
@@ -98,6 +99,12 @@ class FolderWriter:
         self._tracks: dict[str, CameraTrack] = {}
         self._trouble: _Trouble | None = None
         self._thread: threading.Thread | None = None
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        """Write nothing in a fork of the process that has the folder; what comes is left out."""
+        self._more, self._waiting = threading.Condition(), _DiskQueue()
+        self._thread, self._closing = None, True
 
     # ------------------------------------------------------------------ from any thread
 
@@ -108,7 +115,7 @@ class FolderWriter:
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
-        """What became of each camera's records."""
+        """Accounts of each camera's records."""
         with self._more:
             return {name: track.account for name, track in self._tracks.items()}
 
@@ -123,27 +130,35 @@ class FolderWriter:
         with self._more:
             self._waiting.items.append((track, Description({"camera": track.camera, **facts})))
 
-    def put(self, track: CameraTrack, given: Any, size: int, *, event: bool = False) -> None:
-        """Have something written; where too much waits it is left out and counted. Never waits.
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return self._waiting.bytes
+
+    def put(self, track: CameraTrack, given: Any, size: int, *, event: bool = False) -> bool:
+        """Have something written, or leave it out and count it where too much waits. Never waits.
+
+        Returns whether it is kept.
 
         Args:
-            track: whose it is.
-            given: what ``read`` of the track makes items of.
-            size: its bytes.
-            event: it says what the camera is.
+            track: track of the camera that ``given`` is about.
+            given: object that ``read`` of the track makes items of.
+            size: bytes that ``given`` counts for while waiting; below 0: it is too large.
+            event: whether ``given`` is an event; events have more room to wait.
         """
         with self._more:
             waiting = self._waiting
             track.offered += 1
-            room = MAX_WAITING * EVENT_ROOM if event else MAX_WAITING
-            if self._closing or waiting.bytes > room:
+            room = MAX_WAITING_BYTES * EVENT_ROOM if event else MAX_WAITING_BYTES
+            if self._closing or waiting.bytes > room or size < 0:
                 self._leave_out(track, given)
-                return
+                return False
             before = waiting.bytes
             waiting.items.append((track, given))
             waiting.bytes += size + OVERHEAD
             if not before or before < CHUNK <= waiting.bytes:
                 self._more.notify()
+            return True
 
     def _leave_out(self, track: CameraTrack, given: Any) -> None:
         at = datetime.now(UTC)
@@ -237,7 +252,7 @@ class FolderWriter:
                 track.lose(given, trouble.reason)
 
     def _ready(self, found: dict[CameraTrack, list[Any]]) -> bool:
-        """Return whether the disk is to be tried; where it had failed, look whether there is room.
+        """Return True if the disk is to be tried; after a failure, check the room on it first.
 
         Raises:
             ConfigurationError: another recorder has the folder now.
@@ -267,14 +282,14 @@ class FolderWriter:
         told = RecordingError(prefix + reason.removeprefix(prefix))
         told.__cause__ = error
         full = isinstance(error, OSError) and error.errno in {errno.ENOSPC, errno.EDQUOT}
-        again = self._clock() + RETRIES[min(tries, len(RETRIES) - 1)]
+        again = self._clock() + RETRY_DELAYS[min(tries, len(RETRY_DELAYS) - 1)]
         self._trouble = _Trouble(told, reason, full, again, tries)
         if before is None:
             logger.warning("%s; nothing is recorded until it is better", told)
             self._tell(told)
 
     def _heal(self) -> None:
-        """The disk took something."""
+        """Note that the disk took something."""
         if self._trouble is not None:
             self._trouble = None
             logger.warning("recordings %s: recorded again", self._folder.path)

@@ -9,25 +9,26 @@ import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam._client.interpretation import Interpretation
+from smartcam._arguments import check_callable, check_kind
+from smartcam._client._inside import Interpretation
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Result, StatusChanged
 from smartcam.observers import Observer, TraceEntry
 from smartcam.protocols.messages import ResultContainer
 from smartcam.recording._folder import RecordingFolder
-from smartcam.recording._folder_files import Limits
-from smartcam.recording._folder_writer import FolderWriter
-from smartcam.recording._form import RecordedError, load_compress
+from smartcam.recording._folders.files import Limits
+from smartcam.recording._folders.writer import FolderWriter
+from smartcam.recording._mcap.form import RecordedError, load_compress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from smartcam.fleet import FleetServer
-    from smartcam.fleet._recording_file import RecordSection
-    from smartcam.recording._folder_track import CameraTrack, RecordingAccount
-    from smartcam.recording._form import Item
+    from smartcam.fleet._inside import RecordSection
+    from smartcam.recording._folders.track import CameraTrack, RecordingAccount
+    from smartcam.recording._mcap.form import Item
 
 
 class _SeenResult(NamedTuple):
@@ -51,7 +52,7 @@ class FleetRecorder(Server):
     :attr:`accounts` and the files tell; it is tried again until it is better.
 
     Args:
-        server: whose cameras; not started yet.
+        server: server whose cameras are recorded; not started yet.
         section: what is recorded, and where; default: what the server's file says.
         on_trouble: called in the event loop with why nothing is written any more, and with None
             when it is again.
@@ -71,7 +72,16 @@ class FleetRecorder(Server):
         on_trouble: Callable[[RecordingError | None], None] = lambda _: None,
         _clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        section = section or server.file.record
+        # an agent's module, with its libraries, is there where somebody made an agent
+        from smartcam.fleet import FleetServer
+        from smartcam.fleet._inside import RecordSection
+
+        check_kind(server, FleetServer, "server", "a FleetServer", "recorder")
+        check_callable(on_trouble, "on_trouble", "recorder")
+        if section is None:
+            section = server.file.record
+        else:
+            check_kind(section, RecordSection, "section", "a RecordSection, or None", "recorder")
         if section is None:
             raise ConfigurationError(f"fleet {server.file.fleet}: record: is not in its file")
         self.section: RecordSection = section
@@ -131,12 +141,12 @@ class FleetRecorder(Server):
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
-        """What became of the records of each camera that had any."""
+        """Accounts of the records of each camera that had any."""
         return {} if self._writer is None else self._writer.accounts
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Why nothing is written at the time; None where all is well."""
+        """Error for which nothing is written at the time; None where all is well."""
         return None if self._writer is None else self._writer.trouble
 
     def _tell(self, trouble: RecordingError | None) -> None:
@@ -232,10 +242,10 @@ class _SeenReading:
     """Makes records of what came, in the writer's thread: a result's value is what it holds.
 
     Args:
-        camera: its name.
-        spec: how its results are read; None: they are not.
-        y_down: as its settings say.
-        lenient: as its settings say.
+        camera: name of the camera.
+        spec: interpreter of the results; None: results are not read.
+        y_down: as the camera's settings say.
+        lenient: as the camera's settings say.
     """
 
     def __init__(self, camera: str, spec: Any, y_down: bool, lenient: bool) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import IO, TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from smartcam.exceptions import RecordingError
-from smartcam.recording._form import MAX_MESSAGE, load_extra
+from smartcam.recording._mcap.form import MAX_MESSAGE, load_extra
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -104,12 +104,12 @@ class RecordReader:
         self._crc = 0
 
     def records(self) -> Iterator[Record]:
-        """Yield what matters, in the order in which it stands there.
+        """Yield the records that a recording is read from, in the order of the file.
 
         Raises:
-            CutOffError: the file ends before it is over.
-            RecordingError: it goes beyond a bound.
-            ValueError: it is damaged here.
+            CutOffError: the file ends before its last record.
+            RecordingError: the file goes beyond a bound.
+            ValueError: the file is damaged here.
         """
         self._check_magic()
         while True:

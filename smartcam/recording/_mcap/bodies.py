@@ -16,7 +16,7 @@ Value = TypeVar("Value")
 
 
 class LastBodies(Generic[Key, Value]):
-    """What was said of the last frames with data of a file.
+    """The values that a file said of its last frames with data.
 
     Whoever writes asks for the number of a frame by its data, who reads for the data by the number.
     Both forget alike, so what one finds is there for the other.
@@ -41,5 +41,5 @@ class LastBodies(Generic[Key, Value]):
                 del self._known[key]
 
     def get(self, key: Key) -> Value | None:
-        """Return what was said; None where it is not kept."""
+        """Return the value added for a key; None where it is not kept."""
         return self._known.get(key)

@@ -1,4 +1,4 @@
-"""What a replay does, worked out from a recording's frames, or results where it has none; pure.
+"""Plan a replay from a recording's frames, or from results where it has none; pure.
 
 A container belongs to the oldest trigger without one. Others came unasked: by the digital input,
 where the application waits for triggers, or from a free run.
@@ -22,10 +22,10 @@ from smartcam.models import (
     StatusChanged,
 )
 from smartcam.observers import TraceEntry
+from smartcam.protocols import BVS, Transport, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport, Verdict
-from smartcam.protocols._bvs import BVS, HANDBOOK
-from smartcam.recording._form import GAP, RecordedError, status_of
+from smartcam.protocols._inside import HANDBOOK
+from smartcam.recording._mcap.form import GAP, RecordedError, status_of
 from smartcam.recording._state import RecordedState
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import is_fleet, parse_address
@@ -33,15 +33,14 @@ from smartcam.settings import is_fleet, parse_address
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
 
-    from smartcam.protocols._base import Protocol
-    from smartcam.protocols._framed.dialect import FramedDialect
-    from smartcam.recording._form import Item
+    from smartcam.protocols import FramedDialect, Protocol
+    from smartcam.recording._mcap.form import Item
     from smartcam.recording._reader import RecordedCamera, Recording
 
 CONDITIONS = (Status.OVERHEAT, Status.SYSTEM_ERROR)
-"""What an operator of the emulated camera can set; the other bits follow from what it does."""
+"""Bits that an operator of the emulated camera can set; the others follow from its work."""
 
-TOGETHER = 0.1
+MAX_TIME_BEHIND_FIRST = 0.1
 """Seconds behind its first container in which an inspection's others come, where the camera says
 all the time that it waits for a trigger."""
 
@@ -63,7 +62,7 @@ class Take:
 
 @dataclass(slots=True)
 class TakeList:
-    """What an application gave, in order."""
+    """The results of an application, in order."""
 
     application: int
     triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
@@ -199,7 +198,7 @@ class _What(enum.Enum):
 
 
 class _ReplayStep(NamedTuple):
-    """What a frame, or the end of a link, means for a replay."""
+    """The meaning of a frame, or of the end of a link, for a replay."""
 
     at: float  # when, seconds since 1970
     what: _What
@@ -477,7 +476,7 @@ class _ScheduleMaker:
         self._takers[step.what](step)
 
     def finish(self) -> None:
-        """Nothing more comes: what a trigger under way would have given is not known."""
+        """End the plan: what a trigger under way would have given is not known."""
         self._triggers.clear()
 
     # ------------------------------------------------------------------ steps
@@ -524,7 +523,7 @@ class _ScheduleMaker:
                 self.changes.append(Change(self.now - self.began, condition, on))
 
     def _drop(self, bits: Status) -> None:
-        """The camera dropped the last trigger."""
+        """Note that the camera dropped the last trigger."""
         self._triggers.pop()
         if self._triggers:
             return  # one of ours is under way: the emulated camera drops it by itself
@@ -576,12 +575,12 @@ class _ScheduleMaker:
 
     @property
     def _waits(self) -> bool:
-        """Whether the last status says that the camera waits for a trigger."""
+        """True if the last status says that the camera waits for a trigger."""
         return self._status is not None and Status.WAITING_FOR_TRIGGER in self._status
 
     def _is_over(self) -> bool:
-        """Whether the open inspection sends no more: no status tells, where it waits throughout."""
-        return self._waits and self.now - self._opened > TOGETHER
+        """Return True if the camera waits, and has been silent too long to send more results."""
+        return self._waits and self.now - self._opened > MAX_TIME_BEHIND_FIRST
 
     # ------------------------------------------------------------------ inside
 
@@ -591,7 +590,7 @@ class _ScheduleMaker:
         return gap
 
     def _give_up(self) -> None:
-        """The inspection under way sends nothing: its trigger has no result."""
+        """Give up the inspection under way: its trigger has no result."""
         if self._active is not None and self._list(self._active).waits:
             for began in self._triggers:
                 ended = self._waits_from if self._waits_from > began else self.now

@@ -6,21 +6,21 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import RosMessageError
-from smartcam.recording._bag import BagWriter, load_yaml, make_folder, remove_folder
-from smartcam.recording._bag_items import BagCounts, BagItems
-from smartcam.recording._form import load_extra
+from smartcam.recording._bags.items import BagCounts, BagItems
+from smartcam.recording._bags.writer import BagWriter, make_folder, remove_folder
+from smartcam.recording._mcap.form import load_compress, load_extra
 from smartcam.recording._recorder import Description, Recorder
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2 import RosTypes
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.observers import TraceEntry
-    from smartcam.recording._form import Item
+    from smartcam.recording._mcap.form import Item
 
 
 DISTRIBUTION = "jazzy"
-"""Whose message definitions a bag has; those that it uses are the same in the ones after it."""
+"""ROS distribution whose message definitions a bag has; those used are the same in later ones."""
 
 
 def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
@@ -31,8 +31,8 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
         MissingExtraError: a library is not installed.
     """
     types = RosTypes(DISTRIBUTION)
-    load_extra("mcap.writer")
-    load_yaml()
+    load_compress()
+    load_extra("yaml")
     return BagWriter(folder, make_folder(folder, overwrite=overwrite), types)
 
 
@@ -63,7 +63,7 @@ class BagRecorder(Recorder):
 
     @property
     def bag_counts(self) -> BagCounts:
-        """What was written so far."""
+        """Counts of what was written so far."""
         return self._file.items.counts if isinstance(self._file, _BagFile) else BagCounts()
 
     def remove(self) -> None:

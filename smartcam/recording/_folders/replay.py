@@ -7,17 +7,19 @@ import contextlib
 import functools
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import check_all, check_callable, check_flag, check_text
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.recording._replay import replay
+from smartcam.recording._reader import check_recording
+from smartcam.recording._replays.replay import check_speed, replay
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from smartcam.fleet import FleetServer
     from smartcam.recording._reader import RecordedCamera, Recording
-    from smartcam.recording._replay import ReplayedCamera
-    from smartcam.recording._replay_lines import ReplayedLines
+    from smartcam.recording._replays.lines import ReplayedLines
+    from smartcam.recording._replays.replay import ReplayedCamera
 
 
 class FleetReplay(Server):
@@ -32,16 +34,16 @@ class FleetReplay(Server):
     programs trigger gets what was recorded for a trigger, what came by itself comes again.
 
     Args:
-        recording: what to play; usually a folder of a :class:`FleetRecorder`.
-        cameras: their names; default: all of them.
-        speed: how many times faster than recorded, 0.001 to 1000.
+        recording: recording to play; usually a folder of a :class:`FleetRecorder`.
+        cameras: names of the cameras to play; default: all.
+        speed: factor by which to play faster than recorded, 0.001 to 1000.
         loop: begin again where something is over.
         listen: endpoint of the agent; port 0 takes a free one.
         on_over: called once for each camera, with its name, when nothing of it is left.
 
     Attributes:
-        skipped: why a camera is not played, by its name: there was no session with it, or none of
-            its make can be emulated.
+        skipped: reasons why cameras are not played, by name: there was no session, or no camera of
+            the make can be emulated.
 
     Raises:
         ConfigurationError: something given is wrong, or none of the cameras can be played.
@@ -58,12 +60,17 @@ class FleetReplay(Server):
         listen: str = "tcp/127.0.0.1:0",
         on_over: Callable[[str], None] = lambda _: None,
     ) -> None:
-        self._recording, self._listen = recording, listen
+        check_recording(recording, "replay")
+        if cameras is not None:
+            given = check_all(cameras, "cameras", "names of cameras", "replay")
+            cameras = [check_text(one, "cameras", "replay") for one in given]
+        speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
+        self._recording, self._listen = recording, check_text(listen, "listen", "replay", least=1)
         self._server: FleetServer | None = None
         self._stack = contextlib.AsyncExitStack()
         self.skipped: dict[str, str] = {}
         self._played: dict[str, ReplayedCamera | ReplayedLines] = {}
-        self._on_over = on_over
+        self._on_over = check_callable(on_over, "on_over", "replay")
         for name in recording.cameras if cameras is None else cameras:
             try:
                 self._played[name] = replay(
@@ -135,7 +142,7 @@ class FleetReplay(Server):
 
 
 def _said(camera: RecordedCamera) -> dict[str, Any]:
-    """Return what an agent is to know of a camera, besides where it is."""
+    """Return the settings that an agent needs of a camera, besides the address."""
     found: dict[str, Any] = {}
     spec = camera.interpret_as
     if spec is not None:

@@ -1,4 +1,4 @@
-"""What is recorded of one camera beside an agent: its account, its file, what is missing in it."""
+"""Record one camera beside an agent: its account, its file, and the gaps in it."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.models import CameraEvent, Connected, Reconnected
-from smartcam.recording._form import GAP, RecordedError
+from smartcam.recording._mcap.form import GAP, RecordedError
 from smartcam.recording._recorder import Description, address_facts
 from smartcam.recording._state import RecordedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.recording._form import Item
+    from smartcam.recording._mcap.form import Item
     from smartcam.recording._recorder import RecordingFile
 
 
 class RecordingAccount(NamedTuple):
-    """What became of a camera's records: frames, results, events and errors, all counted alike.
+    """The account of a camera's records: frames, results, events and errors, all counted alike.
 
     Attributes:
-        written: on the disk.
-        waiting: for the disk.
-        lost: not written: the disk was full, gone or too slow, or it could not be read back.
+        written: records on the disk.
+        waiting: records that wait for the disk.
+        lost: records not written: the disk was full, gone or too slow, or it could not be read.
     """
 
     written: int = 0
@@ -37,11 +37,11 @@ class Gap:
     """Records that were not written.
 
     Attributes:
-        since: when the first of them came.
-        until: when the last of them came.
-        count: how many.
-        reason: why.
-        events: the last event of each kind among them, in order.
+        since: time at which the first record came.
+        until: time at which the last record came.
+        count: number of records.
+        reason: cause of the gap, as text.
+        events: last event of each kind among the records, in order.
     """
 
     since: datetime
@@ -51,7 +51,7 @@ class Gap:
     events: dict[type, CameraEvent] = field(default_factory=dict[type, CameraEvent])
 
     def error(self, camera: str) -> RecordedError:
-        """Return what stands in the file."""
+        """Return the record by which a file tells of the gap."""
         text = (
             f"{self.count} records from {self.since.isoformat()} to {self.until.isoformat()} were "
             f"not written: {self.reason}"
@@ -60,18 +60,18 @@ class Gap:
 
 
 class CameraTrack:
-    """What is recorded of one camera.
+    """The recording of one camera.
 
     Args:
-        camera: its name.
-        read: makes items of what was put in, in the thread.
+        camera: name of the camera.
+        read: function that makes items of what was put in; called in the writer's thread.
 
     Attributes:
-        endian: that its last status told.
+        endian: byte order that the last status told.
         offered: records that came.
-        left_out: those of them that found no room to wait.
+        left_out: offered records that found no room to wait.
         written: records on the disk.
-        lost: others that are not, and will not be.
+        lost: records that waited, but are not on the disk and will not be.
         overflow: the gap that grows where too much waits; None where nothing is left out.
     """
 
@@ -92,7 +92,7 @@ class CameraTrack:
 
     @property
     def account(self) -> RecordingAccount:
-        """What became of its records."""
+        """Account of the camera's records."""
         written, lost = self.written, self.lost + self.left_out
         return RecordingAccount(written, self.offered + self.more - written - lost, lost)
 

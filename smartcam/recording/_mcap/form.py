@@ -4,17 +4,20 @@ Each camera has four topics, ``/CAMERA/frames``, ``results``, ``events`` and ``e
 is a JSON object with the field names of the public models; a field that is None is left out, since
 viewers such as Foxglove take a field's type from the schema and know no "or null". The schemas
 keep to the types that Foxglove reads (``type`` is one word everywhere).
+
+Where pictures are recorded there is a fifth topic, ``/CAMERA/pictures``, whose messages are no JSON
+but Foxglove's of Protocol Buffers: see ``_pictures``.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
-from smartcam.exceptions import MissingExtraError
+from smartcam._extras import load
+from smartcam._json import object_text
 from smartcam.models import (
     ApplicationChanged,
     CameraEvent,
@@ -27,17 +30,19 @@ from smartcam.models import (
     jsonable,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._json import frame_text, object_text, result_text, with_data
+from smartcam.recording._mcap.json import frame_text, result_text, with_data
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from smartcam.frames import Frame
 
 FORMAT = "3"
 """Version of the form that is written."""
 
 FORMATS = ("1", "2", FORMAT)
-"""Those that are read; another one is refused. In 1 a frame's body repeats the frame's end, and
-in both 1 and 2 a result the bytes of its frame."""
+"""Versions of the form that are read; another one is refused. In 1 a frame's body repeats the
+frame's end; in 1 and 2 a result repeats the bytes of its frame."""
 
 PROFILE = "x-smartcam"
 """Profile in the file's header."""
@@ -50,11 +55,14 @@ CAMERA_METADATA = "smartcam.camera"
 told; a later one goes before an earlier one."""
 
 GAP = "RecordingGap"
-"""What :class:`RecordedError` has for a class where records were not written."""
+"""Class that a :class:`RecordedError` names where records were not written."""
 
 MAX_MESSAGE = 1 << 26
 """Bytes of a message, written or read. A frame stands in one as bytes and as fields, so this has
 room for an image of 15 MiB; the largest frame of a BVS camera takes 4 MiB."""
+
+MAX_PICTURE_SIZE_BYTES = 1 << 27
+"""Bytes of a picture that is written: half of the largest record that is read."""
 
 MAX_VALUES = 3_000_000
 """Commas and opening brackets of a message, written or read: each may become an object that takes
@@ -74,10 +82,10 @@ class RecordedError(NamedTuple):
 
     Attributes:
         camera: name of the camera.
-        at: when the recorder was told, UTC.
+        at: time at which the recorder was told, UTC.
         error: name of the exception's class.
-        text: what it says.
-        triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+        text: text of the error.
+        triggered_at: time of the call of ``trigger()``, UTC; None where no trigger ended so.
         since: of a gap (``error`` is ``RecordingGap``): when the first record came that was not
             written, UTC; ``at`` is when the last did. None of other errors.
         records: of a gap: how many were not written. None of other errors.
@@ -92,8 +100,29 @@ class RecordedError(NamedTuple):
     records: int | None = None
 
 
-Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError
-"""What a recording holds."""
+class RecordedPicture(NamedTuple):
+    """A picture, as a source of frames gave it.
+
+    Attributes:
+        camera: name of the camera.
+        at: time of the capture, UTC.
+        frame: the :class:`~smartcam.frames.Frame`.
+        left_out: pictures before it that were not written, since too much waited for the disk.
+        result_number: :attr:`~smartcam.Result.number` of the result that was made of the picture;
+            None where the recorder was not told.
+        result_received_at: when that result came, UTC: each client begins its numbers anew.
+    """
+
+    camera: str
+    at: datetime
+    frame: Frame
+    left_out: int = 0
+    result_number: int | None = None
+    result_received_at: datetime | None = None
+
+
+Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError | RecordedPicture
+"""Any item that a recording holds."""
 
 
 class Kind(NamedTuple):
@@ -127,17 +156,11 @@ def load_extra(name: str) -> Any:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        return importlib.import_module(name)
-    except ImportError as exc:
-        raise MissingExtraError(
-            f'recordings need {name.partition(".")[0]}: pip install "smartcam[record]"',
-            extra="record",
-        ) from exc
+    return load(name, "recordings need")
 
 
 def load_compress() -> Callable[[bytes], bytes]:
-    """Return what packs a chunk; raises as :func:`load_extra`."""
+    """Return the function that packs a chunk; raises as :func:`load_extra`."""
     compress: Callable[[bytes], bytes] = load_extra("zstandard").compress
     return compress
 
@@ -167,9 +190,10 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
     """Return an item's message.
 
     Args:
-        kind: which one it is.
-        item: it.
-        raw_from: of a result: the frame whose data is its ``raw``, which then is not written.
+        kind: name of the kind of item, a key of ``KINDS``.
+        item: item to write.
+        raw_from: of a result, the number of the frame that has its ``raw``, which is not written
+            then.
 
     Raises:
         ValueError: nobody could read it back.
@@ -259,7 +283,7 @@ def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
 
 
 def camera_name(fields: Mapping[str, Any]) -> str:
-    """Return whose message it is; raises as :func:`_get`."""
+    """Return the name of a message's camera; raises as :func:`_get`."""
     name = _get(fields, "camera", str)
     if len(name) > MAX_NAME:
         raise ValueError(f"camera: a name of {len(name)} characters, expected {MAX_NAME} at most")
@@ -499,3 +523,9 @@ KINDS: dict[str, Kind] = {
     ),
 }
 """The kinds of messages, by the last part of their topics."""
+
+PICTURES = "pictures"
+"""Last part of the topic of pictures."""
+
+PICTURE_SCHEMAS = ("foxglove.RawImage", "foxglove.CompressedImage", "foxglove.CompressedVideo")
+"""Schemas of pictures, which are read by another distribution of smartcam."""

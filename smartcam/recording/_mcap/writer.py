@@ -47,6 +47,7 @@ class McapWriter:
         self._compress = compress
         self._chunk_size = chunk_size
         self._parts: list[bytes] = []  # of the chunk that is being filled
+        self._packs = True  # the chunk, when it is ended
         self._size = 0  # bytes in them
         self._places: dict[int, list[int]] = {}  # by channel: times and places in it, in turn
         self._first = self._last = 0  # times of its messages
@@ -83,15 +84,19 @@ class McapWriter:
         self._put(record)
         return number
 
-    def add_message(self, channel: int, at: int, data: bytes, sequence: int) -> None:
+    def add_message(
+        self, channel: int, at: int, data: bytes, sequence: int, *, packs: bool = True
+    ) -> None:
         """Write a message.
 
         Args:
-            channel: its number.
-            at: when, nanoseconds since 1970, UTC.
-            data: its bytes.
+            channel: number of the channel.
+            at: time of the message, nanoseconds since 1970, UTC.
+            data: bytes of the message.
             sequence: the channel's own count.
+            packs: whether it is worth packing; a chunk with a message that is not stays as it is.
         """
+        self._packs = self._packs and packs
         places = self._places.get(channel)
         if places is None:
             if not self._places:
@@ -107,7 +112,7 @@ class McapWriter:
         self._parts += (head, data)
         self._size += _MESSAGE_HEAD.size + size
         if self._size > self._chunk_size:
-            self._end_chunk()
+            self.end_chunk()
 
     def add_metadata(self, name: str, facts: Mapping[str, str]) -> None:
         """Write facts under a name; they stand before the chunk that is being filled."""
@@ -118,12 +123,12 @@ class McapWriter:
 
     def flush(self) -> None:
         """End the chunk, if there is a message in it, and hand everything to the system."""
-        self._end_chunk()
+        self.end_chunk()
         self._stream.flush()
 
     def finish(self) -> None:
         """Write the index and what stands last."""
-        self._end_chunk()
+        self.end_chunk()
         self._stream.write(_record(_DATA_END, bytes(4)))
         start = place = self._stream.tell()
         parts: list[bytes] = []
@@ -151,18 +156,18 @@ class McapWriter:
         self._parts.append(record)
         self._size += len(record)
         if self._size > self._chunk_size:
-            self._end_chunk()
+            self.end_chunk()
 
-    def _end_chunk(self) -> None:
+    def end_chunk(self) -> None:
         """Write the chunk; one without messages is not ended."""
         if not self._places:
             return
         data = b"".join(self._parts)
-        packed = self._compress(data)
+        packed, how = (self._compress(data), _ZSTD) if self._packs else (data, "")
         times = self._first, self._last
         chunk = (
             _CHUNK_FIELDS.pack(*times, len(data), zlib.crc32(data)),
-            _text(_ZSTD),
+            _text(how),
             len(packed).to_bytes(8, "little"),
         )
         start, length = self._stream.tell(), sum(map(len, chunk)) + len(packed) + _HEAD.size
@@ -183,7 +188,7 @@ class McapWriter:
                 struct.pack("<QQQQI", *times, start, length, _COUNT.size * len(places)),
                 *places,
                 (place - start - length).to_bytes(8, "little"),
-                _text(_ZSTD),
+                _text(how),
                 struct.pack("<QQ", len(packed), len(data)),
             )
         )
@@ -191,6 +196,7 @@ class McapWriter:
         self._ended = max(self._ended, self._last)
         self._chunks += 1
         self._parts, self._size, self._places = [], 0, {}
+        self._packs = True
 
     def _statistics(self) -> bytes:
         counts = self._counts

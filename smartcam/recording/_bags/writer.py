@@ -10,7 +10,6 @@ names in a list, which ROS 2 Humble does not read.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import re
 import stat
@@ -18,18 +17,19 @@ from dataclasses import dataclass, field
 from typing import IO, TYPE_CHECKING, Any, NamedTuple
 
 import smartcam
-from smartcam.exceptions import ConfigurationError, MissingExtraError
-from smartcam.recording._form import load_extra
-from smartcam.recording._recorder import CHUNK, opened
+from smartcam.exceptions import ConfigurationError
+from smartcam.recording._exclusive_files import opened
+from smartcam.recording._mcap.form import load_compress, load_extra
+from smartcam.recording._mcap.writer import McapWriter
+from smartcam.recording._recorder import CHUNK
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from smartcam.ros2._qos import QoS
-    from smartcam.ros2._types import RosTypes
+    from smartcam.ros2 import QoS, RosTypes
 
 VERSION = 8
-"""Of the form of ``metadata.yaml``."""
+"""Version of the form in which ``metadata.yaml`` is written."""
 
 METADATA = "metadata.yaml"
 
@@ -44,9 +44,9 @@ class Topic(NamedTuple):
     """A topic of a bag.
 
     Attributes:
-        name: with a slash in front.
-        type: of its messages.
-        qos: that its node offers.
+        name: absolute name of the topic, with a slash in front.
+        type: type of the messages.
+        qos: quality of service that the publishing node offers.
     """
 
     name: str
@@ -67,7 +67,7 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
     """Make a bag's folder and return its MCAP file, open and ours.
 
     Args:
-        folder: of the bag; the one that it is in must be there.
+        folder: folder of the bag, whose parent must be there.
         overwrite: take the place of a bag that is there.
 
     Raises:
@@ -121,7 +121,7 @@ def mcap_of(folder: Path) -> Path:
 
 
 def _is_of_bag(folder: Path, path: Path) -> bool:
-    """Return whether a file may be a bag's own: other recordings are not taken for one."""
+    """Return True if a file may be the bag's own; other recordings are not taken for one."""
     own = re.fullmatch(re.escape(folder.resolve().name) + r"_\d+\.mcap", path.name)
     return (own is not None or path.name in {METADATA, _HALF}) and not path.is_dir()
 
@@ -139,12 +139,12 @@ class BagWriter:
     """Writes a bag; not for several threads.
 
     Args:
-        folder: its folder.
-        stream: its MCAP file, from :func:`make_folder`; closed at the end.
-        types: of the messages.
+        folder: folder of the bag.
+        stream: MCAP file of the bag, from :func:`make_folder`; closed at the end.
+        types: types of the messages.
 
     Raises:
-        MissingExtraError: the mcap library, or PyYAML, is not installed.
+        MissingExtraError: zstandard, or PyYAML, is not installed.
     """
 
     folder: Path
@@ -158,8 +158,8 @@ class BagWriter:
     _last: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
-        self._yaml = load_yaml()
-        self._writer: Any = load_extra("mcap.writer").Writer(self.stream, chunk_size=CHUNK)
+        self._yaml = load_extra("yaml")
+        self._writer = McapWriter(self.stream, load_compress(), CHUNK)
         self._on_disk = stat.S_ISREG(os.fstat(self.stream.fileno()).st_mode)
 
     @property
@@ -169,7 +169,7 @@ class BagWriter:
 
     def start(self) -> None:
         """Write what stands first; from here on it can be read, whatever happens."""
-        self._writer.start("ros2", library=f"smartcam {smartcam.__version__}")
+        self._writer.start("ros2", f"smartcam {smartcam.__version__}")
         # a file that is cut off has only this one, which says how to read the policies
         self._write_metadata_record()
         self.flush()
@@ -178,9 +178,9 @@ class BagWriter:
         """Write a message; it is on the disk after the next :meth:`flush`.
 
         Args:
-            topic: where to.
-            at: when it came, nanoseconds since 1970, UTC.
-            message: it, or a mapping of its fields.
+            topic: topic to write the message to.
+            at: time of arrival, nanoseconds since 1970, UTC.
+            message: message of the type, or a mapping of the fields.
 
         Raises:
             RosMessageError: the fields make no message of the topic's type.
@@ -192,7 +192,7 @@ class BagWriter:
             channel = self._channels[topic] = self._new_channel(topic)
         channel.count += 1
         self._first, self._last = min(self._first, at), max(self._last, at)
-        self._writer.add_message(channel.id, at, data, at, channel.count & 0xFFFFFFFF)
+        self._writer.add_message(channel.id, at, data, channel.count & 0xFFFFFFFF)
 
     def flush(self) -> None:
         """End the chunk and have it put on the disk."""
@@ -227,7 +227,7 @@ class BagWriter:
                 kind.name, "ros2msg", kind.text.encode()
             )
         qos = self._text([_policies(topic.qos)]).strip()
-        number: int = self._writer.register_channel(
+        number = self._writer.register_channel(
             topic.name,
             "cdr",
             self._schemas[kind.name],
@@ -279,20 +279,6 @@ class BagWriter:
             "custom_data": None,
             "ros_distro": self.types.distribution,
         }
-
-
-def load_yaml() -> Any:
-    """Import PyYAML.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
-    try:
-        return importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            'bags need PyYAML: pip install "smartcam[ros2,record]"', extra="ros2"
-        ) from exc
 
 
 def _policies(qos: QoS) -> dict[str, Any]:

@@ -15,38 +15,37 @@ is, is known from the ``interpret_as`` in the recording.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import PrivateAttr
 
-from smartcam.emulator._application import Application
-from smartcam.emulator._camera import EmulatedCamera
-from smartcam.emulator._generators import wrap_number
-from smartcam.emulator._line_camera import LineCamera
-from smartcam.emulator._makes import check_options, emulated_class
+from smartcam._arguments import check_callable, check_flag, check_kind, check_number
+from smartcam.emulator import Application, EmulatedCamera, LineCamera
+from smartcam.emulator._inside import check_options, emulated_class, wrap_number
 from smartcam.exceptions import ConfigurationError
-from smartcam.interpreters._base import resolve
+from smartcam.interpreters import resolve
 from smartcam.protocols import messages as m
-from smartcam.recording._replay_lines import ReplayedLines
-from smartcam.recording._schedule import CONDITIONS, plan_replay
+from smartcam.recording._reader import check_recording
+from smartcam.recording._replays.lines import ReplayedLines
+from smartcam.recording._replays.schedule import CONDITIONS, plan_replay
 from smartcam.settings import is_fleet
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
-    from smartcam.emulator._client_link import ClientLink
-    from smartcam.emulator._clock import Clock, TimerHandle
-    from smartcam.emulator._scene import TableScene
+    from smartcam.emulator import TableScene
+    from smartcam.emulator._inside import ClientLink, Clock, TimerHandle
     from smartcam.layout import Field
     from smartcam.models import ByteOrder, Status
     from smartcam.recording._reader import Recording
-from smartcam.recording._schedule import ReplayPlan, Take, TakeList
+from smartcam.recording._replays.schedule import ReplayPlan, Take, TakeList
 
 MAX_SPEED = 1000.0
 """Times faster, or slower, than recorded: beyond it timers of a millisecond decide."""
 
-SOON = 1e-6
+MIN_INSPECTION_TIME = 1e-6
 """Seconds that a replayed inspection takes at least: its take is chosen when it has begun."""
 
 NEVER = 0.0001
@@ -71,7 +70,7 @@ class _Takes:
 
     @property
     def left(self) -> int:
-        """How many there are still, in this round."""
+        """Number of takes that are left, in this round."""
         return len(self._takes) - self._next
 
     def pop(self) -> Take | None:
@@ -84,7 +83,7 @@ class _Takes:
 
 
 class _Numbers(NamedTuple):
-    """Where the sequence number stands in a container."""
+    """The place of the sequence number in a container."""
 
     field: Field  # of the layout
     offset: int  # of its first byte
@@ -103,7 +102,7 @@ class _Numbers(NamedTuple):
 
 @dataclass(slots=True)
 class _Track:
-    """What is played of one application."""
+    """The parts of a replay that belong to one application."""
 
     waits: bool  # it waits for triggers
     triggered: _Takes  # takes for triggers
@@ -115,7 +114,7 @@ class _Track:
     numbers: _Numbers | None = None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
-        """The inspection ends: return its container; None where it sends nothing."""
+        """End the inspection: return its container; None where it sends nothing."""
         take, self.current = self.current, None
         if take is None or not take.containers:
             return None
@@ -158,9 +157,9 @@ class ReplayedCamera(EmulatedCamera):
     containers are kept in memory.
 
     Args:
-        recording: what to play.
+        recording: recording to play.
         camera: name of the camera in it; default the only one there is.
-        speed: how many times faster than recorded, 0.001 to 1000.
+        speed: factor by which to play faster than recorded, 0.001 to 1000.
         loop: begin again where something is over: each application's takes on their own.
         host: address to listen on.
         port: port to listen on, 0 for a free one.
@@ -168,12 +167,12 @@ class ReplayedCamera(EmulatedCamera):
         dialect: default the recorded one.
         quirks: what is not known of real cameras, beside the recorded deviations of the dialect:
             fields of :class:`~smartcam.emulator.Quirks`.
-        clock: its time; default: real time.
+        clock: clock that the replay runs by; default: real time.
         name: for logs; default the recorded one.
         on_over: called once, in the event loop, when nothing is left; never with ``loop``.
 
     Attributes:
-        plan: what it plays.
+        plan: plan of what is played.
         speed: as given.
 
     Raises:
@@ -196,7 +195,9 @@ class ReplayedCamera(EmulatedCamera):
         name: str | None = None,
         on_over: Callable[[], None] | None = None,
     ) -> None:
-        check_speed(speed)
+        check_recording(recording, "replay")
+        speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
+        on_over = None if on_over is None else check_callable(on_over, "on_over", "replay")
         self.plan: ReplayPlan = plan_replay(recording, camera)
         self.speed: float = speed
         self._loop = loop
@@ -210,7 +211,12 @@ class ReplayedCamera(EmulatedCamera):
             for number, found in self.plan.applications.items()
         }
         recorded: dict[str, Any] = {}
-        if dialect in {None, self.plan.dialect}:
+        if quirks is None:
+            quirks = {}
+        check_kind(quirks, Mapping, "quirks", "fields of Quirks, or None", "replay")
+        if dialect is None:
+            dialect = self.plan.dialect
+        if dialect == self.plan.dialect:
             recorded = dict.fromkeys(self.plan.quirks, True)
         super().__init__(
             [
@@ -220,11 +226,11 @@ class ReplayedCamera(EmulatedCamera):
             builtins=False,
             host=host,
             port=port,
-            transport=transport or self.plan.transport,
-            dialect=dialect or self.plan.dialect,
-            quirks={**recorded, **(quirks or {})},
+            transport=self.plan.transport if transport is None else transport,
+            dialect=dialect,
+            quirks={**recorded, **quirks},
             clock=clock,
-            name=name or recording.camera(camera).name,
+            name=recording.camera(camera).name if name is None else name,
             active=self.plan.active,
             running=self.plan.running,
         )
@@ -242,7 +248,7 @@ class ReplayedCamera(EmulatedCamera):
 
     @property
     def remaining(self) -> int:
-        """How many inspections are left, in this round."""
+        """Number of inspections that are left, in this round."""
         return sum(track.triggered.left + track.unasked.left for track in self._tracks.values())
 
     async def stop(self) -> None:
@@ -257,7 +263,7 @@ class ReplayedCamera(EmulatedCamera):
         await super().stop()
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """A link received a message; who sets a sequence number gets it."""
+        """Take a message of a link; a client that sets a sequence number gets it."""
         if isinstance(message, m.SetSequenceNumber):
             for track in self._tracks.values():
                 track.numbers = self._numbers
@@ -289,10 +295,10 @@ class ReplayedCamera(EmulatedCamera):
             tell()
 
     def _begin(self, track: _Track, take: Take | None) -> None:
-        """An inspection began: it takes as long as the recorded one."""
+        """Begin an inspection, which takes as long as the recorded one."""
         track.current, self._armed = take, None
         if take is not None:
-            self.device.change_run(late=max(0.0, take.seconds / self.speed - SOON))
+            self.device.change_run(late=max(0.0, take.seconds / self.speed - MIN_INSPECTION_TIME))
 
     def _arm_drops(self, track: _Track) -> None:
         """Have the next triggers dropped where the recorded ones were."""
@@ -346,7 +352,7 @@ class ReplayedCamera(EmulatedCamera):
             pass
 
     def _pause(self) -> None:
-        """What comes by itself waits."""
+        """Hold back what comes by itself."""
         self._ready, self._due = None, False
         if self._alarm is not None:
             self._alarm.cancel()
@@ -400,7 +406,7 @@ def _application(found: TakeList, speed: float) -> _PlayedApplication:
     if found.load_time is not None:
         fields["load_time"] = min(found.load_time / speed, MAX_LOAD_TIME)
     if found.waits:
-        fields["processing_time"] = SOON
+        fields["processing_time"] = MIN_INSPECTION_TIME
     else:
         fields["rate"] = NEVER
     return _PlayedApplication(**fields)
@@ -422,23 +428,25 @@ def replay(
     are played.
 
     Args:
-        recording: what to play.
+        recording: recording to play.
         camera: name of the camera in it; default the only one there is.
-        speed: how many times faster than recorded, 0.001 to 1000.
+        speed: factor by which to play faster than recorded, 0.001 to 1000.
         loop: begin again where something is over.
         on_over: called once, in the event loop, when no trigger is left; never with ``loop``.
-        options: of :class:`ReplayedCamera`, or of a :class:`~smartcam.emulator.LineCamera`.
+        options: options of :class:`ReplayedCamera`, or of a :class:`~smartcam.emulator.LineCamera`.
 
     Raises:
         ConfigurationError: something given is wrong, or the camera cannot be replayed.
         UnsupportedError: its protocol brings no emulated camera.
     """
+    check_recording(recording, "replay")
+    speed, loop = check_speed(speed), check_flag(loop, "loop", "replay")
+    on_over = None if on_over is None else check_callable(on_over, "on_over", "replay")
     known = recording.camera(camera)
     if not known.url:
         raise ConfigurationError(
             f"recording {recording.path}: there was no session with camera {known.name!r}"
         )
-    check_speed(speed)
     kind = EmulatedCamera if is_fleet(known.url) else emulated_class(known.protocol)
     given: dict[str, Any] = {"camera": camera, "speed": speed, "loop": loop, "on_over": on_over}
     if issubclass(kind, LineCamera):
@@ -452,9 +460,6 @@ def replay(
     )
 
 
-def check_speed(speed: float) -> None:
-    """Refuse a speed that cannot be kept; ConfigurationError."""
-    if not 1 / MAX_SPEED <= speed <= MAX_SPEED:
-        raise ConfigurationError(
-            f"replay: a speed from {1 / MAX_SPEED:g} to {MAX_SPEED:g} was expected, got {speed}"
-        )
+def check_speed(speed: float) -> float:
+    """Return a speed that can be kept; else ConfigurationError."""
+    return check_number(speed, "speed", 1 / MAX_SPEED, MAX_SPEED, "replay")

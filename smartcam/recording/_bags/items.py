@@ -1,4 +1,4 @@
-"""What goes into a bag of each thing that a client saw, or that a recording holds."""
+"""Make a bag's items of each thing that a client saw, or that a recording holds."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._ros_names import as_name
+from smartcam.exceptions import SmartCamError
 from smartcam.models import (
     ApplicationChanged,
     CameraEvent,
@@ -20,29 +22,38 @@ from smartcam.models import (
     Quaternion,
     Reconnected,
     Result,
-    Status,
     StatusChanged,
 )
 from smartcam.observers import TraceEntry
-from smartcam.recording._bag import Topic
-from smartcam.recording._bag_messages import (
+from smartcam.recording._bags.specs import Specs
+from smartcam.recording._bags.writer import Topic
+from smartcam.recording._mcap.form import RecordedError, nanoseconds
+from smartcam.ros2._inside import (
+    DEFAULT,
+    DETECTIONS,
     DIAGNOSTICS,
-    STATUS,
-    diagnostics,
+    DRIVER,
+    LATCHED,
+    OK,
+    POSES,
+    RESULT,
+    STATUS_TYPE,
+    WARN,
+    KnownState,
+    ResultMessages,
+    diagnostic_fields,
+    hardware_id,
+    header_fields,
     health,
     status_fields,
+    utf8,
 )
-from smartcam.recording._bag_specs import Specs
-from smartcam.recording._form import RecordedError, nanoseconds
-from smartcam.ros2._camera_status import OK, WARN
-from smartcam.ros2._messages import DETECTIONS, POSES, RESULT, ResultMessages, utf8
-from smartcam.ros2._names import as_name
-from smartcam.ros2._qos import DEFAULT, DRIVER, LATCHED
+from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from smartcam.ros2._types import RosTypes
+    from smartcam.ros2 import RosTypes
 
 _DIAGNOSTICS = Topic("/diagnostics", DIAGNOSTICS, DEFAULT)
 
@@ -54,13 +65,13 @@ UNREADABLE = frozenset({"InterpretationError", "WrongApplicationError"})
 
 
 class BagCounts(NamedTuple):
-    """What a bag holds.
+    """Counts of the messages of a bag.
 
     Attributes:
-        messages: all of them.
+        messages: all messages.
         results: results, each on the topic ``results``; those that could not be read, too.
-        unread: of these, the ones that could not be read; their messages say why.
-        localizations: of these, the ones that are localizations, which two more topics have.
+        unread: results that could not be read; their messages say why.
+        localizations: results that are localizations, which two more topics have.
         errors: other errors, on ``/diagnostics``.
     """
 
@@ -95,8 +106,8 @@ class BagItems:
     """Makes messages of items, in order; knows the state of each camera.
 
     Args:
-        types: of the messages.
-        read: what each result goes through; default as it is.
+        types: types of the messages.
+        read: function that each result goes through; default: results stay as they are.
     """
 
     _types: RosTypes
@@ -116,7 +127,7 @@ class BagItems:
             camera.specs = Specs(camera.facts.get("interpret_as", ""), pixels=pixels)
 
     def messages(self, item: object) -> Iterator[BagMessage]:
-        """Yield what an item comes to; nothing of frames, which ROS has no message for."""
+        """Yield the messages of an item; none of a frame, which ROS has no message for."""
         for message in self._messages(item):
             self._count(messages=1)
             yield message
@@ -195,18 +206,16 @@ class _BagCamera:
     title: str  # for topics
     make: ResultMessages
     url: str = ""
-    connected: bool = False
-    status: Status | None = None
-    application: int | None = None
-    why: str = ""  # it is not connected
+    known: KnownState = field(init=False)  # as far as it was told
     facts: dict[str, Any] = field(default_factory=dict[str, Any])  # that were told
     specs: Specs = field(default_factory=Specs)  # how its results are read
 
     def __post_init__(self) -> None:
+        self.known = KnownState(self.name)
         self.results = Topic(f"/{self.title}/results", RESULT, DRIVER)
         self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
-        self._status = Topic(f"/{self.title}/status", STATUS, LATCHED)
+        self._status = Topic(f"/{self.title}/status", STATUS_TYPE, LATCHED)
         self._told: object = None  # of the last diagnostics
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
@@ -214,39 +223,40 @@ class _BagCamera:
         """Keep what an event tells."""
         match event:
             case Connected() | Reconnected():
-                self.connected, self.url, self.why = True, event.url, ""
+                self.url = event.url
+                self.known = self.known._replace(connected=True, why="")
             case Disconnected():
-                self.connected, self.status = False, None
-                self.why = event.reason
+                self.known = self.known._replace(connected=False, status=None, why=event.reason)
             case StatusChanged():
-                self.status = event.status
+                self.known = self.known._replace(status=event.status)
             case ApplicationChanged():
-                self.application = event.application
+                self.known = self.known._replace(application=event.application)
             case _:
                 pass
 
     def state(self, at: datetime) -> Iterator[BagMessage]:
         """Yield the state for its topic, and for the diagnostics what is new to them."""
-        when = nanoseconds(at)
-        level, text = health(self.status, connected=self.connected, why=self.why)
-        fields = status_fields(
-            self.name,
-            at,
-            connected=self.connected,
-            status=self.status,
-            application=self.application,
-        )
-        error = "" if level == OK else text
-        yield BagMessage(self._status, when, {**fields, "error": utf8(error)})
-        if (level, text, self.application) != self._told:
-            self._told = (level, text, self.application)
-            told = diagnostics(self.title, self.url, at, level, text, application=self.application)
-            yield BagMessage(_DIAGNOSTICS, when, told)
+        known = self.known
+        how = health(known, heard=bool(known.why))
+        fields = {"header": header_fields(at, self.name), **status_fields(known)}
+        yield BagMessage(self._status, nanoseconds(at), fields)
+        told = (how.level, "" if how.level == OK else how.text, known.application)
+        if told != self._told:
+            self._told = told
+            application = [] if known.application is None else [("application", known.application)]
+            yield self._diagnostics(at, how.level, how.text, application)
 
     def warning(self, at: datetime, text: str, **values: object) -> BagMessage:
         """Return a message of the diagnostics about something that went wrong once."""
-        told = diagnostics(self.title, self.url, at, WARN, text, **values)
-        return BagMessage(_DIAGNOSTICS, nanoseconds(at), told)
+        said = [(key, value) for key, value in values.items() if value is not None]
+        return self._diagnostics(at, WARN, text, said)
+
+    def _diagnostics(
+        self, at: datetime, level: int, text: str, values: list[tuple[str, Any]]
+    ) -> BagMessage:
+        said = diagnostic_fields(self.title, _hardware(self.url), level, text, values)
+        fields = {"header": header_fields(at, self.name), "status": [said]}
+        return BagMessage(_DIAGNOSTICS, nanoseconds(at), fields)
 
     # ------------------------------------------------------------------ containers
 
@@ -259,7 +269,7 @@ class _BagCamera:
                     self._containers.append((application, bytes.fromhex(data), entry.at))
 
     def settle(self, raw: bytes) -> None:
-        """A container was read: forget it and those before it."""
+        """Forget a container that was read, and those before it."""
         for place, (_, data, _) in enumerate(self._containers):
             if data == raw:
                 for _ in range(place + 1):
@@ -276,13 +286,21 @@ class _BagCamera:
         return known
 
 
+def _hardware(url: str) -> str:
+    """Return a camera's hardware id; the URL itself where it is none of this version's."""
+    try:
+        return hardware_id(parse_address(url)) if url else ""
+    except SmartCamError:
+        return url
+
+
 def topic_of_camera(name: str) -> str:
     """Return a camera's name as its topics have it, which is its node's name, too."""
     return "/".join(part for part in as_name(name).split("/") if part) or "camera"
 
 
 def parts_from_json(value: object) -> list[Localization] | None:
-    """Return what a recording has of localizations as localizations, None where it is none."""
+    """Return the localizations that recorded JSON holds; None where it holds anything else."""
     if not isinstance(value, list):
         return None
     said: list[Any] = value

@@ -10,22 +10,26 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.emulator._line_camera import LineCamera, LineClient
+from smartcam.emulator import LineCamera, LineClient, TicketedCamera, TicketedClient
 from smartcam.exceptions import ConfigurationError, RecordingError
-from smartcam.models import Disconnected
+from smartcam.models import Disconnected, Result
 from smartcam.observers import TraceEntry
+from smartcam.protocols import LineDialect
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import load_protocol
-from smartcam.recording._schedule import MAX_REPLAY
+from smartcam.protocols._inside import load_protocol
+from smartcam.recording._replays.schedule import MAX_REPLAY
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from smartcam.emulator._client_link import ClientLink
-    from smartcam.emulator._line_codec import LineCodec
-    from smartcam.protocols._base import Protocol
-    from smartcam.recording._form import Item
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from smartcam.emulator._inside import ClientLink, HeardLine, LineCodec, LineServer
+    from smartcam.frames import Frame
+    from smartcam.protocols import LineRow, Protocol
+    from smartcam.recording._mcap.form import Item
     from smartcam.recording._reader import Recording
 
 
@@ -38,18 +42,18 @@ class TimedLine(NamedTuple):
 
 @dataclass(slots=True)
 class LineAnswers:
-    """What a line got, each time that it was said."""
+    """The answers to a line, for each time that it was said."""
 
     given: list[list[TimedLine]] = field(default_factory=list[list[TimedLine]])
     next: int = 0
 
     @property
     def left(self) -> int:
-        """How many were not played yet, in this round."""
+        """Number of answers that were not played yet, in this round."""
         return max(0, len(self.given) - self.next)
 
     def forget_silence(self) -> None:
-        """The link ended: what a line under way would have got is not known."""
+        """End the link: what a line under way would have got is not known."""
         if self.given and not self.given[-1]:
             self.given.pop()
 
@@ -64,12 +68,12 @@ class LineAnswers:
 
 @dataclass(slots=True)
 class LinesPlan:
-    """What a recorded camera said.
+    """Everything that a recorded camera sent.
 
     Attributes:
-        greeting: before any line was said.
-        answers: to each line, without its end.
-        secrets: to a line that was not recorded, such as a password, by its place in a session.
+        greeting: bytes sent before any line came.
+        answers: answers to each line, by the line without its end.
+        secrets: answers to lines that were not recorded, such as passwords, by place in a session.
     """
 
     greeting: list[TimedLine] = field(default_factory=list[TimedLine])
@@ -77,8 +81,16 @@ class LinesPlan:
     secrets: dict[int, LineAnswers] = field(default_factory=dict[int, LineAnswers])
 
 
-def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPlan:
-    """Work out what each line got; ``cut`` returns a line without its end.
+def eight_bits(picture: Frame) -> NDArray[np.uint8]:
+    """Return the brightness of a picture, of more than 8 bits the upper 8."""
+    grey: NDArray[Any] = picture.grey()
+    if grey.dtype.itemsize > 1:
+        grey = grey >> (picture.format.depth - 8)
+    return grey.astype("u1")
+
+
+def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
+    """Work out what each line got: what came behind it, or what names it as its question.
 
     Raises:
         RecordingError: it is more than :data:`MAX_REPLAY`.
@@ -86,10 +98,12 @@ def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPla
     plan = LinesPlan()
     pieces, began, place, size = plan.greeting, None, 0, 0
     last = LineAnswers()
+    known: dict[str, tuple[list[TimedLine], float]] = {}  # by what answers are known by
     for item in items:
         if isinstance(item, Disconnected):
             last.forget_silence()
             pieces, began, place = [], None, 0
+            known.clear()
         if not isinstance(item, TraceEntry) or item.direction == "!":
             continue
         at, data = item.at.timestamp(), bytes.fromhex(item.hex)
@@ -98,11 +112,13 @@ def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPla
             raise RecordingError(f"recording: {size} bytes of lines, expected {MAX_REPLAY} at most")
         began = at if began is None else began
         if item.direction == "<":
-            pieces.append(TimedLine(max(0.0, at - began), data))
+            answered, asked_at = known.get(codec.answer_key(data), (pieces, began))
+            answered.append(TimedLine(max(0.0, at - asked_at), data))
             continue
         pieces, began = [], at
+        known[codec.request_key(data)] = pieces, began
         last = (
-            plan.answers.setdefault(cut(data), LineAnswers())
+            plan.answers.setdefault(bare(codec, data), LineAnswers())
             if data
             else plan.secrets.setdefault(place, LineAnswers())
         )
@@ -111,6 +127,11 @@ def plan_lines(items: Iterable[Item], cut: Callable[[bytes], bytes]) -> LinesPla
     last.forget_silence()
     plan.answers = {line: one for line, one in plan.answers.items() if one.given}
     return plan
+
+
+def bare(codec: LineCodec, data: bytes) -> bytes:
+    """Return a client's line without its end, and without what differs each time it is said."""
+    return codec.text(data).encode(codec.encoding, "replace")
 
 
 class ReplayedLines(LineCamera):
@@ -129,6 +150,9 @@ class ReplayedLines(LineCamera):
     ) -> None:
         known = recording.camera(camera)
         self._kind = kind
+        self.also_hears: tuple[LineRow, ...] = (
+            kind.also_hears if issubclass(kind, TicketedCamera) else ()
+        )
         self._address = parse_address(known.url)
         self.protocol: Protocol = load_protocol(known.protocol)
         self.max_links: int = kind.max_links
@@ -139,38 +163,87 @@ class ReplayedLines(LineCamera):
                 f"recording {recording.path}: camera {known.name!r} speaks in lines, which are "
                 "played from the begin, not from a time on"
             )
-        self.plan: LinesPlan = plan_lines(recording.items(known.name), self._bare)
+        self.plan: LinesPlan = plan_lines(recording.items(known.name), self.lines)
         if not self.plan.answers:
             raise ConfigurationError(
                 f"recording {recording.path}: no line to camera {known.name!r} is in it"
             )
         self._speed, self._loop = speed, loop
+        spoken = next(iter(self.protocol.dialects.values()))
+        self._at_once = isinstance(spoken, LineDialect) and spoken.at_once
         self._on_over = None if loop else on_over
         self._places: dict[LineClient, int] = {}
+        self._triggered = 0  # triggers that were played
+        self._images = self._recorded_images(recording, known.name)
 
     def make_codec(self) -> LineCodec:
         """Return the lines of the recorded camera."""
         return self._kind.make_codec(self)
 
-    def _bare(self, data: bytes) -> bytes:
-        return self.lines.text(data).encode(self.lines.encoding, "replace")
+    def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
+        """Return a new client, as the recorded camera has them."""
+        if issubclass(self._kind, TicketedCamera):
+            return TicketedClient(self, link, server)
+        return super().make_client(link, server)
+
+    def begun(self, client: LineClient, message: HeardLine) -> None:
+        """Note a client's line as it came."""
+        if isinstance(client, TicketedClient):
+            client.ticket = self.lines.request_key(message.data)
 
     @property
     def url(self) -> str:
         """Its address, with what the recorded one says beside host and port."""
         return self._address._replace(host=self.host, port=self.port).url
 
+    def _recorded_images(self, recording: Recording, camera: str) -> dict[int, bytes]:
+        """Return the answers to a line that asks for a picture, by the triggers before it."""
+        if not recording.counts.pictures:
+            return {}
+        triggers, of_result = 0, dict[int, int]()
+        for item in recording.items(camera):
+            if isinstance(item, Result):
+                of_result[item.number] = triggers
+            elif isinstance(item, TraceEntry) and item.direction == ">":
+                triggers += self._triggers(bare(self.lines, bytes.fromhex(item.hex)))
+        found: dict[int, bytes] = {}
+        size = 0
+        for result, picture, _ in recording.judged(camera):
+            if picture is None:
+                continue
+            answer = self._kind.image_answer(eight_bits(picture))
+            if answer is None:
+                return {}
+            found[of_result[result.number]] = answer
+            size += len(answer)
+            if size > MAX_REPLAY:
+                raise RecordingError(
+                    f"recording: {size} bytes of pictures, expected {MAX_REPLAY} at most"
+                )
+        return found
+
+    def _image_for(self, line: str) -> bytes | None:
+        """Return the picture of the last trigger; None where no picture is asked for, or known."""
+        row = self.lines.row_of(line)
+        if self.lines.message_type(m.Sender.CLIENT, row) is not m.ReadImage:
+            return None
+        return self._images.get(min(self._triggered, max(self._images, default=0)))
+
     @property
     def remaining(self) -> int:
-        """How many triggers are left, in this round."""
+        """Number of triggers that are left, in this round."""
         return sum(one.left for line, one in self.plan.answers.items() if self._triggers(line))
 
     def _triggers(self, line: bytes) -> bool:
         row = self.lines.row_of(line.decode(self.lines.encoding, "replace"))
         return self.lines.message_type(m.Sender.CLIENT, row) is m.Trigger
 
+    def begins_session(self, message: HeardLine) -> bool:
+        """Return True: whoever says a line that is not in the recording is sent away."""
+        return True
+
     def greet(self, client: LineClient) -> None:
-        """Say what came before any line."""
+        """Send a client the bytes that the recorded camera sent before any line."""
         self._places[client] = 0
         if 0 in self.plan.secrets:
             client.hide_next()
@@ -180,12 +253,18 @@ class ReplayedLines(LineCamera):
         """Give a line what the recorded one got."""
         place = self._places[client]
         self._places[client] += 1
+        if self._at_once:
+            client = client.keep()
         data = line.encode(self.lines.encoding, "replace")
         found = self.plan.secrets.get(place) or self.plan.answers.get(data)
+        if found is None and (image := self._image_for(line)) is not None:
+            self._play(client, [TimedLine(0.0, image)], client.go_on)
+            return
         if found is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
             return
         triggers = self._triggers(data)
+        self._triggered += triggers
         if triggers and not found.left and not self._loop:
             client.answer(None)
             return
@@ -208,14 +287,14 @@ class ReplayedLines(LineCamera):
             last = index == len(pieces) - 1
 
             def say(data: bytes = piece.data, last: bool = last) -> None:
-                client.say_bytes(data)
+                client.say_again(data)
                 if last and done is not None:
                     done()
 
             self.after(piece.seconds / self._speed, say)
 
     def lost(self, link: ClientLink) -> None:
-        """A link is gone; harmless when said twice."""
+        """Forget a link that is gone; a second call does nothing."""
         client = self._clients.get(link)
         if client is not None:
             self._places.pop(client, None)

@@ -8,19 +8,21 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from smartcam.recording._folder_track import Gap
-from smartcam.recording._recorder import Description, RecordingFile, opened
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam.recording._exclusive_files import opened
+from smartcam.recording._folders.track import Gap
+from smartcam.recording._recorder import Description, RecordingFile
 from smartcam.recording._state import STATE_METADATA
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from smartcam.recording._folder import RecordingFolder
-    from smartcam.recording._folder_track import CameraTrack
+    from smartcam.recording._folders.track import CameraTrack
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
-LOOK = 10.0
+LOOK_INTERVAL = 10.0
 """Seconds after which it is looked again what is in the folder, where files are begun."""
 
 STEP = 64
@@ -28,7 +30,7 @@ STEP = 64
 
 
 class Limits(NamedTuple):
-    """When a file is over, and what is kept.
+    """The limits at which a file is ended, and of how much is kept.
 
     Attributes:
         size: bytes of a file.
@@ -45,10 +47,10 @@ class FolderFiles:
     """Writes what came of each camera to its files.
 
     Args:
-        folder: that they are in.
-        limits: of files.
-        compress: packs a chunk.
-        clock: seconds, for the files' age.
+        folder: folder that holds the files.
+        limits: bounds on the files.
+        compress: function that packs a chunk.
+        clock: function that returns seconds, for the files' age.
     """
 
     def __init__(
@@ -113,7 +115,9 @@ class FolderFiles:
         written = 0
         try:
             items = [*track.read(one)]
-        except Exception as exc:  # noqa: BLE001 - an interpreter's, of whatever kind
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:  # noqa: BLE001 - an interpreter's, of whatever kind
             track.lose_one(f"unexpected {exc!r}")
             return 0
         track.more += len(items) - 1  # a result that cannot be read is an error, too
@@ -140,7 +144,7 @@ class FolderFiles:
             OSError: it cannot be made.
         """
         now = self._clock()
-        if now - self._looked > LOOK:
+        if now - self._looked > LOOK_INTERVAL:
             self._folder.look()
             self._looked = now
         path = self._folder.next_path(track.camera, _time_of(first))

@@ -1,0 +1,1 @@
+"""Write rosbag2 folders, from a running fleet or from a recording."""

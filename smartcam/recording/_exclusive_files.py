@@ -1,0 +1,37 @@
+"""Open a file that one recorder writes."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import IO, TYPE_CHECKING
+
+from smartcam._locks import try_lock
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
+    """Open a file for one recorder; what was in it is gone when it is ours, not before.
+
+    Raises:
+        ConfigurationError: another recorder writes it.
+        FileExistsError: it is there already.
+        OSError: it cannot be made.
+    """
+    stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
+    try:
+        if stat.S_ISREG(os.fstat(stream.fileno()).st_mode):  # a pipe may have many writers
+            if try_lock(stream.fileno()) is False:
+                raise ConfigurationError(f"recording {path}: another recorder is writing this file")
+            stream.truncate()
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def _open_whole(path: str, flags: int) -> int:
+    return os.open(path, flags & ~os.O_TRUNC, 0o666)

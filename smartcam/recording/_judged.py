@@ -1,0 +1,109 @@
+"""Find the picture that a result was made of."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam.models import Result
+from smartcam.recording._mcap.form import RecordedPicture
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from smartcam.frames import Frame
+    from smartcam.recording._mcap.form import Item
+
+MAX_PICTURES: Final = 256
+"""Pictures of a camera that are kept to be found."""
+
+MAX_PICTURE_BYTES: Final = 1 << 28
+"""Bytes that the kept pictures of a camera may have together; the last one is kept in any case."""
+
+MAX_RESULTS: Final = 1000
+"""Results of a camera that wait for a picture that comes later."""
+
+
+class JudgedResult(NamedTuple):
+    """A result and its picture.
+
+    Attributes:
+        result: result of the camera.
+        picture: picture that the result was made of; None where there is none.
+        told: True if the recorder was told that the two belong together, as after
+            ``read_image()``; False where the picture was found by the times. Without a trigger
+            of this client the times say nothing: the picture is None.
+    """
+
+    result: Result[Any]
+    picture: Frame | None
+    told: bool
+
+
+def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
+    """Yield each result with its picture; a result waits until later pictures are of later."""
+    matchers: dict[str, _Matcher] = {}
+    for item in items:
+        if isinstance(item, (RecordedPicture, Result)):
+            if item.camera not in matchers:
+                matchers[item.camera] = _Matcher()
+            matcher = matchers[item.camera]
+            if isinstance(item, RecordedPicture):
+                matcher.add_picture(item)
+            else:
+                matcher.results.append(item)
+            yield from matcher.settled()
+    for matcher in matchers.values():
+        yield from matcher.settled(over=True)
+
+
+class _Matcher:
+    """Pictures and results of one camera."""
+
+    def __init__(self) -> None:
+        self.results: deque[Result[Any]] = deque()
+        self._pictures: deque[RecordedPicture] = deque()
+        self._bytes = 0
+        self._latest = 0.0  # capture of the last picture that nothing was told of, seconds
+
+    def add_picture(self, picture: RecordedPicture) -> None:
+        self._pictures.append(picture)
+        self._bytes += _size(picture)
+        if picture.result_number is None:
+            self._latest = max(self._latest, picture.frame.utc)
+        too_many = len(self._pictures) > MAX_PICTURES
+        while too_many or (self._bytes > MAX_PICTURE_BYTES and len(self._pictures) > 1):
+            self._bytes -= _size(self._pictures.popleft())
+            too_many = False
+
+    def settled(self, *, over: bool = False) -> Iterator[JudgedResult]:
+        """Yield the results whose picture is known, or comes no more."""
+        while self.results:
+            result = self.results[0]
+            found = self._told(result)
+            told = found is not None
+            late = self._latest > result.received_at.timestamp()
+            if not (told or late or over or len(self.results) > MAX_RESULTS):
+                return
+            self.results.popleft()
+            picture = self._by_time(result) if found is None else found.frame
+            yield JudgedResult(result, picture, told)
+
+    def _told(self, result: Result[Any]) -> RecordedPicture | None:
+        key = result.number, result.received_at
+        pictures = reversed(self._pictures)
+        return next(
+            (one for one in pictures if (one.result_number, one.result_received_at) == key), None
+        )
+
+    def _by_time(self, result: Result[Any]) -> Frame | None:
+        if result.triggered_at is None:  # how long the camera's tools took is not known
+            return None
+        triggered, came = result.triggered_at.timestamp(), result.received_at.timestamp()
+        untold = (one.frame for one in self._pictures if one.result_number is None)
+        between = (one for one in untold if triggered <= one.utc - one.duration <= one.utc <= came)
+        return next(between, None)
+
+
+def _size(picture: RecordedPicture) -> int:
+    return memoryview(picture.frame.data).nbytes

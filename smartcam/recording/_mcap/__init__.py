@@ -1,0 +1,1 @@
+"""The MCAP file of a recording: its topics, and their messages as JSON."""

@@ -1,0 +1,118 @@
+"""Packets as bytes: Ethernet, IP, TCP and UDP, and the file that holds them.
+
+Sources: the format of pcap is libpcap's (draft-ietf-opsawg-pcap), IPv4 RFC 791, IPv6 RFC 8200, TCP
+RFC 9293, its window scale RFC 7323, UDP RFC 768.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Final
+
+MAX_PACKET_BYTES: Final = 1 << 18
+"""Snapshot length that the file's header tells: Wireshark's own default."""
+
+WINDOW_SCALE: Final = 7
+"""Makes of the largest window that fits into a header one of 8 MB, more than the largest frame."""
+
+FIN, SYN, RST, PUSH, ACK = 0x01, 0x02, 0x04, 0x08, 0x10
+"""Flags of a TCP segment."""
+
+_TCP, _UDP = 6, 17
+_TYPES: Final = {4: 0x0800, 16: 0x86DD}
+"""Type of an Ethernet frame, by the bytes of the IP addresses in it."""
+
+_HOPS: Final = 64
+_DO_NOT_FRAGMENT: Final = 0x4000
+_WINDOW: Final = 0xFFFF
+_MICROSECONDS, _ETHERNET = 0xA1B2C3D4, 1
+
+_FILE: Final = struct.Struct("<IHHiIII")
+_RECORD: Final = struct.Struct("<IIII")
+_IPV4: Final = struct.Struct(">BBHHHBBH4s4s")
+_IPV6: Final = struct.Struct(">IHBB16s16s")
+_TCP_HEADER: Final = struct.Struct(">HHIIBBHHH")
+_UDP_HEADER: Final = struct.Struct(">HHHH")
+
+
+@dataclass(slots=True, eq=False)
+class Side:
+    """One end of a link."""
+
+    mac: bytes
+    ip: bytes
+    port: int
+    sequence: int = 0
+
+
+def file_header() -> bytes:
+    """Return the header of a pcap file."""
+    return _FILE.pack(_MICROSECONDS, 2, 4, 0, 0, MAX_PACKET_BYTES, _ETHERNET)
+
+
+def file_record(time: int, packet: bytes) -> bytes:
+    """Return a packet as a pcap file has it; ``time`` in nanoseconds since 1970, cut to micro."""
+    seconds, rest = divmod(time, 10**9)
+    return _RECORD.pack(seconds, rest // 1000, len(packet), len(packet)) + packet
+
+
+def tcp_packet(
+    sender: Side, receiver: Side, flags: int, number: int, data: bytes, mss: int = 0
+) -> bytes:
+    """Return an Ethernet frame with a TCP segment.
+
+    Args:
+        sender: the end whose sequence number is the segment's.
+        receiver: the end whose sequence number is acknowledged.
+        flags: flags of the segment; a segment with SYN has options.
+        number: number of the IP packet, in IPv4.
+        data: the segment's.
+        mss: the maximum segment size that its options tell.
+    """
+    # maximum segment size; no operation; window scale
+    options = struct.pack(">BBHBBBB", 2, 4, mss, 1, 3, 3, WINDOW_SCALE) if flags & SYN else b""
+    size = _TCP_HEADER.size + len(options)
+    acknowledged = receiver.sequence & 0xFFFFFFFF if flags & ACK else 0
+    header = sender.port, receiver.port, sender.sequence & 0xFFFFFFFF, acknowledged, size << 2
+    plain = _TCP_HEADER.pack(*header, flags, _WINDOW, 0, 0) + options + data
+    total = _checksum(_pseudo_header(sender, receiver, _TCP, len(plain)) + plain)
+    body = _TCP_HEADER.pack(*header, flags, _WINDOW, total, 0) + options + data
+    return _ethernet(sender, receiver, _TCP, number, body)
+
+
+def udp_packet(sender: Side, receiver: Side, number: int, data: bytes) -> bytes:
+    """Return an Ethernet frame with a UDP datagram; ``number`` is the IP packet's, in IPv4."""
+    header = sender.port, receiver.port, _UDP_HEADER.size + len(data)
+    plain = _UDP_HEADER.pack(*header, 0) + data
+    total = _checksum(_pseudo_header(sender, receiver, _UDP, len(plain)) + plain)
+    body = _UDP_HEADER.pack(*header, total or 0xFFFF) + data  # 0 would mean that there is none
+    return _ethernet(sender, receiver, _UDP, number, body)
+
+
+def _ethernet(sender: Side, receiver: Side, protocol: int, number: int, body: bytes) -> bytes:
+    kind = _TYPES[len(sender.ip)]
+    if len(sender.ip) == 4:
+        size = _IPV4.size + len(body)
+        before = 0x45, 0, size, number, _DO_NOT_FRAGMENT, _HOPS, protocol
+        total = _checksum(_IPV4.pack(*before, 0, sender.ip, receiver.ip))
+        ip = _IPV4.pack(*before, total, sender.ip, receiver.ip)
+    else:
+        ip = _IPV6.pack(6 << 28, len(body), protocol, _HOPS, sender.ip, receiver.ip)
+    return receiver.mac + sender.mac + struct.pack(">H", kind) + ip + body
+
+
+def _pseudo_header(sender: Side, receiver: Side, protocol: int, size: int) -> bytes:
+    """Return the part of a checksum that is not in the segment itself."""
+    if len(sender.ip) == 4:
+        return sender.ip + receiver.ip + struct.pack(">HH", protocol, size)
+    return sender.ip + receiver.ip + struct.pack(">II", size, protocol)
+
+
+def _checksum(data: bytes) -> int:
+    """Return the Internet's checksum (RFC 1071) of bytes, whose own field is 0."""
+    # The sum of all words is the number that they make, modulo 2^16 - 1.
+    total = int.from_bytes(data + bytes(len(data) % 2), "big") % 0xFFFF
+    if total == 0 and any(data):
+        total = 0xFFFF
+    return 0xFFFF - total

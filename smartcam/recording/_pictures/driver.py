@@ -1,0 +1,209 @@
+"""A recording as a source of frames: its pictures come again, with their times and gaps."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import logging
+import re
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from smartcam.exceptions import (
+    ConfigurationError,
+    FrameFormatError,
+    FrameSourceError,
+    RecordingError,
+)
+from smartcam.frames import Frame, FrameDriver, StreamFormat
+from smartcam.recording._mcap.form import GAP, RecordedError, RecordedPicture
+from smartcam.recording._reader import each_item, frame_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from smartcam.frames import FrameAddress, FrameSink
+
+_log = logging.getLogger(__name__)
+
+MAX_DELAY: Final = 0.5
+"""Seconds that a picture may be late before the ones behind it are late as well."""
+
+MAX_LOOKAHEAD: Final = 100
+"""Items behind the first picture among which one of another camera is looked for."""
+
+STOP_TIMEOUT: Final = 5.0
+"""Seconds that the disk may take for a picture that nobody wants any more."""
+
+MAX_SPEED: Final = 1000.0
+
+_KNOWN: Final = ("camera", "name", "pace", "speed")
+
+
+class RecordedDriver(FrameDriver):
+    """The pictures in a recording: ``run.mcap``, or a folder of recordings that follow each other.
+
+    Parameters stand behind ``#``: ``run.mcap#camera=left&pace=none``.
+
+    ========== ====================================================================================
+    ``camera`` name of the camera in the recording; needed where several have pictures
+    ``pace``   ``real`` (usual): with the times between pictures as they were; or ``none``: each
+               picture when the readers have taken the last one, and none is skipped
+    ``speed``  times faster than recorded, 0.001 to 1000; usual 1
+    ``name``   of the source; usual that of the camera
+    ========== ====================================================================================
+
+    A frame is the one that was recorded: its bytes, number, ``utc``, ``device_time``, ``moment``
+    and ``duration``; ``lost`` are those that were lost or not recorded before it. Only ``captured``
+    is of the replay: on ``time.monotonic()``, as far apart as then. A recording may be silent for
+    longer than a source allows: ``stall=None`` lets it.
+    """
+
+    times_frames: ClassVar[bool] = True
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        path, fragment = address.path, address.fragment
+        found = re.fullmatch(r"(.*?)#(\w+=[^#]*)", path, re.DOTALL)
+        if found is not None and "://" not in address.url:
+            path, fragment = found[1], found[2]
+        self._path = Path(path)
+        said = address.parameters(_KNOWN, fragment)
+        self._camera = said.get("camera")
+        self._said_name = said.get("name")
+        pace = said.get("pace", "real")
+        if pace not in ("real", "none"):
+            raise address.wrong("pace", "real or none", pace)
+        self._paced = pace == "real"
+        self._speed = address.number("speed", said.get("speed", "1"), 1 / MAX_SPEED, MAX_SPEED)
+        self._task: asyncio.Task[None] | None = None
+        self._reading: asyncio.Future[RecordedPicture | None] | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the camera, or as the URL says; before it is opened, the path."""
+        return self._said_name or self._camera or str(self._path)
+
+    async def open(self) -> StreamFormat:
+        """Look for the first picture.
+
+        Raises:
+            FrameFormatError: there is no picture in it, or there are those of several cameras.
+            FrameSourceError: it is not there, or no recording of smartcam.
+        """
+        first = await asyncio.to_thread(self._first)
+        self._camera = first.camera
+        frame = first.frame
+        return StreamFormat(frame.format, frame.width, frame.height)
+
+    def _first(self) -> RecordedPicture:
+        first: RecordedPicture | None = None
+        behind = 0
+        cameras: dict[str, None] = {}
+        try:
+            for item in each_item(self._path, lambda _: None):
+                if isinstance(item, RecordedPicture):
+                    cameras[item.camera] = None
+                    if first is None and self._camera in (None, item.camera):
+                        first = item
+                behind += first is not None
+                if first is not None and (self._camera is not None or behind > MAX_LOOKAHEAD):
+                    break
+        except (ConfigurationError, RecordingError) as exc:
+            raise FrameSourceError(str(exc), source=self.name) from exc
+        if self._camera is None and len(cameras) > 1:
+            raise self._several(cameras)
+        if first is None:
+            there = f"; those of {', '.join(cameras)} are" if cameras else ""
+            whose = f" of camera {self._camera!r}" if self._camera is not None else ""
+            raise FrameFormatError(
+                f"{self._path}: no picture{whose} is in it{there}", source=self.name
+            )
+        return first
+
+    def _several(self, cameras: dict[str, None]) -> FrameFormatError:
+        return FrameFormatError(
+            f"{self._path}: there are pictures of {', '.join(cameras)}: say which, such as "
+            f"{self._path}#camera={next(iter(cameras))}",
+            source=self.name,
+            available=tuple(cameras),
+        )
+
+    async def start(self, sink: FrameSink) -> None:
+        """Play it from its begin."""
+        self._task = asyncio.create_task(self._play(sink), name=f"frames of {self.name}")
+
+    async def stop(self) -> None:
+        """Play no longer."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+        reading, self._reading = self._reading, None
+        if reading is not None:
+            await asyncio.wait([reading], timeout=STOP_TIMEOUT)
+
+    async def close(self) -> None:
+        """Have nothing left. Idempotent."""
+        await self.stop()
+
+    # ------------------------------------------------------------------ playing
+
+    def _pictures(self) -> Iterator[RecordedPicture]:
+        """Yield the camera's pictures; those that a gap has count as left out."""
+        gap = 0
+        for item in each_item(self._path, lambda text: _log.warning("%s", text)):
+            if item.camera != self._camera:
+                continue
+            if isinstance(item, RecordedError) and item.error == GAP:
+                gap += item.records or 0
+            elif isinstance(item, RecordedPicture):
+                yield item._replace(left_out=item.left_out + gap)
+                gap = 0
+
+    async def _next(self, pictures: Iterator[RecordedPicture]) -> RecordedPicture | None:
+        """Have a thread read the next picture; None at the end."""
+        reading = asyncio.get_running_loop().run_in_executor(None, next, pictures, None)
+        self._reading = reading
+        reading.add_done_callback(_looked_at)
+        return await asyncio.shield(reading)
+
+    async def _play(self, sink: FrameSink) -> None:
+        pictures = self._pictures()
+        loop = asyncio.get_running_loop()
+        last: Frame | None = None
+        due = loop.time()
+        try:
+            while (picture := await self._next(pictures)) is not None:
+                frame = frame_of(picture)
+                if self._paced:
+                    due += 0.0 if last is None else _between(last, frame) / self._speed
+                    due = max(due, loop.time() - MAX_DELAY)
+                    await asyncio.sleep(due - loop.time())
+                now = time.monotonic()
+                captured = min(now, due) if self._paced else now
+                sink.frame(dataclasses.replace(frame, captured=captured, source=self.name))
+                if not self._paced:
+                    await sink.taken()
+                last = frame
+        except (ConfigurationError, RecordingError) as exc:
+            sink.ended(FrameSourceError(str(exc), source=self.name))
+        except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
+            failed = FrameSourceError(f"{self.name}: {exc!r}", source=self.name)
+            failed.__cause__ = exc
+            sink.ended(failed)
+        else:
+            sink.ended(None)
+
+
+def _between(last: Frame, frame: Frame) -> float:
+    """Return the seconds between two captures: by the steady clock, if both are of one run."""
+    by_clock, by_utc = frame.captured - last.captured, frame.utc - last.utc
+    same_run = by_clock >= 0 and abs(by_clock - by_utc) < 1 + 0.01 * by_clock
+    return by_clock if same_run else max(0.0, by_utc)
+
+
+def _looked_at(done: asyncio.Future[RecordedPicture | None]) -> None:
+    if not done.cancelled():
+        done.exception()  # nobody may be there for it any longer

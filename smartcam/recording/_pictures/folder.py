@@ -1,0 +1,187 @@
+"""Pictures in files that follow each other, the oldest of which are deleted."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._arguments import check_callable, check_kind, check_number, check_path, check_text
+from smartcam.exceptions import ConfigurationError
+from smartcam.frames import Frame
+from smartcam.recording._folder import FileName, RecordingFolder
+from smartcam.recording._folders.files import Limits
+from smartcam.recording._folders.writer import FolderWriter
+from smartcam.recording._mcap.form import (
+    MAX_NAME,
+    MAX_PICTURE_SIZE_BYTES,
+    RecordedPicture,
+    load_compress,
+)
+from smartcam.recording._pictures.recorder import record_frames
+from smartcam.recording._recorder import MAX_WAITING_PICTURE_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+    from typing import Self
+
+    from smartcam.exceptions import RecordingError
+    from smartcam.frames import FrameSource, ReaderStatistics
+    from smartcam.recording._folders.track import RecordingAccount
+
+MIN_FILE_BYTES: Final = 1e5
+MAX_FILE_BYTES: Final = 1e15
+MAX_AGE: Final = 86_400.0 * 366
+"""Seconds after which a file ends at the latest."""
+
+
+class RotatingRecorder:
+    """Records pictures into a folder, as an agent records its cameras.
+
+    ::
+
+        with RotatingRecorder("pictures", size=1e9, keep=50e9) as folder:
+            async with smartcam.frames.open(url) as source:
+                await folder.record(source)
+
+    Each camera has files of its own, such as ``left_20260102T030405.678Z.mcap``. A full, slow or
+    missing disk costs pictures, which are counted and told in the files; when it is better, the
+    recording goes on.
+
+    Args:
+        path: the folder; made if new.
+        size: bytes of a file, behind which the next one begins.
+        age: seconds of a file, behind which the next one begins.
+        keep: bytes of all files together; beyond them the oldest recordings are deleted.
+        on_trouble: called in the writer's thread with why nothing is written, and with None when
+            it is again.
+
+    Attributes:
+        path: as given.
+
+    Raises:
+        ConfigurationError: an argument is wrong.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        size: float = 1e9,
+        age: float = 3600.0,
+        keep: float = 10e9,
+        on_trouble: Callable[[RecordingError | None], None] = lambda _: None,
+    ) -> None:
+        self.path: Path = check_path(path, "path", "recordings")
+        size = check_number(size, "size", MIN_FILE_BYTES, MAX_FILE_BYTES, unit="bytes")
+        age = check_number(age, "age", 1.0, MAX_AGE, unit="seconds")
+        keep = check_number(keep, "keep", 2 * size, MAX_FILE_BYTES, unit="bytes")
+        check_callable(on_trouble, "on_trouble", "recordings")
+        self._limits = Limits(size, age, keep)
+        self._on_trouble = on_trouble
+        self._writer: FolderWriter | None = None
+        self._tracks: dict[str, Any] = {}
+
+    def open(self) -> Self:
+        """Enter the folder and start the thread that writes it.
+
+        Raises:
+            ConfigurationError: another recorder writes in the folder.
+            MissingExtraError: what packs the chunks is not installed.
+        """
+        if self._writer is not None:
+            raise ConfigurationError(f"recordings {self.path}: opened before; make a new recorder")
+        folder = RecordingFolder(self.path)
+        writer = FolderWriter(folder, self._limits, load_compress(), self._on_trouble)
+        writer.start()
+        self._writer = writer
+        return self
+
+    def close(self) -> None:
+        """Write what waits and end the files; idempotent. It waits for the disk, 30 s at most."""
+        if self._writer is not None:
+            self._writer.stop()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def accounts(self) -> dict[str, RecordingAccount]:
+        """Accounts of each camera's pictures: written, waiting and lost."""
+        return {} if self._writer is None else self._writer.accounts
+
+    @property
+    def trouble(self) -> RecordingError | None:
+        """Error for which nothing is written at the time; None where all is well."""
+        return None if self._writer is None else self._writer.trouble
+
+    @property
+    def has_room(self) -> bool:
+        """True if less than half of the pictures wait that may wait for the disk."""
+        return self._writer is None or self._writer.waiting < MAX_WAITING_PICTURE_BYTES // 2
+
+    def add_picture(self, frame: Frame, *, camera: str = "") -> bool:
+        """Keep a picture, or leave it out and count it where too much waits. Never waits.
+
+        Args:
+            frame: picture of a source of frames; its bytes are kept until they are written.
+            camera: name of the camera; default made of the frame's source by :func:`file_name`.
+
+        Returns:
+            True if the picture is kept.
+
+        Raises:
+            ConfigurationError: an argument is wrong.
+        """
+        check_kind(frame, Frame, "frame", "a Frame", "recordings")
+        camera = check_text(camera, "camera", "recordings", most=MAX_NAME)
+        if self._writer is None:
+            return False
+        name = camera or file_name(frame.source)
+        track = self._tracks.get(name)
+        if track is None:
+            known = FileName(name, datetime.now(UTC))
+            if FileName.parse(str(known)) is None:
+                raise ConfigurationError(
+                    f"recordings {self.path}: camera {name!r:.60}: expected a name of small "
+                    "letters, digits, _ and -, which the files have in theirs"
+                )
+            track = self._tracks[name] = self._writer.track(name, _itself)
+        size = memoryview(frame.data).nbytes
+        at = datetime.fromtimestamp(max(0.0, frame.utc), UTC)
+        return self._writer.put(
+            track, RecordedPicture(name, at, frame), size if size <= MAX_PICTURE_SIZE_BYTES else -1
+        )
+
+    async def record(
+        self,
+        source: FrameSource,
+        *,
+        camera: str = "",
+        count: int | None = None,
+        on_start: Callable[[], None] = lambda: None,
+    ) -> ReaderStatistics:
+        """Record every picture of a source, as :meth:`Recorder.record` does."""
+        return await record_frames(source, self, camera, count, on_start)
+
+    async def wait_failed(self) -> RecordingError:
+        """Wait without end: what a disk does ends no such recording.
+
+        Cancellation: safe.
+        """
+        never: asyncio.Future[RecordingError] = asyncio.get_running_loop().create_future()
+        return await never
+
+
+def file_name(name: str) -> str:
+    """Return the name that a source has in a recording: small letters, digits and hyphens."""
+    return re.sub(r"[^a-z0-9_]+", "-", name.lower()).strip("-")[:100] or "camera"
+
+
+def _itself(picture: RecordedPicture) -> Iterator[RecordedPicture]:
+    yield picture

@@ -1,0 +1,86 @@
+"""Record every picture of a source."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Protocol
+
+from smartcam._arguments import check_callable, check_integer, check_kind, check_text
+from smartcam.exceptions import SmartCamError
+from smartcam.frames import FrameSource
+from smartcam.frames._inside import FrameTap
+from smartcam.recording._mcap.form import MAX_NAME
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.exceptions import RecordingError
+    from smartcam.frames import Frame, ReaderStatistics
+
+
+class PictureRecorder(Protocol):
+    """Anything that pictures are recorded by: a file, a video, a folder of files."""
+
+    @property
+    def has_room(self) -> bool:
+        """True if a picture would not have to wait long for the disk."""
+        ...
+
+    def add_picture(self, frame: Frame, *, camera: str = "") -> bool:
+        """Keep a picture; return False where it is left out, and counted."""
+        ...
+
+    async def wait_failed(self) -> RecordingError:
+        """Wait until the recording fails and return why."""
+        ...
+
+
+async def record_frames(
+    source: FrameSource,
+    recorder: PictureRecorder,
+    camera: str,
+    count: int | None,
+    on_start: Callable[[], None],
+) -> ReaderStatistics:
+    """Record every picture of a source, as :meth:`Recorder.record` says."""
+    check_kind(source, FrameSource, "source", "a FrameSource", "recording")
+    if count is not None:
+        count = check_integer(count, "count", 1, 1 << 62, "recording")
+    check_callable(on_start, "on_start", "recording")
+    camera = check_text(camera, "camera", "recording", most=MAX_NAME)
+    _ = source.format  # it is open
+    kept = 0
+    refusals: list[SmartCamError] = []
+
+    def take(frame: Frame) -> bool:
+        nonlocal kept
+        try:
+            if kept == count or not recorder.add_picture(frame, camera=camera):
+                return False
+        except SmartCamError as exc:  # the driver, which calls, can do nothing about it
+            refusals.append(exc)
+            tap.close()
+            return False
+        kept += 1
+        if kept == 1:
+            on_start()
+        if kept == count:
+            tap.close()
+        return True
+
+    tap = FrameTap(source, take, lambda: not recorder.has_room)
+    ended = asyncio.ensure_future(tap.ended())
+    failed = asyncio.ensure_future(recorder.wait_failed())
+    try:
+        await asyncio.wait({ended, failed}, return_when=asyncio.FIRST_COMPLETED)
+        if failed.done():
+            raise failed.result()
+        await ended
+        if refusals:
+            raise refusals[0]
+    finally:
+        tap.close()
+        ended.cancel()
+        failed.cancel()
+        await asyncio.wait({ended, failed})
+    return tap.statistics()

@@ -1,0 +1,1 @@
+"""Emulate a recorded camera: what it sends at which time."""
