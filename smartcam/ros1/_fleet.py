@@ -6,16 +6,14 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Any
 
-from smartcam.fleet._ros import RosFleet
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import RosFleet, ZenohEnd
 from smartcam.ros1._link import checked_url
 from smartcam.ros1._rosbridge import RosbridgeNode
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from smartcam.fleet._address import FleetAddress
-    from smartcam.fleet._ros_file import RosSection
+    from smartcam.fleet._inside import FleetAddress, RosSection
 
 TIMEOUT = 10.0
 """Seconds for coming to the fleet, and for the first answer of a bridge."""
@@ -26,9 +24,9 @@ class RosbridgeFleet(RosFleet):
 
     Args:
         bridge: the URL of the rosbridge.
-        on_change: is told which node's bridge has come or is gone.
-        *given: what :class:`RosFleet` takes.
-        **said: what :class:`RosFleet` takes.
+        on_change: function called with the node whose bridge has come or gone.
+        *given: arguments of :class:`RosFleet`.
+        **said: arguments of :class:`RosFleet` by name.
     """
 
     def __init__(
@@ -72,10 +70,10 @@ async def bridged(
 
     Args:
         bridge: the URL of the rosbridge.
-        on_change: is told which node's bridge has come or is gone.
-        address: the fleet's.
-        section: how the cameras are seen.
-        **said: what :class:`RosFleet` takes of single cameras.
+        on_change: function called with the node whose bridge has come or gone.
+        address: address of the fleet.
+        section: settings of the nodes of the cameras.
+        **said: arguments of :class:`RosFleet` about single cameras.
 
     Raises:
         ConfigurationError: the URL cannot be.

@@ -16,8 +16,8 @@ from smartcam.exceptions import RosMessageError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.ros2._type_definitions import MessageField
-    from smartcam.ros2._types import MessageType
+    from smartcam.ros2 import MessageType
+    from smartcam.ros2._inside import MessageField
 
 Part: TypeAlias = "str | Raw"
 
@@ -43,7 +43,7 @@ _ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
     "float32": (int, float),
     "float64": (int, float),
 }
-"""What a value of JSON may be; integers where nothing is said."""
+"""Types that a value of JSON may have, by the field's type; all others are integers."""
 
 _BYTES: Final = ("uint8", "char")
 _MARK: Final = secrets.token_hex(12)
@@ -63,7 +63,7 @@ class Raw:
         return (len(self.data) + 2) // 3 * 4
 
     def chunks(self) -> list[memoryview]:
-        """Return it in parts that take a moment each."""
+        """Return the bytes in parts that take a moment each."""
         return [self.data[start : start + _CHUNK] for start in range(0, len(self.data), _CHUNK)]
 
 
@@ -112,11 +112,11 @@ def _signed(value: int) -> int:
 
 
 def from_json(kind: MessageType, said: Any) -> Any:
-    """Return the message that JSON says; what is not said is zero.
+    """Return the message that JSON holds; fields that are not in it are zero.
 
     Args:
-        kind: its type.
-        said: an object, or an array of its first fields' values in order.
+        kind: type of the message.
+        said: object of the fields, or array of the first fields' values in order.
 
     Raises:
         RosMessageError: a field that the type has not, or a value that does not fit.

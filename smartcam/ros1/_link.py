@@ -11,7 +11,9 @@ import socket
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 
-from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam._extras import load
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -41,7 +43,7 @@ LARGEST = 8 << 20
 
 
 class LinkListener(Protocol):
-    """What hears of a link."""
+    """The listener to a link."""
 
     def came(self) -> None:
         """Hear that there is a bridge: say what is to be advertised."""
@@ -71,18 +73,18 @@ def checked_url(url: str) -> str:
 
 
 def _aiohttp() -> Any:
-    try:
-        import aiohttp
-    except ImportError as exc:
-        raise MissingExtraError(
-            'a rosbridge needs aiohttp: pip install "smartcam[web]"', extra="web"
-        ) from exc
-    return aiohttp
+    return load("aiohttp", "a rosbridge needs")
 
 
 def link_errors() -> tuple[type[Exception], ...]:
-    """Return what a link that cannot be had, or breaks, raises."""
+    """Return the errors that a link raises where it cannot be made, or breaks."""
     return OSError, TimeoutError, _aiohttp().ClientError
+
+
+async def _refuse_redirect(_session: object, _context: object, sent: Any) -> None:
+    """Go nowhere else: a bridge is where its URL says; aiohttp would follow to any place."""
+    location = sent.response.headers.get("Location", "")
+    raise ConnectionError(f"expected a WebSocket, got a redirect to {location!r:.200}")
 
 
 @contextlib.asynccontextmanager
@@ -94,7 +96,9 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
     """
     aiohttp = _aiohttp()
     timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE)
-    async with aiohttp.ClientSession() as session:
+    watching = aiohttp.TraceConfig()
+    watching.on_request_redirect.append(_refuse_redirect)
+    async with aiohttp.ClientSession(trace_configs=[watching]) as session:
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
                 web = await session.ws_connect(
@@ -137,11 +141,11 @@ class BridgeLink:
     """A link that :meth:`run` keeps.
 
     Attributes:
-        url: the bridge's.
-        outbox: what is sent.
+        url: URL of the bridge.
+        outbox: operations and messages to send.
         connected: whether there is a bridge now.
-        failure: why there is none; "" where nothing has been tried.
-        changed: is notified of each change of these.
+        failure: reason why there is no bridge; "" where nothing has been tried.
+        changed: condition that is notified of each change of ``connected`` and ``failure``.
     """
 
     def __init__(self, url: str, outbox: Outbox, listener: LinkListener, backoff: Backoff) -> None:
@@ -200,7 +204,7 @@ class BridgeLink:
             self.changed.notify_all()
 
     async def _tell_lost(self, reason: str) -> bool:
-        """Say that there is no link; return whether there was one."""
+        """Log that there is no link; return True if there was one."""
         told_before = self.failure
         was = await self.end(f"{self.url}: {reason}")
         level = logging.DEBUG if told_before == self.failure else logging.WARNING
@@ -208,7 +212,7 @@ class BridgeLink:
         return was
 
     async def end(self, failure: str = "") -> bool:
-        """Have no link, and nothing left that was for it; return whether there was one."""
+        """End the link and forget what was to be sent by it; return True if there was a link."""
         was = self.connected
         await self._set(connected=False, failure=failure)
         self.outbox.clear()
@@ -247,7 +251,9 @@ class BridgeLink:
         if isinstance(operation, dict) and isinstance(operation.get("op"), str):
             try:
                 self._listener.heard(operation)
-            except Exception:
+            except ENDS_PROGRAM:
+                raise
+            except BaseException:
                 logger.exception("%s ! %.200r", self.url, operation)  # the link goes on
         else:
             logger.warning("%s: expected an operation of rosbridge, got %.80r", self.url, text)

@@ -1,4 +1,4 @@
-"""What waits to be sent to a rosbridge: bounded, and where there is no room the newest wins."""
+"""Queue what is to be sent to a rosbridge: bounded, and where there is no room the newest wins."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from smartcam.ros1._json_messages import Part
 
-MOST_OPERATIONS = 256
-"""That wait before nothing more is read of the bridge."""
-MOST_BYTES = 32 << 20
-"""That the messages of a topic may have together while they wait."""
+MAX_WAITING_OPERATIONS = 256
+"""Operations that wait before nothing more is read from the bridge."""
+MAX_WAITING_BYTES = 32 << 20
+"""Bytes that the waiting messages of one topic may have together; one message may have more."""
 
 
 class Lane:
@@ -47,7 +47,7 @@ class Lane:
         self._waiting.append(parts)
         self.waiting_bytes += sum(map(len, parts))
         while len(self._waiting) > self._depth or (
-            self.waiting_bytes > MOST_BYTES and len(self._waiting) > 1
+            self.waiting_bytes > MAX_WAITING_BYTES and len(self._waiting) > 1
         ):
             self.take()
             self.dropped += 1
@@ -85,19 +85,19 @@ class Outbox:
         """Have an operation wait."""
         self._operations.append(parts)
         self.wake()
-        if len(self._operations) >= MOST_OPERATIONS:
+        if len(self._operations) >= MAX_WAITING_OPERATIONS:
             self._room.clear()
 
     def add(self, lane: Lane) -> None:
-        """Send what waits there, too."""
+        """Send the messages of a lane, too."""
         self._lanes.append(lane)
 
     def remove(self, lane: Lane) -> None:
-        """Send no more of it."""
+        """Send no more messages of a lane."""
         self._lanes.remove(lane)
 
     def wake(self) -> None:
-        """Say that something waits."""
+        """Note that something waits to be sent."""
         self._ready.set()
         self._flushed.clear()
 
@@ -111,7 +111,7 @@ class Outbox:
 
     @property
     def full(self) -> bool:
-        """Whether more operations wait than should."""
+        """True if more operations wait than should."""
         return not self._room.is_set()
 
     async def room(self) -> None:
@@ -123,7 +123,7 @@ class Outbox:
         await self._flushed.wait()
 
     async def take(self) -> tuple[Part, ...]:
-        """Return what is next, wait for it."""
+        """Return the next operation or message, and wait until there is one."""
         while True:
             if self._operations:
                 self._room.set()

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.ros1._rosbridge import RosbridgeNode
-    from smartcam.ros2._qos import QoS
-    from smartcam.ros2._types import MessageType
+    from smartcam.ros2 import MessageType, QoS
 
 
 class RosbridgePublisher:
@@ -21,10 +20,10 @@ class RosbridgePublisher:
 
     Attributes:
         name: the topic's absolute name.
-        type: of the messages.
-        lane: what waits to be sent.
+        type: type of the messages.
+        lane: messages that wait to be sent.
         exists: whether ROS 1 has the type.
-        subscribed: whether anybody hears it, as far as is known.
+        subscribed: whether anybody hears the topic, as far as is known.
     """
 
     def __init__(self, node: RosbridgeNode, name: str, kind: MessageType, qos: QoS) -> None:
@@ -47,7 +46,7 @@ class RosbridgePublisher:
 
     @property
     def heard(self) -> bool:
-        """Whether a message goes anywhere: the bridge is there, and nothing says that nobody hears.
+        """True if a message may be heard: the bridge is there, and nothing says that nobody hears.
 
         Of a topic with long messages it is asked every two seconds, where rosapi answers, as it
         does beside most bridges.
@@ -98,6 +97,6 @@ class RosbridgePublisher:
         self.close()
 
     def advertisement(self) -> dict[str, Any]:
-        """Return how a bridge is told."""
+        """Return the operation that tells a bridge of the topic."""
         told = {"op": "advertise", "topic": self.name, "type": ros1_name(self.type.name)}
         return {**told, "latch": self.lane.latched}

@@ -1,4 +1,4 @@
-"""A node of ROS 1 behind a rosbridge: it publishes topics and serves services."""
+"""A node of ROS 1 behind a rosbridge: it publishes and hears topics, and serves services."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING, Any
 
-from smartcam._server import Server
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.backoff import Backoff
-from smartcam.exceptions import ConfigurationError, RosError
+from smartcam.exceptions import ConfigurationError
 from smartcam.ros1._json_messages import encoded
 from smartcam.ros1._link import BridgeLink
 from smartcam.ros1._outbox import Outbox
@@ -17,9 +17,9 @@ from smartcam.ros1._publishing import RosbridgePublisher
 from smartcam.ros1._retiring import KNOWN, question, retire
 from smartcam.ros1._serving import CLOSE_TIMEOUT, RosbridgeService
 from smartcam.ros1._subscribers import listen_for_subscribers
-from smartcam.ros2._names import check_namespace, check_node, full_name, resolve
-from smartcam.ros2._qos import DEFAULT, SERVICES, QoS
-from smartcam.ros2._types import RosTypes
+from smartcam.ros1._subscribing import RosbridgeSubscription
+from smartcam.ros2 import QoS, RosTypes
+from smartcam.ros2._inside import DEFAULT, HANDLER_TIMEOUT, SERVICES, NamedNode
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
-HANDLER_TIMEOUT = 600.0
-"""Seconds that a service's handler may take."""
 FLUSH = 1.0
 """Seconds at the end for what waits to be sent."""
 ASK_TIMEOUT = 5.0
@@ -40,7 +38,7 @@ REPEAT = 10.0
 _LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.INFO}
 
 
-class RosbridgeNode(Server):
+class RosbridgeNode(NamedNode):
     """A node of ROS 1 in asyncio, over a rosbridge; ``async with`` opens and closes it.
 
     Opening it does not wait for the bridge: it is tried until it is there, and again when it is
@@ -52,13 +50,13 @@ class RosbridgeNode(Server):
     machine has not the package, is in the bridge's log alone.
 
     Args:
-        name: letters, digits and ``_``.
-        namespace: such as ``/line1``.
+        name: name of the node, of letters, digits and ``_``.
+        namespace: namespace of the node, such as ``/line1``.
         bridge: the bridge's URL, ``ws://host:9090``.
         types: the messages and services that are known; None for those of Jazzy. What ROS 1 has not
             is left out where it is published or served, and told in the log.
-        backoff: when a bridge is tried again; None for :class:`smartcam.Backoff` as it is.
-        on_change: is told that the bridge has come or is gone; it is called in the loop.
+        backoff: delays between tries to reach a bridge; None: those of :class:`smartcam.Backoff`.
+        on_change: function called in the event loop when the bridge has come or gone.
 
     Raises:
         ConfigurationError: a name or the URL cannot be.
@@ -77,14 +75,14 @@ class RosbridgeNode(Server):
         backoff: Backoff | None = None,
         on_change: Callable[[RosbridgeNode], None] = lambda _node: None,
     ) -> None:
-        self.name: str = check_node(name)
-        self.namespace: str = check_namespace(namespace)
+        super().__init__(name, namespace)
         self.types: RosTypes = types or RosTypes()
         self._on_change = on_change
         self._outbox = Outbox()
         self._link = BridgeLink(bridge, self._outbox, self, backoff or Backoff())
         self._publishers: dict[str, RosbridgePublisher] = {}
         self._services: dict[str, RosbridgeService] = {}
+        self._subscriptions: list[RosbridgeSubscription] = []
         self._running: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
         self._new: list[RosbridgeService] = []  # that are to be advertised
@@ -93,23 +91,24 @@ class RosbridgeNode(Server):
         self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {
             "call_service": self._called,
+            "publish": self._published,
             "status": self._told,
             "service_response": self._answered,
         }
 
     @property
-    def full_name(self) -> str:
-        """Such as ``/line1/cam3``."""
-        return full_name(self.namespace, self.name)
+    def is_open(self) -> bool:
+        """True from ``start()`` until ``stop()``, whether the bridge is there or not."""
+        return self._running is not None
 
     @property
     def connected(self) -> bool:
-        """Whether the bridge is there."""
+        """True while the bridge is there."""
         return self._link.connected
 
     @property
     def failure(self) -> str:
-        """Why the bridge is not there; "" where it is, or has not been tried."""
+        """Reason for which the bridge is not there; "" where it is, or has not been tried."""
         return self._link.failure
 
     async def wait_connected(self, timeout: float | None = None) -> None:
@@ -147,6 +146,8 @@ class RosbridgeNode(Server):
             running.cancel()
             await asyncio.wait((running,))
             await self._link.end()
+            for subscription in [*self._subscriptions]:
+                subscription.close()
             self._publishers.clear()
             self._services.clear()
             self._leaving.clear()
@@ -169,18 +170,38 @@ class RosbridgeNode(Server):
         Args:
             topic: absolute, relative to the namespace, or private (``~/it``).
             type: such as ``std_msgs/msg/String``.
-            qos: of it, ``depth`` counts, for messages that wait for the bridge, and ``latched``.
+            qos: quality of service, of which ``depth``, for messages that wait for the bridge, and
+                ``latched`` count.
 
         Raises:
             ConfigurationError: the topic cannot be, is there already, or there is no such type.
             RosError: the node is not open.
         """
-        kind, name = self.types.message(type), self._resolved(topic, "topic", self._publishers)
+        kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
         publisher = self._publishers[name] = RosbridgePublisher(self, name, kind, qos)
         if self._told_absent(publisher.exists, name, kind.name):
             self._outbox.add(publisher.lane)
             self.say(encoded(publisher.advertisement()))
         return publisher
+
+    def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosbridgeSubscription:
+        """Hear a topic.
+
+        Args:
+            topic: name of the topic, as of :meth:`publisher`.
+            type: such as ``std_msgs/msg/String``.
+            qos: quality of service, of which ``depth`` counts, for messages that wait for a reader.
+
+        Raises:
+            ConfigurationError: the topic cannot be, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind, name = self.types.message(type), self._resolved(topic, "topic")
+        heard = RosbridgeSubscription(self, name, kind, qos)
+        if self._told_absent(heard.exists, name, kind.name):
+            self._subscriptions.append(heard)
+            heard.ask()
+        return heard
 
     def serve(
         self,
@@ -191,14 +212,15 @@ class RosbridgeNode(Server):
         qos: QoS = SERVICES,
         timeout: float = HANDLER_TIMEOUT,
     ) -> RosbridgeService:
-        """Serve.
+        """Serve a service.
 
         Args:
-            service: its name, as of a topic.
-            type: such as ``std_srvs/srv/Trigger``.
-            handler: is awaited with each request, and returns the response, or a mapping of its
-                fields. The text of an error becomes the response's field ``error``, ``message`` or
-                ``status_message``; where it has none of these the call fails at its caller.
+            service: name of the service, resolved as that of a topic.
+            type: type of the service, such as ``std_srvs/srv/Trigger``.
+            handler: coroutine function that takes each request and returns the response, or a
+                mapping of its fields. The text of an error becomes the response's field ``error``,
+                ``message`` or ``status_message``; where the response has none of these fields, the
+                call fails at its caller.
             qos: has no meaning in ROS 1.
             timeout: seconds that the handler may take.
 
@@ -206,7 +228,7 @@ class RosbridgeNode(Server):
             ConfigurationError: the name cannot be, is there already, or there is no such type.
             RosError: the node is not open.
         """
-        kind, name = self.types.service(type), self._resolved(service, "service", self._services)
+        kind, name = self.types.service(type), self._new_name(service, "service", self._services)
         served = RosbridgeService(self, name, kind, handler, timeout)
         self._services[name] = served
         if self._told_absent(served.exists, name, kind.name):
@@ -214,10 +236,8 @@ class RosbridgeNode(Server):
             self._change()
         return served
 
-    def _resolved(self, name: str, what: str, there: dict[str, Any]) -> str:
-        full = resolve(name, self.namespace, self.name, what)
-        if self._running is None:
-            raise RosError(f"{self.full_name}: the node is not open")
+    def _new_name(self, name: str, what: str, there: dict[str, Any]) -> str:
+        full = self._resolved(name, what)
         if full in there:
             raise ConfigurationError(f"{self.full_name}: the {what} {full} is there already")
         return full
@@ -230,7 +250,7 @@ class RosbridgeNode(Server):
     # ------------------------------------------------------------------ for its parts
 
     def has(self, end: RosbridgePublisher | RosbridgeService) -> bool:
-        """Whether it is not closed."""
+        """Return True if the end is not closed."""
         return end in (self._publishers.get(end.name), self._services.get(end.name))
 
     def forget(self, end: RosbridgePublisher | RosbridgeService) -> None:
@@ -249,6 +269,12 @@ class RosbridgeNode(Server):
             self._leaving.append(end)
             self._change()
 
+    def forget_subscription(self, heard: RosbridgeSubscription) -> None:
+        """Hear no more of it."""
+        if heard in self._subscriptions:
+            self._subscriptions.remove(heard)
+            heard.leave()
+
     def renew(self, service: RosbridgeService) -> None:
         """Withdraw a service and advertise it again: its calls fail at their callers."""
         service.end_turn()
@@ -262,7 +288,7 @@ class RosbridgeNode(Server):
             self._outbox.say(parts)
 
     def wake(self) -> None:
-        """A message waits to be sent."""
+        """Wake the task that sends: a message waits."""
         self._outbox.wake()
 
     def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
@@ -281,6 +307,8 @@ class RosbridgeNode(Server):
             if publisher.exists:
                 self.say(encoded(publisher.advertisement()))
                 publisher.lane.say_again()
+        for subscription in self._subscriptions:
+            subscription.ask()
         self.begin(self._repeat_shared())
         self.begin(listen_for_subscribers(self, self._publishers))
         self._new = [one for one in self._services.values() if one.exists]
@@ -289,7 +317,9 @@ class RosbridgeNode(Server):
     def _tell_change(self) -> None:
         try:
             self._on_change(self)
-        except Exception:
+        except ENDS_PROGRAM:
+            raise
+        except BaseException:
             logger.exception("%s ! who was to be told of the bridge", self.full_name)
 
     async def _repeat_shared(self) -> None:
@@ -382,6 +412,11 @@ class RosbridgeNode(Server):
             self.say(encoded(refusal))
         elif service.ready:  # or it is a call that the bridge aborts
             service.call(identity, operation.get("args"))
+
+    def _published(self, operation: dict[str, Any]) -> None:
+        for subscription in self._subscriptions:
+            if subscription.name == operation.get("topic"):
+                subscription.take(operation.get("msg"))
 
     def _told(self, operation: dict[str, Any]) -> None:
         level = _LEVELS.get(str(operation.get("level")), logging.DEBUG)

@@ -6,6 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any
 
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import RosError, SmartCamError
 from smartcam.ros1._json_messages import encoded, from_json, ros1_name, to_json
 
@@ -15,11 +16,11 @@ if TYPE_CHECKING:
 
     from smartcam.ros1._json_messages import Part
     from smartcam.ros1._rosbridge import RosbridgeNode
-    from smartcam.ros2._types import MessageType, ServiceType
+    from smartcam.ros2 import MessageType, ServiceType
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
-MOST_CALLS = 64
+MAX_CONCURRENT_CALLS = 64
 """Calls of a service that are carried out at the same time; one beyond is refused."""
 SETTLE = 0.5
 """Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
@@ -34,11 +35,11 @@ class RosbridgeService:
     """Serves; made by :meth:`RosbridgeNode.serve`.
 
     Attributes:
-        name: its absolute name.
-        type: of requests and responses.
-        ready: whether it is advertised to the bridge that is there.
+        name: absolute name of the service.
+        type: type of requests and responses.
+        ready: whether the service is advertised to the present bridge.
         calls: calls that came.
-        failed: those that were refused, or failed.
+        failed: calls that were refused, or failed.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class RosbridgeService:
     def call(self, identity: object, said: object) -> None:
         """Carry out a call. What it waits for ends where the bridge goes."""
         self.calls += 1
-        busy = len(self._tasks) >= MOST_CALLS
+        busy = len(self._tasks) >= MAX_CONCURRENT_CALLS
         task = self._node.begin(self._carry_out(identity, said, busy=busy))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -118,7 +119,11 @@ class RosbridgeService:
             self._refuse(turn, identity, str(exc))
         except TimeoutError:
             self._refuse(turn, identity, f"no answer in {self._timeout:g} s")
-        except Exception as exc:
+        except asyncio.CancelledError:
+            raise
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:
             logger.exception("%s ! its handler failed", self.name)
             self._refuse(turn, identity, f"{type(exc).__name__}: {exc}")
         else:
@@ -126,7 +131,7 @@ class RosbridgeService:
 
     async def _response(self, identity: object, said: object, *, busy: bool) -> tuple[Part, ...]:
         if busy:
-            raise RosError(f"{MOST_CALLS} calls of it are under way, which is the most")
+            raise RosError(f"{MAX_CONCURRENT_CALLS} calls of it are under way, which is the most")
         request = from_json(self.type.request, {} if said is None else said)
         async with asyncio.timeout(self._timeout):
             response = await self._handler(request)

@@ -1,4 +1,4 @@
-"""Who hears a topic with long messages: the bridge sends on what comes, whether anybody does."""
+"""Find out who hears a topic with long messages, since a bridge sends on whatever comes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from smartcam.ros1._rosbridge import RosbridgeNode
 
 SERVICE: Final = "/rosapi/subscribers"
-"""Of the node that rosbridge's launch file starts beside the bridge."""
+"""Service of the node ``rosapi``, which rosbridge's launch file starts beside the bridge."""
 PERIOD = 2.0
 """Seconds between two questions."""
 LONG: Final = frozenset(

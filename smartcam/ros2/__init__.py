@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
-    from smartcam.ros2._cloud_messages import cloud_from
-    from smartcam.ros2._context import RosContext
-    from smartcam.ros2._depth_topics import DepthTopics
-    from smartcam.ros2._graph import RosGraph
-    from smartcam.ros2._image_messages import frame_from, pixels_from
-    from smartcam.ros2._node import Node
-    from smartcam.ros2._parameter_client import ParameterClient
-    from smartcam.ros2._parameters import RosParameters
-    from smartcam.ros2._qos import QoS
-    from smartcam.ros2._services import RosClient, RosService
-    from smartcam.ros2._topics import RosPublisher, RosSubscription
-    from smartcam.ros2._types import MessageType, RosTypes, ServiceType
+    from smartcam.ros2._cameras.cloud_messages import cloud_from
+    from smartcam.ros2._cameras.depth_topics import DepthTopics
+    from smartcam.ros2._cameras.image_messages import frame_from, pixels_from
+    from smartcam.ros2._cameras.node import CameraNode, CameraNodeOptions
+    from smartcam.ros2._node.context import RosContext
+    from smartcam.ros2._node.graph import RosGraph
+    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.parameter_client import ParameterClient
+    from smartcam.ros2._node.parameters import RosParameters
+    from smartcam.ros2._node.qos import QoS
+    from smartcam.ros2._node.services import RosClient, RosService
+    from smartcam.ros2._node.topics import RosPublisher, RosSubscription
+    from smartcam.ros2._types.types import MessageType, RosTypes, ServiceType
 
 __all__ = [
     "CameraNode",
@@ -51,18 +51,18 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_camera_node": "CameraNode CameraNodeOptions",
-            "_cloud_messages": "cloud_from",
-            "_context": "RosContext",
-            "_depth_topics": "DepthTopics",
-            "_graph": "RosGraph",
-            "_image_messages": "frame_from pixels_from",
-            "_node": "Node",
-            "_parameter_client": "ParameterClient",
-            "_parameters": "RosParameters",
-            "_qos": "QoS",
-            "_services": "RosClient RosService",
-            "_topics": "RosPublisher RosSubscription",
-            "_types": "MessageType RosTypes ServiceType",
+            "_cameras.cloud_messages": "cloud_from",
+            "_cameras.depth_topics": "DepthTopics",
+            "_cameras.image_messages": "frame_from pixels_from",
+            "_cameras.node": "CameraNode CameraNodeOptions",
+            "_node.context": "RosContext",
+            "_node.graph": "RosGraph",
+            "_node.node": "Node",
+            "_node.parameter_client": "ParameterClient",
+            "_node.parameters": "RosParameters",
+            "_node.qos": "QoS",
+            "_node.services": "RosClient RosService",
+            "_node.topics": "RosPublisher RosSubscription",
+            "_types.types": "MessageType RosTypes ServiceType",
         },
     )

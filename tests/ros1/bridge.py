@@ -42,6 +42,7 @@ class Bridge(Server):
         topics: the last advertisement of each.
         published: operations ``publish``.
         services: by name.
+        heard: operations ``subscribe`` under way, by their ids.
         reading: cleared, nothing is read.
         rosapi: what is said of a topic's subscribers.
         late: what the first link, a slow one, hears when a service has been withdrawn.
@@ -54,6 +55,7 @@ class Bridge(Server):
         self.published: list[dict[str, Any]] = []
         self.services: dict[str, Served] = {}
         self.responses: dict[str, dict[str, Any]] = {}
+        self.heard: dict[str, dict[str, Any]] = {}
         self.late: dict[str, Any] | None = None
         self.rosapi: Any = lambda _arguments: None
         self.changed = asyncio.Condition()
@@ -133,6 +135,13 @@ class Bridge(Server):
         with contextlib.suppress(ConnectionError):
             await self.links[0].send_str(text)
 
+    async def publish(self, topic: str, message: dict[str, Any]) -> None:
+        """Publish a message of ROS to the links that have subscribed to the topic."""
+        links = {one["link"] for one in self.heard.values() if one["topic"] == topic}
+        for link in links:
+            with contextlib.suppress(ConnectionError):
+                await link.send_str(json.dumps({"op": "publish", "topic": topic, "msg": message}))
+
     async def _serve(self, request: web.Request) -> web.WebSocketResponse:
         link = web.WebSocketResponse(max_msg_size=0)
         await link.prepare(request)
@@ -158,6 +167,12 @@ class Bridge(Server):
             await hear(link, said)
         where = self.published if said["op"] == "publish" else self.said
         await self._change(where.append, said)
+
+    async def _subscribe(self, link: web.WebSocketResponse, said: dict[str, Any]) -> None:
+        self.heard[said["id"]] = {**said, "link": link}
+
+    async def _unsubscribe(self, _: web.WebSocketResponse, said: dict[str, Any]) -> None:
+        self.heard.pop(said["id"], None)
 
     async def _advertise(self, _link: web.WebSocketResponse, said: dict[str, Any]) -> None:
         self.topics[said["topic"]] = said

@@ -22,6 +22,7 @@ GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 services: dict[str, Any] = {}
 publishers: dict[str, Any] = {}
+subscribers: dict[str, Any] = {}
 responses: dict[str, Any] = {}
 changed = threading.Condition()
 
@@ -165,6 +166,19 @@ class Link(socketserver.StreamRequestHandler):
     def on_publish(self, said: Any) -> Any:
         publisher, _ = publishers[said["topic"]]
         publisher.publish(filled(publisher.data_class(), said["msg"]))
+
+    def on_subscribe(self, said: Any) -> Any:
+        make = roslib.message.get_message_class(said["type"])
+
+        def say(message: Any) -> None:
+            self.send({"op": "publish", "topic": said["topic"], "msg": said_of(message)})
+
+        subscribers[said["id"]] = rospy.Subscriber(said["topic"], make, say)
+
+    def on_unsubscribe(self, said: Any) -> Any:
+        there = subscribers.pop(said["id"], None)
+        if there is not None:
+            there.unregister()
 
     def on_advertise_service(self, said: Any) -> Any:
         there = services.pop(said["service"], None)

@@ -27,6 +27,7 @@ PYTHON = "/usr/bin/python3"
 MASTER, BRIDGE, PROXY = 11311, 9090, 9091
 MESSAGES = ROOT / "ros2" / "smartcam_msgs"
 FLEET = """\
+calibrations: calibrations
 cameras:
   line1/cam3: {emulated: {}, application: 7, interpret_as: localizations}
   cam4: {emulated: {}, application: 7, interpret_as: localizations}
@@ -46,9 +47,26 @@ def generate(folder: Path) -> None:
         (package / "__init__.py").touch()
         program = [PYTHON, f"/usr/lib/genpy/gen{kind}_py.py", "-p", "smartcam_msgs"]
         target = ["-o", str(package / kind)]
-        files = [str(one) for one in (MESSAGES / kind).iterdir()]
+        # what has pictures wants sensor_msgs, which need not be there
+        files = [
+            str(one)
+            for one in (MESSAGES / kind).iterdir()
+            if "sensor_msgs/" not in one.read_text(encoding="utf-8")
+        ]
         for more in ([*include, *target, *files], [*target, "--initpy"]):
             subprocess.run([*program, *more], check=True, capture_output=True)  # noqa: S603
+
+
+def generate_transforms(folder: Path) -> None:
+    """Have Debian's genpy make Python of tf2_msgs/TFMessage, which is in a package of its own."""
+    source, package = folder / "TFMessage.msg", folder / "tf2_msgs"
+    source.write_text("geometry_msgs/TransformStamped[] transforms\n")
+    (package / "msg").mkdir(parents=True)
+    (package / "__init__.py").touch()
+    program = [PYTHON, "/usr/lib/genpy/genmsg_py.py", "-p", "tf2_msgs", "-o", str(package / "msg")]
+    include = [f"-I{one}:/usr/share/{one}/msg" for one in ("std_msgs", "geometry_msgs")]
+    for more in ([*include, str(source)], ["--initpy"]):
+        subprocess.run([*program, *more], check=True, capture_output=True)  # noqa: S603
 
 
 class Program:
@@ -265,11 +283,13 @@ async def cameras(peer: Program) -> dict[str, Any]:
     }
     while not poses.done():  # who subscribes takes a moment
         await peer.ask("sure", f"{camera}/trigger", TRIGGER, {})
+    found["calibrated"] = await peer.ask("calibrate", camera, "table")
     return {**found, "poses": await poses, "graph": await _graph(peer)}
 
 
 async def main(folder: Path, command: list[str]) -> dict[str, Any]:
     generate(folder)
+    generate_transforms(folder)
     (folder / "fleet.yaml").write_text(FLEET)
     more = [str(folder), os.environ.get("PYTHONPATH", "")]
     ros = {"ROS_MASTER_URI": f"http://127.0.0.1:{MASTER}", "ROS_IP": "127.0.0.1"}
@@ -301,6 +321,7 @@ async def main(folder: Path, command: list[str]) -> dict[str, Any]:
             await node.stop()
             ours.process.send_signal(signal.SIGINT)
             found["code"] = await ours.process.wait()
+            found["files"] = sorted(one.name for one in (folder / "calibrations").iterdir())
             found["left"] = (await peer.ask("state"))["services"]
     return found
 

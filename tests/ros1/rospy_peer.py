@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 import sys
 import threading
 import time
@@ -33,7 +34,14 @@ def proxy(service: Any, kind: Any, **options: Any) -> Any:
 
 
 def call(service: Any, kind: Any, fields: Any) -> Any:
-    return said_of(proxy(service, kind)(**fields))
+    """Call; again where rospy finds no such service, which is so while it is being advertised."""
+    end = time.monotonic() + 30
+    while True:
+        try:
+            return said_of(proxy(service, kind)(**fields))
+        except rospy.ServiceException as error:
+            if not str(error).endswith("unavailable") or time.monotonic() > end:
+                raise
 
 
 def sure(service: Any, kind: Any, fields: Any) -> Any:
@@ -73,7 +81,68 @@ def own(service: Any, kind: Any) -> Any:
     rospy.Service(service, make, lambda _: make._response_class())
 
 
+class Tip:
+    """A robot on ``/tf``, whose tip somebody moves."""
+
+    def __init__(self) -> None:
+        make = roslib.message.get_message_class("tf2_msgs/TFMessage")
+        publisher = rospy.Publisher("/tf", make, queue_size=10)
+        stamped = roslib.message.get_message_class("geometry_msgs/TransformStamped")
+        self.place, self.going = (0.0, 0.0, 0.0), True
+
+        def say() -> None:
+            while self.going:
+                one = stamped()
+                one.header.stamp = rospy.Time.now()
+                one.header.frame_id, one.child_frame_id = "base", "tip"
+                moved, turned = one.transform.translation, one.transform.rotation
+                moved.x, moved.y, moved.z = self.place
+                turned.x = 1.0  # the tool points down
+                publisher.publish(make([one]))
+                time.sleep(0.02)
+
+        threading.Thread(target=say, daemon=True).start()
+
+
+def calibrate(camera: Any, name: Any) -> Any:
+    """Drive the thesis' services to the end of a plane, with a table one metre from the base."""
+    kind = "smartcam_msgs/PerformCurrentAndGetNextStep"
+    said = {"topic_image2": "SMARTCAMERA", "tf_frame_robot_tcp": "tip", "fixed_camera": "True"}
+    tip, titles, more = Tip(), [], {}
+    errors = [sure(f"{camera}/StartCalibration", "smartcam_msgs/StartCalibration", said)["error"]]
+    step = sure(f"{camera}/PerformCurrentAndGetNextStep", kind, {})
+    while step["button_text"]:
+        titles.append(step["header_text"])
+        given = {
+            "value_inputs": step["default_needed_values"],
+            "text_inputs": step["default_needed_strings"],
+            "option_inputs": [one.split()[0] for one in step["default_needed_options"]],
+        }
+        if titles == ["Calibration"]:
+            given["text_inputs"] = [name]
+        if step["header_text"] == "What came out":
+            given["option_inputs"] = ["accept"]
+        seen = re.search(r"at x (-?[0-9.]+) mm, y (-?[0-9.]+) mm", step["description_text"])
+        if seen and step["header_text"].startswith("Touch mark"):
+            x, y = (float(one) / 1000 for one in seen.groups())
+            tip.place = (x + 1.0, y, 0.5)
+            time.sleep(0.3)
+        step = call(f"{camera}/PerformCurrentAndGetNextStep", kind, given)
+        errors.append(step["error"])
+    tip.going = False
+    asked = {"x": 0.05, "y": 0.02}
+    more["pose"] = call(f"{camera}/TransformPixelPose", "smartcam_msgs/TransformPixelPose", asked)
+    target = {"calibration_name": name, "target_path": "copy.json"}
+    more["exported"] = call(
+        f"{camera}/ExportCalibration", "smartcam_msgs/ExportCalibration", target
+    )
+    bad = {"calibration_name_or_path": "../fleet"}
+    more["refused"] = call(f"{camera}/LoadCalibration", "smartcam_msgs/LoadCalibration", bad)
+    return {"titles": titles, "errors": errors, "text": step["description_text"], **more}
+
+
 DO: dict[str, Any] = {
+    "calibrate": calibrate,
     "call": call,
     "sure": sure,
     "get": get,

@@ -12,10 +12,9 @@ import pytest
 import smartcam
 import smartcam.fleet
 from smartcam.fleet import FleetFile
-from smartcam.fleet._address import FleetAddress
-from smartcam.fleet._ros_file import RosSection
+from smartcam.fleet._inside import FleetAddress, RosSection
 from smartcam.ros1 import RosbridgeNode
-from smartcam.ros1._fleet import bridged
+from smartcam.ros1._inside import bridged
 from tests.cli.commandline import closed_port, run
 from tests.processes import Process, free_place
 from tests.ros1.bridge import Bridge
@@ -24,6 +23,7 @@ from tests.ros2.roskit import PATIENCE
 EMULATED = {"emulated": {}, "application": 7, "interpret_as": "localizations"}
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 async def test_a_fleet_is_seen_and_used_from_ros1() -> None:
     place = free_place()

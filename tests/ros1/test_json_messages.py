@@ -12,7 +12,7 @@ import pytest
 
 from smartcam.exceptions import RosMessageError
 from smartcam.ros1._json_messages import Raw, encoded, from_json, ros1_name, to_json
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2 import RosTypes
 
 TYPES = RosTypes()
 HEADER = {"seq": 0, "stamp": {"secs": 3, "nsecs": 4}, "frame_id": "cam3"}

@@ -16,6 +16,7 @@ import smartcam
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError
 from smartcam.ros1 import RosbridgeNode, _link, _outbox, _serving
 from smartcam.ros2 import QoS
+from tests.fleet.fleetkit import until
 from tests.ros1.bridge import Bridge, Gone
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ async def test_newest_pictures_win_over_a_bridge_that_does_not_read(
 async def test_a_topic_has_so_many_bytes(
     bridge: Bridge, node: RosbridgeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_outbox, "MOST_BYTES", 3000)
+    monkeypatch.setattr(_outbox, "MAX_WAITING_BYTES", 3000)
     publisher = node.publisher("~/image_raw", IMAGE, qos=QoS(depth=100))
     for number in range(5):
         publisher.publish(height=number, data=bytes(900))
@@ -465,7 +466,7 @@ async def test_a_handler_that_does_not_end_answers_nobody_afterwards(
 async def test_too_many_calls(
     bridge: Bridge, node: RosbridgeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_serving, "MOST_CALLS", 3)
+    monkeypatch.setattr(_serving, "MAX_CONCURRENT_CALLS", 3)
     node.serve("~/trigger", TRIGGER, never)
     calls = [asyncio.create_task(bridge.call("/line1/cam3/trigger")) for _ in range(4)]
     response = await calls[3]
@@ -660,7 +661,7 @@ async def test_a_message_that_is_too_long(bridge: Bridge, node: RosbridgeNode) -
 async def test_answers_to_a_bridge_that_does_not_read_have_a_bound(
     bridge: Bridge, node: RosbridgeNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(_outbox, "MOST_OPERATIONS", 8)
+    monkeypatch.setattr(_outbox, "MAX_WAITING_OPERATIONS", 8)
     service = node.serve("~/trigger", TRIGGER, yes)
     await bridge.until(lambda: bridge.services)
     publisher = node.publisher("~/image_raw", IMAGE)
@@ -748,3 +749,54 @@ async def test_stop_can_be_cancelled(bridge: Bridge, delay: float) -> None:
         node.serve("~/trigger", TRIGGER, yes)
         await bridge.another("/line1/cam3/trigger", before)
         assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
+
+
+# ---------------------------------------------------------------------- what is heard
+
+
+async def test_a_topic_is_heard_also_from_another_bridge(
+    bridge: Bridge, node: RosbridgeNode
+) -> None:
+    heard = node.subscribe("text", STRING, qos=QoS(depth=2))
+    await bridge.until(lambda: bridge.heard)
+    (asked,) = bridge.heard.values()
+    assert (asked["topic"], asked["type"], asked["queue_length"]) == (
+        *("/line1/text", "std_msgs/String"),
+        2,
+    )
+    await bridge.publish("/line1/text", {"data": "one"})
+    assert (await anext(heard)).data == "one"
+    bridge.heard.clear()
+    await bridge.restart()
+    await bridge.until(lambda: bridge.heard)
+    await bridge.publish("/line1/text", {"data": "two"})
+    assert (await anext(heard)).data == "two"
+    heard.close()
+    await bridge.until(lambda: not bridge.heard)
+    heard.close()
+    assert [one async for one in heard] == []
+
+
+async def test_newest_messages_wait_and_wrong_ones_are_left_out(
+    bridge: Bridge, node: RosbridgeNode
+) -> None:
+    heard, other = (node.subscribe("text", STRING, qos=QoS(depth=3)) for _ in range(2))
+    await bridge.until(lambda: len(bridge.heard) == 2)
+    for said in ({"data": "old"}, {"data": 1}, {"date": ""}, {"data": "new"}):
+        await bridge.publish("/line1/text", said)
+    await until(lambda: other.statistics().offered == 4)
+    assert (await anext(heard)).data == "new"
+    assert (heard.rejected, heard.statistics().dropped) == (2, 1)
+    assert (await anext(other)).data == "new"
+
+
+async def test_what_ros1_has_not_is_not_asked_for(bridge: Bridge, node: RosbridgeNode) -> None:
+    heard = node.subscribe("found", "vision_msgs/msg/Detection3DArray")
+    assert not heard.exists
+    heard.close()
+    with pytest.raises(ConfigurationError):
+        node.subscribe("no topic", STRING)
+    await node.stop()
+    with pytest.raises(RosError, match="the node is not open"):
+        node.subscribe("text", STRING)
+    assert not bridge.heard

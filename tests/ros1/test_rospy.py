@@ -111,6 +111,25 @@ def test_cameras(seen: dict[str, Any]) -> None:
     assert not [one for one in (*graph["topics"], *graph["services"]) if one.endswith(absent)]
 
 
+def test_a_front_end_in_rospy_calibrates_a_plane(seen: dict[str, Any]) -> None:
+    done = seen["cameras"]["calibrated"]
+    assert set(done["errors"]) == {""}
+    titles = done["titles"]
+    assert titles[:3] == ["Calibration", "Camera, robot and tool", "Marks in the camera's field"]
+    assert [one for one in titles if one.startswith("Touch mark")][-1] == "Touch mark 7 of 7"
+    assert titles[-2:] == ["What came out", "Save table"]
+    assert "table.json" in done["text"]
+    pose = done["pose"]["pose"]
+    assert (done["pose"]["error"], pose["header"]["frame_id"]) == ("", "base")
+    place = pose["pose"]["position"]
+    assert abs(place["x"] - 1.05) < 1e-3
+    assert abs(place["y"] - 0.02) < 1e-3
+    assert abs(place["z"] - 0.5) < 1e-3
+    assert done["exported"] == {"error": ""}
+    assert "cannot be used" in done["refused"]["error"]
+    assert {"table.json", "table.journal", "exports"} <= {*seen["files"]}
+
+
 def test_bridges_come_and_go(seen: dict[str, Any]) -> None:
     before, after = seen["lines"][:2], seen["lines"][2:]
     assert [one["node"] for one in before] == ["/cam4", "/line1/cam3"]

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+import asyncio
+import contextlib
+import importlib.util
+from collections.abc import AsyncIterator, Awaitable, Callable
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+from smartcam._ros_names import full_name, resolve
 from smartcam.emulator import Application, EmulatedCamera, Run
 from smartcam.emulator._application import LOCALIZATIONS
 from smartcam.exceptions import ConfigurationError, RosError
-from smartcam.ros2._names import full_name, resolve
-from smartcam.ros2._qos import QoS
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2 import QoS, RosTypes
+from smartcam.ros2._inside import NativeContext, NativeNode
+from tests.ros2.roskit import DOMAIN, NO_RCLPY
+from tests.timed_loop import TimedLoop
 
 PARTS, TEXTS, RUNNING, BROKEN, PIXELS, BOTH = 1, 2, 3, 4, 5, 6
 """Applications of :class:`PartsCamera`."""
@@ -94,7 +101,7 @@ class PaperNode:
         made = self.publishers[name] = PaperPublisher(self, name, type, qos)
         return made
 
-    def serve(self, service: str, type: str, handler: Any) -> Any:
+    def serve(self, service: str, type: str, handler: Any, *, timeout: float = 0.0) -> Any:
         name = resolve(service, self.namespace, self.name, "service")
         self.handlers[name] = (self.types.service(type), handler)
         return SimpleNamespace(close=lambda: self.handlers.pop(name))
@@ -108,6 +115,62 @@ class PaperNode:
         kind, handler = self.handlers[f"{self.full_name}/{service}"]
         request = kind.request.decode(kind.request.encode(fields))
         return kind.response.decode(kind.response.encode(await handler(request)))
+
+
+class HeardNode(PaperNode):
+    """Node through rclpy: another node calls, and published messages are kept, too."""
+
+    def __init__(self, here: NativeNode, there: NativeNode) -> None:
+        super().__init__()
+        self.here, self.there = here, there
+
+    def publisher(self, topic: str, type: str, *, qos: QoS) -> PaperPublisher:
+        made = super().publisher(topic, type, qos=qos)
+        end = self.here.publisher(topic, type, qos=qos)
+        noted, closed = made.publish, made.close
+
+        def publish(message: Any) -> None:
+            noted(message)
+            end.publish(message)
+
+        def close() -> None:
+            closed()
+            end.close()
+
+        made.publish, made.close = publish, close  # type: ignore[method-assign]
+        return made
+
+    def serve(self, service: str, type: str, handler: Any, *, timeout: float = 600.0) -> Any:
+        return self.here.serve(service, type, handler, timeout=timeout)
+
+    async def call(self, service: str, **fields: Any) -> Any:
+        """Call a service from the other node."""
+        name = f"{self.full_name}/{service}"
+        kinds = self.here.graph.services()
+        while name not in kinds:
+            await asyncio.sleep(0.02)
+            kinds = self.here.graph.services()
+        client = self.there.client(name, kinds[name][0])
+        try:
+            return await client.call(fields, timeout=60)
+        finally:
+            client.close()
+
+
+@contextlib.asynccontextmanager
+async def paper_or_rclpy() -> AsyncIterator[PaperNode]:
+    """Give a node on paper, or on asyncio's own loop one through rclpy."""
+    if isinstance(asyncio.get_running_loop(), TimedLoop):
+        yield PaperNode()
+        return
+    if importlib.util.find_spec("rclpy") is None:
+        pytest.skip(NO_RCLPY)
+    context = NativeContext(domain=DOMAIN)
+    async with (
+        NativeNode("cam3", namespace="/line1", context=context, managed=False) as here,
+        NativeNode("viewer", context=context, managed=False) as there,
+    ):
+        yield HeardNode(here, there)
 
 
 class Life:

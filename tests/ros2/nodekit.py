@@ -10,8 +10,7 @@ import smartcam
 from smartcam.backoff import Backoff
 from smartcam.emulator import Application, EmulatedCamera
 from smartcam.exceptions import RosError
-from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2 import CameraNode, CameraNodeOptions, RosTypes
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable

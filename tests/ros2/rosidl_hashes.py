@@ -16,7 +16,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-NEEDED = ("builtin_interfaces", "service_msgs", "std_msgs", "geometry_msgs")
+NEEDED = ("builtin_interfaces", "service_msgs", "std_msgs", "geometry_msgs", "sensor_msgs")
 PARTS = ("rosidl_adapter", "rosidl_parser", "rosidl_generator_type_description", "rosidl_cli")
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import CommandRejectedError, RosError, SmartCamError
-from smartcam.ros2._lifecycle import PRIVATE, STATES, TRANSITIONS, Lifecycle
+from smartcam.ros2._node.lifecycle import PRIVATE, STATES, TRANSITIONS, Lifecycle
 from tests.ros2.nodekit import COUNTER, OTHER, TYPES, NotedNode, away, box, seen, until
 
 WAYS = {

@@ -9,11 +9,15 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam.ros2._camera_node import CameraNode, CameraNodeOptions
-from smartcam.ros2._camera_status import ERROR, OK, STALE, WARN, status_fields
-from smartcam.ros2._qos import LATCHED
+from smartcam import Status
+from smartcam.ros2 import CameraNode, CameraNodeOptions, RosTypes
+from smartcam.ros2._inside import LATCHED, OK, WARN, KnownState, health, status_fields
 from tests.ros2.nodekit import COUNTER, NAME, OTHER, NotedNode, Seen, away, box, seen, until
 from tests.timed_loop import spend
+
+NO_SESSION = "there was no session yet"
+ERROR, STALE = 2, 3
+"""Levels of ``diagnostic_msgs/msg/DiagnosticStatus``."""
 
 DIAGNOSTICS, STATUS = "/diagnostics", "~/status"
 
@@ -287,7 +291,7 @@ async def test_what_cannot_be_said_is_said_later(caplog: pytest.LogCaptureFixtur
         one.box.inject({"kind": "condition", "condition": "overheat"})
         await asyncio.sleep(2.0)
         assert _statuses(one)[-1].error == ""
-        assert "was not said" in caplog.text
+        assert "status was not published" in caplog.text
         for topic in one.node.topics.values():
             topic.fails = False
         await asyncio.sleep(1.1)
@@ -310,9 +314,35 @@ async def test_no_password_is_said() -> None:
         assert "secret" not in text
 
 
+@pytest.mark.parametrize(
+    ("known", "said"),
+    [
+        (KnownState("cam", connected=True), (False, 0, "", OK, "connected")),
+        (KnownState("cam", True, Status.RUNNING, -1), (True, 0, "", OK, "ready")),
+        (KnownState("cam", True, Status.RUNNING, 7), (True, 7, "", OK, "ready")),
+        (KnownState("cam", True, Status.RUNNING | Status.BUSY, 7), (False, 7, "", OK, "busy")),
+        (KnownState("cam", why="gone"), (False, 0, "gone", ERROR, "gone")),
+        (
+            KnownState("cam"),
+            (False, 0, "there was no session yet", ERROR, "there was no session yet"),
+        ),
+        (KnownState("cam", False, Status.RUNNING, 7, "\0"), (False, 0, "\ufffd", ERROR, "\0")),
+    ],
+)
+def test_state_that_is_known_is_said_in_one_way(known: KnownState, said: tuple[Any, ...]) -> None:
+    fields, how, message = (
+        status_fields(known),
+        health(known),
+        RosTypes().message("smartcam_msgs/msg/CameraStatus"),
+    )
+    got = message.decode(message.encode(fields))
+    assert (got.ready, got.application_id, got.error, how.level, how.text) == said
+    assert health(known, heard=False).level == (how.level if known.connected else STALE)
+
+
 async def test_unknown_bits_are_kept() -> None:
     async with seen() as one:
-        fields = status_fields(one.camera)
+        fields = status_fields(KnownState.of(one.camera))
         message = one.node.topics[STATUS].type
         fields["status"] |= 1 << 63
         assert message.decode(message.encode(fields)).status == 0x280 | 1 << 63

@@ -13,10 +13,12 @@ import pytest
 from smartcam.calibration import CameraModel
 from smartcam.depth import Cloud, DepthFrame
 from smartcam.exceptions import ConfigurationError, FrameTimeoutError
-from smartcam.ros2._cloud_messages import cloud_from
-from smartcam.ros2._depth_topics import TOPICS, DepthTopics
-from smartcam.ros2._image_messages import frame_from, pixels_from
+from smartcam.geometry import Transform
+from smartcam.ros2 import DepthTopics, cloud_from, frame_from, pixels_from
+from smartcam.ros2._cameras.depth_topics import TOPICS
+from smartcam.ros2._inside import LATCHED
 from tests.ros2.roskit import soon, two_nodes, until
+from tests.ros2.tfkit import TransformTree
 
 pytestmark = pytest.mark.real_time
 
@@ -133,6 +135,30 @@ async def test_a_pair_of_the_callers_stays_open_and_clouds_may_be_dense() -> Non
         assert (cloud.height, cloud.width, cloud.is_dense) == (1, 23, True)
         await topics.close()
         assert (pair.opened, pair.closed) == (0, 0)
+
+
+async def test_tf_finds_the_cloud_from_base_link() -> None:
+    pair: Any = Pair()
+    tilt = Transform.from_quaternion("rect", "l", (0, 0, 0), (np.sin(0.05), 0, 0, np.cos(0.05)))
+    pair.rotation = tilt.rotation
+    place = Transform.from_quaternion("flange", "l", (0.1, 0, 0.05), (0, 0, 0.6, 0.8))
+    tree = TransformTree()
+    tree.put("base_link", "tool0", (0.5, 0.2, 0.7), (1, 0, 0, 0))
+    async with two_nodes() as (here, there):
+        topics = DepthTopics(lambda: pair, here, place=place, parent_frame="tool0")
+        topics.start()
+        clouds = there.subscribe("/line1/cam3/points2", TOPICS["points2"])
+        frames = there.subscribe("/tf_static", "tf2_msgs/msg/TFMessage", qos=LATCHED)
+        await until(lambda: pair.opened)
+        pair.frames.put_nowait(depth_frame())
+        cloud = await soon(anext(clouds))
+        tree.hear(await soon(anext(frames)))
+        found = tree.lookup("base_link", cloud.header.frame_id)
+        robot = tree.lookup("base_link", "tool0")
+        seen = np.array([[0.1, 0.2, 1.0]])
+        wanted = robot.apply(place.apply(tilt.inverse().apply(seen)))
+        assert np.allclose(found.apply(seen), wanted)
+        await topics.close()
 
 
 async def test_closing_in_the_middle_closes_the_cameras() -> None:

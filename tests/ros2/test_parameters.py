@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
-from smartcam.ros2 import Node
-from smartcam.ros2._parameter_values import decode_value, encode_value, typed
-from smartcam.ros2._parameters import RosParameters
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2 import Node, RosParameters, RosTypes
+from smartcam.ros2._node.parameter_values import decode_value, encode_value, typed
 
 PATIENCE = 10.0
 INT64 = (1 << 63) - 1

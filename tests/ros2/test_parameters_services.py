@@ -18,7 +18,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.ros2 import Node, RosContext
-from smartcam.ros2._qos import PARAMETERS
+from smartcam.ros2._node.qos import PARAMETERS
 from tests.processes import free_place
 from tests.ros2.roskit import STRING, soon, two_nodes, until
 
@@ -210,13 +210,22 @@ async def test_ten_thousand_names(shared: tuple[Node, Node]) -> None:
     here, there = shared
     names = ["a"] * MANY
     for service in ("get_parameters", "get_parameter_types", "describe_parameters"):
-        with pytest.raises(ServiceCallError, match="10000 names: expected 1024 at most"):
-            await call(there, service, names=names)
-    with pytest.raises(ServiceCallError, match="10000 names"):
-        await call(there, "list_parameters", prefixes=names)
-    for service in ("set_parameters", "set_parameters_atomically"):
-        with pytest.raises(ServiceCallError, match="10000 names"):
-            await call(there, service, parameters=[integer("a", 5)] * MANY)
+        reply = await call(there, service, names=names)
+        (found,) = (
+            getattr(reply, field.name)
+            for field in there.types.service(SERVICES[service]).response.fields
+        )
+        assert len(found) == 0
+    assert (await call(there, "list_parameters", prefixes=names)).result.names == []
+    many = [integer("a", 5)] * MANY
+    results = (await call(there, "set_parameters", parameters=many)).results
+    assert len(results) == MANY
+    for one in (
+        *results,
+        (await call(there, "set_parameters_atomically", parameters=many)).result,
+    ):
+        assert not one.successful
+        assert "10000 names: expected 1024 at most" in one.reason
     assert here.parameters.get("a") == 0
     assert len((await call(there, "get_parameters", names=names[:1024])).values) == 1024
 
@@ -231,8 +240,8 @@ async def test_text_with_nul(shared: tuple[Node, Node]) -> None:
         client.type = _Patched(  # type: ignore[assignment]
             client.type, data.replace(b"sentinel", b"senti\0el")
         )
-        with pytest.raises(ServiceCallError, match="NUL"):
-            await client.call(timeout=60)
+        (found,) = (await client.call(timeout=60)).results
+        assert "NUL" in found.reason
     assert here.parameters.get("text") == "x"
 
 
@@ -415,6 +424,9 @@ async def test_types_are_described_as_they_are_hashed(nodes: tuple[Node, Node]) 
             }
         )
         assert f"RIHS01_{hashlib.sha256(text.encode()).hexdigest()}" == hashed
+        _check_sources(reply, name)
+        fields = {"type_name": name, "type_hash": hashed, "include_type_sources": False}
+        assert (await asks.call(fields, timeout=60)).type_sources == []
     unused = here.types.message("std_msgs/msg/Bool").hash
     for hashed, why in ((unused, "uses no type"), ("", "is no hash"), ("RIHS01_0", "is no hash")):
         reply = await asks.call(type_name=STRING, type_hash=hashed, timeout=60)
@@ -432,3 +444,14 @@ def _plain(said: Any) -> dict[str, Any]:
             for field in said.fields
         ],
     }
+
+
+def _check_sources(reply: Any, name: str) -> None:
+    """See that the sources are whole: their types have the hash that was asked for."""
+    said = reply.type_description
+    wanted = [one.type_name for one in (said.type_description, *said.referenced_type_descriptions)]
+    assert [one.type_name for one in reply.type_sources] == wanted
+    texts = {one.type_name: one.raw_file_contents for one in reply.type_sources}
+    kinds = {one.encoding for one in reply.type_sources}
+    assert kinds == ({"srv", "msg", "implicit"} if "/srv/" in name else {"msg"})
+    assert (texts[name] == "string data\n") == (name == STRING)

@@ -30,14 +30,13 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.frames import FrameSource, find_format
-from smartcam.ros2 import Node
-from smartcam.ros2 import _picture_stream as picture_stream
-from smartcam.ros2._camera_lens import as_path
-from smartcam.ros2._camera_pictures import CameraPictures
-from smartcam.ros2._image_messages import frame_from, header_fields
-from smartcam.ros2._lens_messages import lens_fields
-from smartcam.ros2._picture_requests import MOST_NAMESPACES
-from smartcam.ros2._qos import DRIVER, LATCHED
+from smartcam.ros2 import Node, frame_from
+from smartcam.ros2._cameras import picture_stream
+from smartcam.ros2._cameras.image_messages import header_fields
+from smartcam.ros2._cameras.lens import as_path
+from smartcam.ros2._cameras.lens_messages import lens_fields
+from smartcam.ros2._cameras.pictures import CameraPictures
+from smartcam.ros2._inside import DRIVER
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.processes import free_place
 from tests.ros2.roskit import soon, two_nodes, until
@@ -48,7 +47,7 @@ IMAGE = "sensor_msgs/msg/Image"
 INFO = "sensor_msgs/msg/CameraInfo"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 SET = "sensor_msgs/srv/SetCameraInfo"
-GET = "polled_camera/srv/GetPolledImage"
+GET = "smartcam_msgs/srv/RequestImage"
 CAM = "/line1/cam3"
 LENS = CameraModel(size=(4, 2), matrix=np.array([[5.0, 0, 1.5], [0, 6, 0.5], [0, 0, 1]]))
 
@@ -385,53 +384,28 @@ async def test_a_file_that_is_none_leaves_the_camera_uncalibrated(
 
 async def test_a_picture_on_request_is_exposed_after_it() -> None:
     async with pictures(camera_info=LENS) as (driver, _, _, there):
-        images = there.subscribe("/mine/image_raw", IMAGE, qos=LATCHED)
         client = there.client(f"{CAM}/request_image", GET)
-        asking = asyncio.create_task(client.call(response_namespace="/mine"))
+        asking = asyncio.create_task(client.call())
         await soon(driver.streams())
         driver.give(frame(1, captured=time.monotonic() - 100), frame(2, utc=7.25))
         reply = await soon(asking)
-        assert reply.success, reply.status_message
-        assert (reply.stamp.sec, reply.stamp.nanosec) == (7, 250_000_000)
-        image = await soon(anext(images))
-        assert (image.data[0], image.header.stamp) == (2, reply.stamp)
-        later = there.subscribe("/mine/camera_info", INFO, qos=LATCHED)
-        info = await soon(anext(later))
-        assert (info.header.stamp, info.k[0]) == (reply.stamp, 5.0)
+        assert reply.error == ""
+        image, info = reply.image, reply.camera_info
+        assert (image.header.stamp.sec, image.header.stamp.nanosec) == (7, 250_000_000)
+        assert image.data[0] == 2
+        assert (info.header, info.k[0]) == (image.header, 5.0)
         await soon(driver.rests())
-
-
-async def test_a_request_that_cannot_be_is_refused() -> None:
-    wrong: list[tuple[dict[str, Any], str]] = [
-        ({"binning_x": 2}, "bin"),
-        ({"roi": {"width": 2, "height": 1}}, "whole picture, 4x2"),
-        ({"roi": {"x_offset": 1}}, "whole picture"),
-        ({"response_namespace": "/a b"}, "a b"),
-        ({"timeout": {"sec": -1}}, "timeout"),
-    ]
-    async with pictures() as (driver, _, here, there):
-        client = there.client(f"{CAM}/request_image", GET)
-        for change, says in wrong:
-            asking = asyncio.create_task(client.call({"response_namespace": "/mine", **change}))
-            while not asking.done():
-                if driver.sink is not None:
-                    driver.give(frame(1))
-                await asyncio.sleep(0.01)
-            reply = await asking
-            assert not reply.success
-            assert says in reply.status_message
-        assert not here.graph.ends("/mine/image_raw", "MP")
 
 
 async def test_a_request_without_a_picture_ends_in_its_time() -> None:
     async with pictures() as (driver, _, _, there):
         client = there.client(f"{CAM}/request_image", GET)
-        reply = await client.call({"timeout": {"nanosec": 50_000_000}})
-        assert not reply.success
-        assert "in time" in reply.status_message
+        reply = await client.call({"timeout": 0.05})
+        assert "in time" in reply.error
+        for wrong in (-1.0, 61.0, float("nan")):
+            assert "timeout: expected 0 to 60" in (await client.call({"timeout": wrong})).error
         driver.fails["start"] = FrameSourceError("scripted: it is in use", source="scripted")
-        reply = await client.call(response_namespace="/mine")
-        assert "in use" in reply.status_message
+        assert "in use" in (await client.call()).error
 
 
 def bitmap(value: int) -> bytes:
@@ -474,22 +448,17 @@ async def test_of_a_camera_with_single_pictures_they_come_on_request(tmp_path: P
         shown.start()
         assert not here.graph.ends(f"{CAM}/image_raw", "MP")
         client = there.client(f"{CAM}/request_image", GET)
-        for number in range(MOST_NAMESPACES + 2):
+        for number in range(3):
             camera.file = bitmap(number)
-            reply = await client.call(response_namespace=f"/n{number}/")
-            assert reply.success, reply.status_message
-            images = there.subscribe(f"/n{number}/image_raw", IMAGE, qos=LATCHED)
-            assert bytes((await soon(anext(images))).data) == bytes([number]) * 8
-            images.close()
-        assert len(images_of(here)) == MOST_NAMESPACES
+            reply = await client.call()
+            assert (reply.error, bytes(reply.image.data)) == ("", bytes([number]) * 8)
         reply = await there.client(f"{CAM}/set_camera_info", SET).call(request())
         assert reply.success, reply.status_message
         camera.file = b"GIF89a"
-        assert "bitmap" in (await client.call(response_namespace="/a")).status_message
+        assert "bitmap" in (await client.call()).error
         camera.waits = True
-        assert "no answer" in (await client.call(response_namespace="/a")).status_message
+        assert "no answer" in (await client.call()).error
         await shown.close()
-        await until(lambda: not images_of(here))
 
 
 class Fleet(LastPicture):
@@ -523,8 +492,8 @@ async def test_a_camera_of_a_fleet_gives_jpegs_where_those_are_heard(
         small = there.subscribe(f"{CAM}/image_raw/compressed", COMPRESSED)
         assert (await soon(anext(small))).header.frame_id == "a"
         assert [(one["encoding"], one["quality"]) for one in camera.asked] == [("jpeg", 40)]
-        reply = await there.client(f"{CAM}/request_image", GET).call(response_namespace="/p")
-        assert reply.success, reply.status_message
+        reply = await there.client(f"{CAM}/request_image", GET).call()
+        assert reply.error == ""
         await shown.close()
         assert source.statistics().readers == 0
     assert not [one for one in caplog.records if one.levelno > logging.INFO]

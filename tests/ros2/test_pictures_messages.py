@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
+import struct
 import time
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from smartcam.calibration import CameraModel
 from smartcam.exceptions import CalibrationError, FrameFormatError, RosMessageError
 from smartcam.frames import Frame, Moment, find_format
-from smartcam.frames._pixels import PIXEL_FORMATS
-from smartcam.ros2._cloud_messages import cloud_fields, cloud_from, depth_fields, points_of
-from smartcam.ros2._image_messages import (
+from smartcam.frames._pixels.formats import PIXEL_FORMATS
+from smartcam.ros2 import RosTypes, cloud_from, frame_from, pixels_from
+from smartcam.ros2._cameras.cloud_messages import (
+    cloud_fields,
+    compressed_depth_fields,
+    depth_fields,
+    points_of,
+)
+from smartcam.ros2._cameras.image_messages import (
     ENCODINGS,
     array_fields,
     compressed_fields,
     compression,
-    frame_from,
     header_fields,
     image_fields,
-    pixels_from,
     prepared,
 )
-from smartcam.ros2._lens_messages import lens_fields, lens_from
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
 
 TYPES = RosTypes("jazzy")
 IMAGE = TYPES.message("sensor_msgs/msg/Image")
@@ -35,6 +40,7 @@ INFO = TYPES.message("sensor_msgs/msg/CameraInfo")
 CLOUD = TYPES.message("sensor_msgs/msg/PointCloud2")
 WIDTH, HEIGHT = 12, 6
 UTC = 1_700_000_000.25
+HEADER = header_fields(UTC, "cam")
 
 RAW = [one.name for one in PIXEL_FORMATS if not one.compressed]
 
@@ -181,7 +187,8 @@ def test_the_format_of_compressed_pictures(name: str, text: str) -> None:
 
 
 def test_compressed_pictures_are_read() -> None:
-    from smartcam.frames._pictures import decoded, to_jpeg, to_png
+    from smartcam.frames._codecs.pictures import to_png
+    from smartcam.frames._inside import decoded, to_jpeg
 
     grey = picture("Mono8")
     jpeg = to_jpeg(grey, 90)
@@ -336,3 +343,42 @@ def test_depth_in_millimetres_and_in_metres() -> None:
     metres = pixels_from(IMAGE.new(**depth_fields(depth, header)))
     assert np.isnan(metres[0, 0])
     assert np.array_equal(metres[0, 1:], depth[0, 1:])
+
+
+def decompressed(fields: dict[str, Any]) -> np.ndarray[Any, Any]:
+    """Return what compressed_depth_image_transport makes of a message (its ``codec.cpp``)."""
+    encoding, _, how = fields["format"].partition("; ")
+    assert how == "compressedDepth png"
+    kind, a, b = struct.unpack("<iff", fields["data"][:12])
+    png = np.frombuffer(fields["data"][12:], np.uint8)
+    values: np.ndarray[Any, Any] = np.asarray(cv2.imdecode(png, cv2.IMREAD_UNCHANGED))
+    assert kind == 0
+    assert values.dtype == np.uint16
+    if encoding == "16UC1":
+        return values
+    with np.errstate(divide="ignore", invalid="ignore"):
+        metres = np.float32(a) / (values.astype(np.float32) - np.float32(b))
+    return np.where(values > 0, metres, np.nan)
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.3, 2.0), (0.05, 60.0), (1.0, 1.0)])
+def test_compressed_depth_is_read_as_it_was(near: float, far: float) -> None:
+    rng = np.random.default_rng(1)
+    depth = rng.uniform(near, far, (20, 30)).astype(np.float32)
+    depth[0, 0], depth[0, 1] = near, far
+    depth[5:7, 3:9] = 0
+    fields = compressed_depth_fields(depth, HEADER)
+    assert COMPRESSED.new(**fields).header.frame_id == "cam"
+    found = decompressed(fields)
+    assert np.array_equal(np.isnan(found), depth == 0)
+    there = depth > 0
+    step = depth**2 * (1 / near - 1 / max(far, near * 1.001)) / 65534
+    assert (np.abs(found - depth)[there] <= 0.6 * step[there] + 1e-6 * depth[there]).all()
+    whole = decompressed(compressed_depth_fields(depth, HEADER, "16UC1"))
+    assert np.array_equal(whole, np.rint(depth * np.float32(1000)))
+
+
+def test_compressed_depth_of_nothing_is_nothing() -> None:
+    nothing = np.zeros((3, 4), np.float32)
+    assert np.isnan(decompressed(compressed_depth_fields(nothing, HEADER))).all()
+    assert not decompressed(compressed_depth_fields(nothing, HEADER, "16UC1")).any()

@@ -8,10 +8,7 @@ Their settings are those of ``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``, their en
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
 import queue
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -19,37 +16,13 @@ import zenoh
 import zenoh.ext
 
 from smartcam.ros2 import Node
-from smartcam.ros2._attachment import Attachment
-from smartcam.ros2._qos import LATCHED
-from smartcam.ros2._tokens import Entity
+from smartcam.ros2._inside import LATCHED
+from smartcam.ros2._node.attachment import Attachment
+from smartcam.ros2._node.tokens import Entity
 from tests.processes import free_place
-from tests.ros2.roskit import PATIENCE, STRING, TRIGGER, soon, until
+from tests.ros2.roskit import PATIENCE, STRING, TRIGGER, peer, soon, until
 
 pytestmark = pytest.mark.real_time
-
-
-@contextlib.contextmanager
-def peer(place: str) -> Iterator[Any]:
-    """Give a session of rmw_zenoh."""
-    config = zenoh.Config()
-    settings = {
-        "mode": "peer",
-        "connect/endpoints": [place],
-        "listen/endpoints": ["tcp/127.0.0.1:0"],
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": True,
-        "scouting/gossip/multihop": False,
-        "scouting/gossip/target": {"router": ["router", "peer"], "peer": ["router"]},
-        "timestamping/enabled": {"router": True, "peer": True, "client": True},
-        "queries_default_timeout": 600_000,
-    }
-    for path, value in settings.items():
-        config.insert_json5(path, json.dumps(value))
-    session = zenoh.open(config)
-    try:
-        yield session
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
 
 
 def entity(node: Node, kind: Any, session: Any, name: str, type: Any, qos: Any) -> Entity:

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from smartcam.exceptions import RosError
-from smartcam.ros2 import Node
-from smartcam.ros2._rosout import MOST_TEXT, MOST_WAITING, ROSOUT, RosOut
-from smartcam.ros2._topics import RosPublisher
+from smartcam.ros2 import Node, RosPublisher
+from smartcam.ros2._node.rosout import MAX_TEXT_CHARACTERS, MAX_WAITING_RECORDS, ROSOUT, RosOut
 from tests.processes import free_place
 from tests.ros2.roskit import soon, two_nodes, until
 
@@ -50,6 +49,9 @@ async def test_what_is_logged_is_published(pair: tuple[Node, Node], logger: logg
     below = logging.Logger("smartcam.rosout_test.below")  # noqa: LOG001
     below.parent = logger
     below.error("worse")
+    # A message that is published while the engine (1.10.2) asks for the earlier ones can make it
+    # leave those out: seen in 4 of 20 runs with its threads kept waiting. So both are out before.
+    await until(lambda: out._publisher is not None and out._publisher.published == 2)
     heard = there.subscribe("/rosout", LOG, qos=ROSOUT)  # late: it is latched
     first, second = await take(heard, 2)
     assert (first.level, first.name, first.msg) == (30, "line1.cam3", "3 of them")
@@ -104,7 +106,7 @@ async def test_text_that_is_none_and_what_is_wanted(
     first, second, third, fourth = await take(heard, 4)
     assert first.msg == "a\\0b \\udcff"
     assert second.msg.startswith("%d (TypeError")
-    assert third.msg == f"{'x' * MOST_TEXT} ..."
+    assert third.msg == f"{'x' * MAX_TEXT_CHARACTERS} ..."
     assert fourth.msg.startswith("it failed\nTraceback")
     assert fourth.msg.endswith("RosError: why")
     await out.close()
@@ -118,7 +120,7 @@ async def test_from_threads_without_waiting_or_end(
     out.start()
 
     def log(number: int) -> None:
-        for place in range(MOST_WAITING):
+        for place in range(MAX_WAITING_RECORDS):
             logger.warning("%d %d", number, place)
 
     threads = [threading.Thread(target=log, args=(number,)) for number in range(2)]
@@ -126,8 +128,8 @@ async def test_from_threads_without_waiting_or_end(
         thread.start()
     for thread in threads:
         thread.join()  # while the loop stands still: what finds no room is dropped
-    assert len(out._waiting) == MOST_WAITING
-    assert out.dropped == MOST_WAITING
+    assert len(out._waiting) == MAX_WAITING_RECORDS
+    assert out.dropped == MAX_WAITING_RECORDS
     logger.warning("the last")
     heard = there.subscribe("/rosout", LOG, qos=ROSOUT)
     await until(lambda: not out._waiting)

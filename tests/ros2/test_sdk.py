@@ -14,7 +14,7 @@ import pytest
 
 from smartcam.exceptions import ServiceCallError
 from smartcam.ros2 import Node, QoS
-from smartcam.ros2._qos import LATCHED
+from smartcam.ros2._inside import LATCHED
 from tests.processes import free_place
 from tests.ros2.roskit import PATIENCE, SET_BOOL, STRING, soon, until
 

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import logging
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from smartcam.calibration import Transform, fit_plane
-from smartcam.calibration._geometry.rotations import matrix_from_quaternion
+from smartcam.calibration import MovingCamera, Transform, chain_of, fit_plane
 from smartcam.exceptions import ConfigurationError
-from smartcam.ros2._qos import LATCHED
-from smartcam.ros2._transforms import StaticTransforms, camera_transforms, transform_fields
+from smartcam.geometry._inside import matrix_from_quaternion
+from smartcam.ros2._cameras.transforms import CameraFrames, StaticTransforms, transform_fields
+from smartcam.ros2._inside import LATCHED
+from tests.ros2.camerakit import PartsCamera
+from tests.ros2.nodekit import seen, until
 from tests.ros2.roskit import soon, two_nodes
+from tests.ros2.tfkit import TransformTree, has_tf2
 
 TF = "tf2_msgs/msg/TFMessage"
 
@@ -26,46 +28,128 @@ def turned(target: str, source: str, shift: tuple[float, float, float]) -> Trans
 
 
 @pytest.mark.parametrize(
-    ("pose", "parent", "named"),
-    [("base", "", "base"), ("flange", "", "flange"), ("flange", "tool0", "tool0")],
+    ("setup", "names", "named"),
+    [
+        ("eye-to-hand", {}, "of_the_robot"),
+        ("eye-to-hand", {"parent": "base_link", "flange": "tool0"}, "base_link"),
+        ("eye-in-hand", {"parent": "base_link"}, "of_the_robot"),
+        ("eye-in-hand", {"parent": "base_link", "flange": "tool0"}, "tool0"),
+    ],
 )
-def test_hand_eye_puts_the_camera_at_the_base_or_the_flange(
-    pose: str, parent: str, named: str
+def test_hand_eye_puts_the_pictures_at_the_base_or_the_flange(
+    setup: str, names: dict[str, Any], named: str
 ) -> None:
-    found = turned(pose, "camera", (0.1, 0.2, 0.3))
-    calibration = SimpleNamespace(kind="hand-eye", camera_pose=found)
-    (one,) = camera_transforms(calibration, "cam3_optical", parent=parent)
+    found = turned("of_the_robot", "camera", (0.1, 0.2, 0.3))
+    place = SimpleNamespace(setup=setup, camera_pose=found)
+    frames = CameraFrames("cam3", place=place, **names)
+    (one,) = frames.transforms()
     assert (one.target, one.source) == (named, "cam3_optical")
+    assert frames.optical == "cam3_optical"
     points = np.array([[0.0, 0, 1], [0.3, -0.2, 2]])
     assert np.allclose(one.apply(points), found.apply(points))
 
 
-def test_of_a_pair_the_right_camera_is_where_the_left_one_has_it() -> None:
-    shift = Transform("right", "left", np.eye(3), np.array([-0.12, 0, 0]))
-    calibration = SimpleNamespace(kind="stereo", transform=shift)
-    (one,) = camera_transforms(calibration, "head_optical")
-    assert (one.target, one.source) == ("head_optical", "head_right_optical")
-    assert one.translation.tolist() == pytest.approx([0.12, 0, 0])  # to the right of the left one
+SEEN = np.array([[0, 0], [0.1, 0], [0, 0.1], [0.1, 0.1], [0.05, 0.02]], float)
+TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+TOUCHED = np.column_stack([SEEN, np.zeros(5)]) @ TURN.T + [0.5, 0.1, 0.02]
+HIGHER = np.array([0, 0, 0.1])
 
 
 def test_a_plane_is_where_its_poses_are() -> None:
-    seen = np.array([[0, 0], [100, 0], [0, 100], [100, 100], [50, 20]], float)
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    touched = (np.column_stack([seen, np.zeros(5)]) / 1000) @ turn.T + [0.5, 0.1, 0.02]
-    calibration = fit_plane(seen, touched, model="similarity")
-    (one,) = camera_transforms(calibration, "cam3_optical")
-    assert (one.target, one.source) == ("robot", "cam3_optical_plane")
-    assert np.allclose(one.apply(np.array([[0.1, 0, 0]])), touched[1])
+    calibration = fit_plane(SEEN, TOUCHED, model="similarity")
+    (one,) = CameraFrames("cam_plane", calibration).transforms()
+    assert (one.target, one.source) == ("robot", "cam_plane")
+    assert np.allclose(one.apply(np.array([[0.1, 0, 0]])), TOUCHED[1])
+    (one,) = CameraFrames("cam_plane", calibration, parent="base_link").transforms()
+    assert (one.target, one.source) == ("base_link", "cam_plane")
 
 
-def test_what_says_nothing_of_a_place_gives_none(caplog: pytest.LogCaptureFixture) -> None:
-    seen = np.array([[0, 0], [100, 0], [0, 100], [100, 100], [50, 20]], float)
-    touched = np.column_stack([seen[:, 0] * 0.001, seen[:, 1] * 0.002, np.zeros(5)])
-    with caplog.at_level(logging.INFO, "smartcam.ros2"):
-        assert camera_transforms(fit_plane(seen, touched, model="affine"), "a") == []
-    assert "scale" in caplog.text
-    assert camera_transforms(None, "a") == []
-    assert camera_transforms(SimpleNamespace(kind="sheet"), "a") == []
+def test_each_application_has_a_plane() -> None:
+    given = {1: fit_plane(SEEN, TOUCHED), 2: None, 3: fit_plane(SEEN, TOUCHED + HIGHER)}
+    found = CameraFrames("cam", given).transforms()
+    assert [(one.target, one.source) for one in found] == [("robot", "cam_1"), ("robot", "cam_3")]
+    assert found[1].translation[2] - found[0].translation[2] == pytest.approx(0.1)
+
+
+def test_a_plane_of_two_scales_has_a_frame_too() -> None:
+    touched = np.column_stack([SEEN[:, 0], SEEN[:, 1] * 2, np.zeros(5)])
+    (one,) = CameraFrames("a", fit_plane(SEEN, touched, model="affine")).transforms()
+    assert (one.target, one.source) == ("robot", "a")
+    assert np.allclose(one.rotation, np.eye(3))
+    assert CameraFrames("a").transforms() == []
+    assert CameraFrames("a", SimpleNamespace(to_robot=list)).transforms() == []
+
+
+# ---------------------------------------------------------------------- what tf2 finds
+
+
+async def first_pose(**options: Any) -> tuple[Any, TransformTree]:
+    """Return the first poses of a camera with a calibration, and the frames that were heard."""
+    calibration = fit_plane(SEEN, TOUCHED, model="similarity")
+    client = {"interpret_as": "localizations", "calibration": calibration}
+    tree = TransformTree()
+    async with seen(PartsCamera(), client=client, frame_id="cam", **options) as found:
+        tree.hear(found.node.last("/tf_static"))
+        await until(lambda: found.seen.lifecycle.active)
+        await found.camera.trigger()
+        await until(lambda: found.node.topics["~/detections"].said)
+        poses = found.node.last("~/localizations")
+        for topic in ("~/detections", "~/results"):
+            assert found.node.last(topic).header.frame_id == poses.header.frame_id
+        texts = await found.node.services["~/TriggerLocalization"].call(camera_name="")
+        assert texts.localizations[0].pose.header.frame_id == poses.header.frame_id
+        return poses, tree
+
+
+def where(pose: Any) -> list[list[float]]:
+    return [[pose.position.x, pose.position.y, pose.position.z]]
+
+
+def test_lookups_of_these_tests_are_those_of_tf2_itself() -> None:
+    if not has_tf2():
+        pytest.skip("needs Debian's tf2: apt-get install python3-tf2 python3-rospy")
+    tree = TransformTree()  # which compares each of its lookups with tf2's
+    tree.put("base_link", "tool0", (0.5, 0.2, 0.7), (0.6, 0, 0, 0.8))
+    tree.put("tool0", "cam", (0.1, 0, 0.05), (0, 0, 0.6, 0.8))
+    tree.put("map", "table")
+    assert np.allclose(tree.lookup("tool0", "base_link").apply([[0.5, 0.2, 0.7]]), 0)
+    assert tree._by_tf2("base_link", "cam")["place"] == pytest.approx([0.6, 0.152, 0.714])
+    for target, source in (("base_link", "table"), ("base_link", "robot")):
+        with pytest.raises(LookupError):
+            tree.lookup(target, source)
+        assert "error" in tree._by_tf2(target, source)
+
+
+async def test_tf_finds_the_poses_of_a_plane_from_base_link() -> None:
+    poses, tree = await first_pose(parent_frame="base_link")
+    assert poses.header.frame_id == "base_link"
+    assert np.allclose(tree.lookup("base_link", poses.header.frame_id).translation, 0)
+    plane = tree.lookup("cam", poses.header.frame_id)
+    assert np.allclose(plane.apply(where(poses.poses[0])), [[0.001, -0.25, 0]])
+    poses, tree = await first_pose()
+    tree.lookup("robot", poses.header.frame_id)
+    with pytest.raises(LookupError):
+        tree.lookup("base_link", poses.header.frame_id)
+
+
+async def test_tf_finds_the_poses_of_a_camera_that_the_robot_carries() -> None:
+    turn = (0.0, 0.0, np.sin(0.2), np.cos(0.2))
+    calibrated_at = Transform.from_quaternion("robot", "flange", (0.4, 0.1, 0.6), turn)
+    poses, tree = await first_pose(
+        parent_frame="base_link", flange_frame="tool0", calibrated_at=calibrated_at
+    )
+    assert poses.header.frame_id == "cam_robot"
+    tree.put("base_link", "tool0", (0.4, 0.1, 0.6), turn)  # the robot as it was then
+    still = tree.lookup("base_link", poses.header.frame_id)
+    assert np.allclose(still.rotation, np.eye(3))
+    assert np.allclose(still.translation, 0)
+    now = Transform.from_quaternion("robot", "flange", (0.7, -0.1, 0.6), (0, 0, 0, 1))
+    tree.put("base_link", "tool0", (0.7, -0.1, 0.6))  # and somewhere else
+    calibration = fit_plane(SEEN, TOUCHED, model="similarity")
+    carried = MovingCamera(chain_of(calibration), calibrated_at, field=TOUCHED)
+    wanted = carried.now(now).transform([[0.001, -0.25]])
+    moved = tree.lookup("base_link", poses.header.frame_id)
+    assert np.allclose(moved.apply(where(poses.poses[0])), wanted)
 
 
 def test_a_quaternion_is_of_length_one() -> None:

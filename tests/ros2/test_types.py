@@ -11,9 +11,9 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from smartcam.exceptions import ConfigurationError, RosMessageError
-from smartcam.ros2._definitions import MESSAGES, SERVICES
-from smartcam.ros2._type_definitions import parse_message, parse_service
-from smartcam.ros2._types import RosTypes
+from smartcam.ros2 import RosTypes
+from smartcam.ros2._types.built_in import MESSAGES, SERVICES
+from smartcam.ros2._types.definitions import parse_message, parse_service
 
 DISTRIBUTIONS = ("humble", "jazzy", "kilted", "lyrical", "rolling")
 
@@ -175,8 +175,8 @@ BAD_TEXTS = {
     "uint8": "expected a type and a name",
     "float16 x": "float16 is no type",
     "wstring x": "wstring is not supported",
-    "int32[0] x": "an array of none",
-    "int32[<=] x": "expected how many",
+    "int32[0] x": "an array of 0 elements",
+    "int32[<=] x": "expected a number after <=",
     "int32<=3 x": "only a string is bounded",
     "int8 x 200": "200 is no int8",
     "int8[2] x [1]": "expected 2 values, got 1",
@@ -265,7 +265,7 @@ def test_threads_get_the_same_type() -> None:
 
 def test_only_what_is_asked_for_is_loaded() -> None:
     lines = (
-        "import sys; import smartcam.ros2._types as t; "
+        "import sys; import smartcam.ros2._types.types as t; "
         "assert 'rosbags' not in sys.modules; types = t.RosTypes('humble'); "
         "kind = types.message('std_msgs/msg/String'); kind.decode(kind.encode({'data': 'x'})); "
         "assert 'rosbags.typesys.stores.ros2_lyrical' not in sys.modules; "
@@ -291,3 +291,20 @@ def test_messages_are_compared_by_type_and_values() -> None:
         one.new().dta = 1
     with pytest.raises(RosMessageError, match="did you mean 'data'"):
         one.new(dta=1)
+
+
+@pytest.mark.parametrize("distribution", ["humble", "jazzy", "lyrical"])
+def test_a_source_gives_the_type_again(distribution: str) -> None:
+    types = RosTypes(distribution)
+    for name in types.names():
+        encoding, text = types.source(name)
+        assert encoding == name.split("/")[1]
+        if encoding == "srv":
+            service = types.service(name)
+            both = [types.definition(one.name) for one in (service.request, service.response)]
+            assert [*parse_service(name, text)] == both
+            assert types.source(service.request.name) == ("implicit", "")
+        else:
+            assert parse_message(name, text) == types.definition(name)
+    types.add("my_msgs/msg/Mine", "float64 x 0.5  # where\n")
+    assert types.source("my_msgs/msg/Mine") == ("msg", "float64 x 0.5  # where\n")

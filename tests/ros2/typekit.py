@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from smartcam.ros2._type_definitions import INTEGERS, NUMBERS, MessageField
+from smartcam.ros2._inside import MessageField
+from smartcam.ros2._types.definitions import INTEGERS, NUMBERS
 
 if TYPE_CHECKING:
     import random
 
-    from smartcam.ros2._types import MessageType, RosTypes
+    from smartcam.ros2 import MessageType, RosTypes
 
 ASCII = ("", "a", "camera", "x" * 17)
 WORDS = (*ASCII, "größe", "部品")

@@ -1,0 +1,1 @@
+"""Publish cameras as ROS 2 nodes: results, services, pictures and depth."""

@@ -1,0 +1,185 @@
+"""Publish what two cameras see: disparity, depth, a cloud, and the rectified lenses."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.geometry import Transform
+from smartcam.ros2._cameras.cloud_messages import (
+    cloud_fields,
+    compressed_depth_fields,
+    depth_fields,
+    disparity_fields,
+    points_of,
+)
+from smartcam.ros2._cameras.image_messages import array_fields, header_fields
+from smartcam.ros2._cameras.lens_messages import lens_fields
+from smartcam.ros2._cameras.picture_stream import HeardPictures, say_newest
+from smartcam.ros2._cameras.transforms import StaticTransforms
+from smartcam.ros2._node.qos import DRIVER
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from smartcam.calibration import HandEyeCalibration
+    from smartcam.depth import DepthFrame, StereoDepth
+
+TOPICS: Final = {
+    "disparity": "stereo_msgs/msg/DisparityImage",
+    "depth/image_rect": "sensor_msgs/msg/Image",
+    "depth/image_rect/compressedDepth": "sensor_msgs/msg/CompressedImage",
+    "depth/camera_info": "sensor_msgs/msg/CameraInfo",
+    "points2": "sensor_msgs/msg/PointCloud2",
+    "left/image_rect": "sensor_msgs/msg/Image",
+    "left/camera_info": "sensor_msgs/msg/CameraInfo",
+    "right/camera_info": "sensor_msgs/msg/CameraInfo",
+}
+"""Names, private to the node, and types; as those of ROS' ``stereo_image_proc``."""
+
+
+class DepthTopics:
+    """Publishes what two cameras see while somebody hears it, the newest pair only.
+
+    ::
+
+        topics = DepthTopics(lambda: StereoDepth(open(LEFT), open(RIGHT), calibration), node)
+
+    All messages of a pair have one stamp, when the left picture was captured, and one frame: that
+    of the left camera after rectification, z ahead and y down. With ``place`` it is on
+    ``/tf_static`` from the first pair on.
+
+    Args:
+        stereo: makes a :class:`smartcam.depth.StereoDepth`, not open, each time that somebody
+            begins to hear; or one that is open, which stays the caller's, and streams on.
+        node: open node of ROS.
+        frame_id: of the left camera after rectification; "": the node's name with
+            ``_left_optical``.
+        depth_encoding: ``32FC1``, metres, or ``16UC1``, millimetres.
+        place: where the left camera is: its hand-eye calibration, or a transform from the left
+            camera's frame; None: not known, and not said.
+        parent_frame: name of the frame that ``place`` puts the camera in; empty: its own name.
+        organized: whether clouds have a point for each pixel, NaN where there is none; else they
+            have those that there are.
+
+    Raises:
+        ConfigurationError: another encoding.
+    """
+
+    def __init__(
+        self,
+        stereo: StereoDepth | Callable[[], StereoDepth],
+        node: Any,
+        *,
+        frame_id: str = "",
+        depth_encoding: Literal["32FC1", "16UC1"] = "32FC1",
+        organized: bool = True,
+        place: HandEyeCalibration | Transform | None = None,
+        parent_frame: str = "",
+    ) -> None:
+        if depth_encoding not in {"32FC1", "16UC1"}:
+            raise ConfigurationError(
+                f"depth_encoding: expected 32FC1 or 16UC1, got {depth_encoding!r:.40}"
+            )
+        self._stereo, self._node = stereo, node
+        self.frame_id: str = frame_id or f"{node.name}_left_optical"
+        self._encoding, self._organized = depth_encoding, organized
+        known: Any = place
+        self._place: Transform | None = getattr(known, "camera_pose", known)
+        self._parent = parent_frame
+        self._transforms = StaticTransforms(node)
+        self._nearest = 0.0
+        self._publishers: dict[str, Any] = {}
+        self._stream: HeardPictures[DepthFrame] | None = None
+        self._thread: ThreadPoolExecutor | None = None
+
+    def start(self) -> None:
+        """Have the topics; the cameras stream when somebody hears."""
+        if self._stream is not None:
+            return
+        for name, kind in TOPICS.items():
+            self._publishers[name] = self._node.publisher(f"~/{name}", kind, qos=DRIVER)
+        self._thread = ThreadPoolExecutor(1, "smartcam-ros2-depth")
+        publishers = list(self._publishers.values())
+        self._stream = HeardPictures(self._node.full_name, publishers, self._read, self._publish)
+        self._stream.start()
+
+    async def close(self) -> None:
+        """Be gone; a pair of the caller's stays open. Idempotent.
+
+        Cancellation: all is closed all the same.
+        """
+        stream, self._stream = self._stream, None
+        try:
+            if stream is not None:
+                await stream.close()
+        finally:
+            for one in self._publishers.values():
+                one.close()
+            self._publishers.clear()
+            await self._transforms.close()
+            thread, self._thread = self._thread, None
+            if thread is not None:
+                thread.shutdown(wait=False, cancel_futures=True)
+
+    @contextlib.asynccontextmanager
+    async def _read(self, _: float) -> AsyncIterator[StereoDepth]:
+        if callable(self._stereo):
+            async with self._stereo() as stereo:
+                self._learn(stereo)
+                yield stereo
+        else:
+            self._learn(self._stereo)
+            yield self._stereo
+
+    def _learn(self, stereo: StereoDepth) -> None:
+        """Take over what an open pair knows of itself, and say where it is."""
+        self._nearest, place = stereo.nearest, self._place
+        if place is not None:
+            turn = Transform(place.source, self.frame_id, stereo.rotation.T, np.zeros(3))
+            seen = place @ turn
+            parent = self._parent or place.target
+            found = Transform(parent, self.frame_id, seen.rotation, seen.translation)
+            self._transforms.replace([found])
+
+    async def _publish(self, frame: DepthFrame) -> None:
+        heard = {name: one for name, one in self._publishers.items() if getattr(one, "heard", True)}
+        if self._thread is None or not heard:
+            return
+        loop = asyncio.get_running_loop()
+        for name, publisher in heard.items():
+            fields = await loop.run_in_executor(self._thread, self._fields, name, frame)
+            await say_newest(publisher, fields)
+
+    def _fields(self, name: str, frame: DepthFrame) -> dict[str, Any]:
+        header = header_fields(frame.utc, self.frame_id)
+        focal = float(frame.camera_info.matrix[0, 0])
+        if name == "disparity":
+            largest = focal * frame.baseline / self._nearest
+            return disparity_fields(frame.disparity, header, focal, frame.baseline, largest)
+        if name == "depth/image_rect":
+            return depth_fields(frame.depth, header, self._encoding)
+        if name == "depth/image_rect/compressedDepth":
+            return compressed_depth_fields(frame.depth, header, self._encoding)
+        if name == "points2":
+            return self._cloud(frame, header)
+        if name == "left/image_rect":
+            return array_fields(frame.left, "mono8" if frame.left.ndim == 2 else "rgb8", header)
+        lens, projection = frame.camera_info, None
+        if name == "right/camera_info":
+            # as ROS has it: from the left rectified frame, so that the shift stands in it
+            projection = np.column_stack([lens.matrix, [-focal * frame.baseline, 0, 0]])
+        height, width = frame.depth.shape
+        return lens_fields(lens, header, (width, height), projection=projection)
+
+    def _cloud(self, frame: DepthFrame, header: dict[str, Any]) -> dict[str, Any]:
+        points, colours = points_of(frame.depth, frame.camera_info), frame.left
+        if not self._organized:
+            there = frame.depth > 0
+            points, colours = points[there], colours[there]
+        return cloud_fields(points, colours, header)

@@ -1,0 +1,348 @@
+"""Pictures as ROS' messages and back; nothing here knows a node.
+
+The names of encodings are those of ``sensor_msgs/image_encodings``; depth is as in REP-118: 16UC1
+in millimetres, 0 for none, or 32FC1 in metres, NaN for none.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+from smartcam.exceptions import FrameFormatError
+from smartcam.frames import Frame, Moment, find_format
+from smartcam.frames._inside import jpeg_header
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.frames import PixelFormat
+    from smartcam.geometry import CameraModel
+
+BILLION: Final = 1_000_000_000
+
+UNKNOWN_DURATION: Final = 1.0
+"""Seconds before its stamp in which a picture of another node may have been exposed."""
+
+_BAYER: Final = {"GR": "grbg", "RG": "rggb", "GB": "gbrg", "BG": "bggr"}
+
+ENCODINGS: Final[dict[str, str]] = {
+    "Mono8": "mono8",
+    **{f"Mono{bits}": "mono16" for bits in (10, 12, 14, 16)},
+    "RGB8": "rgb8",
+    "BGR8": "bgr8",
+    "RGB16": "rgb16",
+    "RGBa8": "rgba8",
+    "BGRa8": "bgra8",
+    "RGBa16": "rgba16",
+    **{f"Bayer{ours}8": f"bayer_{theirs}8" for ours, theirs in _BAYER.items()},
+    **{
+        f"Bayer{ours}{bits}": f"bayer_{theirs}16"
+        for ours, theirs in _BAYER.items()
+        for bits in (10, 12, 16)
+    },
+    "Coord3D_C16": "16UC1",
+    # the names that all distributions know; newer ones call them yuyv and uyvy as well
+    "YUV422_8": "yuv422_yuy2",
+    "YUV422_8_UYVY": "yuv422",
+    "YCbCr601_422_8": "yuv422_yuy2",
+    "YCbCr601_422_8_CbYCrY": "yuv422",
+}
+"""Encodings of ROS by the names of the pixel formats that are sent as they are.
+
+Pixels of 10, 12 and 14 bits are sent with 16 bits and the same values. Frames of other formats are
+made ``rgb8`` or unpacked first: see :func:`prepared`.
+"""
+
+_FORMATS: Final[dict[str, str]] = {
+    **{
+        theirs: ours
+        for ours, theirs in reversed(ENCODINGS.items())
+        if ours not in {"Mono10", "Mono12", "Mono14"} and not ours.endswith(("10", "12"))
+    },
+    "8UC1": "Mono8",
+    "8UC3": "BGR8",
+    "8UC4": "BGRa8",
+    "16UC1": "Coord3D_C16",
+    "yuyv": "YUV422_8",
+    "uyvy": "YUV422_8_UYVY",
+    "nv12": "NV12",
+}
+
+_DTYPES: Final = {"U": "u", "S": "i", "F": "f"}
+
+
+# ---------------------------------------------------------------------- to ROS
+
+
+def stamp_fields(utc: float) -> dict[str, int]:
+    """Return a time, seconds since 1970, as the fields of ``builtin_interfaces/Time``."""
+    whole = int(max(utc, 0.0))
+    more = round(max(utc - whole, 0.0) * BILLION)  # apart, since both together lose digits
+    return {"sec": whole + more // BILLION, "nanosec": more % BILLION}
+
+
+def header_fields(utc: float, frame_id: str) -> dict[str, Any]:
+    """Return the fields of ``std_msgs/Header``."""
+    return {"stamp": stamp_fields(utc), "frame_id": frame_id}
+
+
+def prepared(frame: Frame) -> Frame:
+    """Return the frame in a format that ROS has a name for; blocks.
+
+    What it has one for stays as it is. Samples that share bytes are unpacked to 16 bits. Y, U and V
+    in planes, of full range, of BT.709 or BT.2020 become RGB8 or RGB16, since ROS' names say
+    nothing of that; so do the pixels of a JPEG, PNG or JPEG XL, as they are in it.
+
+    Raises:
+        FrameFormatError: there is no way, or the frame's bytes are wrong.
+        MissingExtraError: what reads its format is not installed.
+    """
+    from smartcam.frames._inside import converted, decoded, with_pixels
+
+    name = frame.format.name
+    if name in ENCODINGS:
+        return frame
+    if name.startswith(("Mono", "Bayer")):
+        wanted = "Mono16" if name.startswith("Mono") else f"{name[:7]}16"
+        return with_pixels(frame, frame.array(), wanted)
+    if frame.format.compressed:
+        return prepared(decoded(frame, ""))
+    return converted(frame, "RGB16" if frame.format.depth > 8 else "RGB8")
+
+
+def image_fields(frame: Frame, frame_id: str) -> dict[str, Any]:
+    """Return the fields of ``sensor_msgs/Image``; the pixels are not copied.
+
+    Raises:
+        FrameFormatError: ROS has no name for the format (:func:`prepared` finds another), or there
+            are too few bytes.
+    """
+    encoding = ENCODINGS.get(frame.format.name)
+    if encoding is None:
+        raise FrameFormatError(
+            f"{frame.source}: ROS has no encoding for {frame.format.name}; expected one of "
+            f"{', '.join(ENCODINGS)}",
+            source=frame.source,
+        )
+    frame.format.check(frame.data, frame.width, frame.height, frame.stride)
+    return {
+        "header": header_fields(frame.utc, frame_id),
+        "height": frame.height,
+        "width": frame.width,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": frame.stride,
+        "data": _whole_rows(frame),
+    }
+
+
+def _whole_rows(frame: Frame) -> memoryview:
+    """Return the bytes of all rows; the last one may have come without its padding."""
+    data, size = memoryview(frame.data).cast("B"), frame.stride * frame.height
+    if data.nbytes >= size:
+        return data[:size]
+    return memoryview(bytes(data).ljust(size, b"\0"))
+
+
+def array_fields(pixels: NDArray[Any], encoding: str, header: dict[str, Any]) -> dict[str, Any]:
+    """Return the fields of ``sensor_msgs/Image`` of an array (H, W) or (H, W, C)."""
+    kept = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+    height, width = kept.shape[:2]
+    return {
+        "header": header,
+        "height": height,
+        "width": width,
+        "encoding": encoding,
+        "is_bigendian": 0,
+        "step": kept.nbytes // max(height, 1),
+        "data": kept.reshape(-1).view(np.uint8),
+    }
+
+
+class Compression(NamedTuple):
+    """The steps from a frame to ``sensor_msgs/CompressedImage``.
+
+    Attributes:
+        how: ``jpeg``, ``png`` or, for a JPEG as it came, "".
+        first: the format that it is made before; "": none.
+        encoding: encoding of the pixels after decoding.
+    """
+
+    how: Literal["jpeg", "png", ""]
+    first: Literal["Mono8", "RGB8", ""]
+    encoding: str
+
+    def text(self) -> str:
+        """Return the message's ``format``."""
+        within = "bgr8" if self.encoding in {"rgb8", "bgr8"} else self.encoding
+        kind = "png" if self.how == "png" else "jpeg"
+        return f"{self.encoding}; {kind} compressed {within}"
+
+
+def compression(frame: Frame) -> Compression:
+    """Return the compression of a frame: PNG, without loss, for depth, JPEG for all else.
+
+    In a JPEG, of more than 8 bits the highest 8 are sent, and of a Bayer pattern the colours.
+
+    Raises:
+        FrameFormatError: the frame is of H.264.
+        MissingExtraError: the codecs are not installed.
+    """
+    name = frame.format.name
+    if name == "MJPEG":
+        coloured = jpeg_header(frame.data, name)[2]
+        return Compression("", "", "bgr8" if coloured else "mono8")
+    if name == "Coord3D_C16":
+        return Compression("png", "", "16UC1")
+    if name in {"Mono8", "RGB8", "BGR8"}:
+        return Compression("jpeg", "", ENCODINGS[name])
+    if name.startswith("Mono"):
+        return Compression("jpeg", "Mono8", "mono8")
+    if name.startswith("Bayer"):
+        return Compression("jpeg", "RGB8", "bgr8")
+    if name == "H264":
+        raise FrameFormatError(
+            f"{frame.source}: expected a picture, got H264: read it decoded", source=frame.source
+        )
+    return Compression("jpeg", "", "bgr8")
+
+
+def compressed_fields(frame: Frame, text: str, frame_id: str) -> dict[str, Any]:
+    """Return the fields of ``sensor_msgs/CompressedImage``."""
+    return {
+        "header": header_fields(frame.utc, frame_id),
+        "format": text,
+        "data": memoryview(frame.data).cast("B"),
+    }
+
+
+# ---------------------------------------------------------------------- from ROS
+
+
+def utc_of(header: Any) -> float:
+    """Return a header's time, seconds since 1970."""
+    return float(header.stamp.sec) + float(header.stamp.nanosec) / BILLION
+
+
+def frame_from(
+    message: Any,
+    *,
+    source: str = "",
+    sequence: int = 0,
+    duration: float = UNKNOWN_DURATION,
+    camera_info: CameraModel | None = None,
+) -> Frame:
+    """Return the frame of a ``sensor_msgs/Image`` or ``sensor_msgs/CompressedImage``.
+
+    The pixels are not copied where the message has them as smartcam does. The time is the header's.
+
+    Args:
+        message: message of either type.
+        source: name of the camera; "": the header's ``frame_id``.
+        sequence: number of the frame, such as that of the subscription's ``attachment``.
+        duration: seconds before the stamp in which the frame may have been exposed.
+        camera_info: model of the lens; None: not known.
+
+    Raises:
+        FrameFormatError: an encoding without a pixel format, fewer bytes than the size asks for, or
+            no JPEG or PNG.
+        MissingExtraError: the message is compressed and the extra ``frames`` is not installed.
+    """
+    if hasattr(message, "encoding"):
+        form, width, height, step, data = _raw(message)
+    else:
+        form, width, height, step, data = _compressed(message)
+    form.check(data, width, height, step)
+    utc = utc_of(message.header)
+    now = time.monotonic()
+    return Frame(
+        data=data,
+        format=form,
+        width=width,
+        height=height,
+        stride=step,
+        captured=min(now, now - (time.time() - utc)),
+        utc=utc,
+        moment=Moment.ARRIVAL,
+        duration=duration,
+        sequence=sequence,
+        source=source or message.header.frame_id,
+        camera_info=camera_info,
+    )
+
+
+def _raw(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
+    width, height, step, encoding = message.width, message.height, message.step, message.encoding
+    data = memoryview(message.data).cast("B")
+    name = _FORMATS.get(encoding)
+    if name is None:
+        raise FrameFormatError(
+            f"ROS image: expected one of the encodings {', '.join(_FORMATS)}, got "
+            f"{encoding!r:.40}; pixels_from() has the numbers of 32FC1 and the like"
+        )
+    form = find_format(name)
+    if message.is_bigendian and form.depth > 8:
+        swapped = np.ascontiguousarray(pixels_from(message), "<u2")
+        return form, width, height, form.stride(width), swapped.data.cast("B")
+    return form, width, height, step, data
+
+
+def _compressed(message: Any) -> tuple[PixelFormat, int, int, int, memoryview]:
+    data = memoryview(message.data).cast("B")
+    head = bytes(data[:24])
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 24:
+        width, height = (int.from_bytes(head[at : at + 4], "big") for at in (16, 20))
+        return find_format("PNG"), width, height, 0, data
+    if head[:2] != b"\xff\xd8":
+        raise FrameFormatError(
+            f"ROS compressed image {message.format!r:.60}: expected a JPEG or PNG, got "
+            f"{len(data)} bytes that begin with {head[:8].hex(' ') or 'none'}"
+        )
+    width, height, _ = jpeg_header(data, "MJPEG")
+    return find_format("MJPEG"), width, height, 0, data
+
+
+def pixels_from(message: Any) -> NDArray[Any]:
+    """Return the pixels of a ``sensor_msgs/Image`` as numbers; nothing is converted.
+
+    Returns:
+        (H, W) or (H, W, C), of 8UC1, 32FC1 and their like and of all encodings with a name, except
+        of Y, U and V; a view, in this machine's byte order where that differs.
+
+    Raises:
+        FrameFormatError: no such encoding, or fewer bytes than the size asks for.
+    """
+    kind, channels = _samples(message.encoding)
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype(f"{order}{kind}")
+    width, height, step = message.width, message.height, message.step
+    row = width * channels * dtype.itemsize
+    data = memoryview(message.data).cast("B")
+    if height and width and (step < row or len(data) < step * (height - 1) + row):
+        raise FrameFormatError(
+            f"ROS image {width}x{height} {message.encoding}: expected {row} bytes or more from row "
+            f"to row and {step * (height - 1) + row} in all, got {step} and {len(data)}"
+        )
+    shape = (height, width, channels)
+    strides = (step, channels * dtype.itemsize, dtype.itemsize)
+    view: NDArray[Any] = np.ndarray(shape, dtype, data, 0, strides)
+    view = view if channels > 1 else view[..., 0]
+    return view if dtype.isnative else view.astype(dtype.newbyteorder("="))
+
+
+def _samples(encoding: str) -> tuple[str, int]:
+    """Return the kind of numbers and how many a pixel has."""
+    bits, _, rest = encoding.partition("C")
+    if bits[:-1] in {"8", "16", "32", "64"} and bits[-1:] in _DTYPES and rest in {*"1234", ""}:
+        return f"{_DTYPES[bits[-1]]}{int(bits[:-1]) // 8}", int(rest or 1)
+    for name, channels in (("mono", 1), ("bayer_", 1), ("rgba", 4), ("bgra", 4), ("rgb", 3)):
+        if encoding.startswith(name) and encoding.endswith(("8", "16")):
+            return ("u2" if encoding.endswith("16") else "u1"), channels
+    if encoding in {"bgr8", "bgr16"}:
+        return ("u2" if encoding == "bgr16" else "u1"), 3
+    raise FrameFormatError(
+        f"ROS image: expected an encoding of numbers, such as mono8 or 32FC1, got {encoding!r:.40}"
+    )

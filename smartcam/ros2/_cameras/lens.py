@@ -1,0 +1,156 @@
+"""A camera's lens on ROS: ``camera_info``, where it is kept, and ``set_camera_info``."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
+
+from smartcam.calibration._inside import MAX_FILE, parse_camera_info
+from smartcam.calibration.formats import write_camera_info
+from smartcam.exceptions import ConfigurationError, RosError, RosMessageError, SmartCamError
+from smartcam.ros2._cameras.image_messages import header_fields
+from smartcam.ros2._cameras.lens_messages import lens_fields, lens_from
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.calibration._inside import CameraInfo
+    from smartcam.frames import Frame
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+
+def as_path(url: str) -> Path | None:
+    """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" is none.
+
+    Raises:
+        ConfigurationError: it is of another scheme.
+    """
+    if not url:
+        return None
+    parts = urlsplit(url)
+    if parts.scheme == "file" and parts.netloc in {"", "localhost"}:
+        return Path(unquote(parts.path))
+    if "://" in url:
+        raise ConfigurationError(
+            f"camera_info_url: expected file:///PATH or a path, got {url!r:.120}"
+        )
+    return Path(url)
+
+
+class CameraLens:
+    """The lens of a camera's pictures: that of a file, else the one that a frame carries.
+
+    Args:
+        name: name of the camera, for the file.
+        frame_id: the camera's optical frame.
+        url: the file, ``camera_info`` of ROS, which need not be there yet; "": none.
+        size: function that returns the pictures' width and height.
+
+    Raises:
+        ConfigurationError: the URL cannot be.
+    """
+
+    def __init__(
+        self, name: str, frame_id: str, url: str, size: Callable[[], Awaitable[tuple[int, int]]]
+    ) -> None:
+        self._name, self._frame_id, self._size = name, frame_id, size
+        self._path = as_path(url)
+        self._info: CameraInfo | None = None
+        self._read = self._path is None
+        self._told: tuple[int, int] | None = None
+        self._writing = asyncio.Lock()
+
+    async def load(self) -> None:
+        """Read the file, once; one that is none is told in the log, and counts as not there."""
+        if self._read or self._path is None:
+            return
+        async with self._writing:
+            if self._read:
+                return
+            try:
+                self._info = await asyncio.to_thread(_read, self._path)
+            except FileNotFoundError:
+                logger.info("%s: %s is not there: not calibrated yet", self._name, self._path)
+            except (SmartCamError, OSError) as exc:
+                logger.warning("%s ! the lens is not known: %s", self._name, exc)
+            self._read = True
+
+    def fields(self, frame: Frame) -> dict[str, Any]:
+        """Return ``sensor_msgs/CameraInfo`` beside the image of a frame."""
+        header, size = header_fields(frame.utc, self._frame_id), (frame.width, frame.height)
+        info = self._info
+        lens = frame.camera_info if info is None else info.camera
+        if lens is not None and tuple(lens.size) != size:
+            if self._told != size:
+                self._told = size
+                logger.warning(
+                    "%s ! the lens is that of pictures of %dx%d, these have %dx%d: camera_info is "
+                    "that of a camera that is not calibrated",
+                    self._name,
+                    *lens.size,
+                    *size,
+                )
+            lens = None
+        if lens is None or info is None:
+            return lens_fields(lens, header, size)
+        return lens_fields(
+            lens, header, size, rectification=info.rectification, projection=info.projection
+        )
+
+    async def set(self, request: Any) -> dict[str, Any]:
+        """Serve ``sensor_msgs/srv/SetCameraInfo``.
+
+        Cancellation: the file is the old one or the new one, whole.
+        """
+        try:
+            where = await self._set(request.camera_info)
+        except (SmartCamError, OSError) as exc:
+            logger.warning("%s ! set_camera_info was refused: %s", self._name, exc)
+            return {"success": False, "status_message": str(exc)}
+        return {"success": True, "status_message": f"written to {where}"}
+
+    async def _set(self, message: Any) -> Path:
+        info = lens_from(message)
+        if info is None:
+            raise RosMessageError("camera_info: expected a calibration, got one with K[0] = 0")
+        if self._path is None:
+            raise RosError(
+                "this camera has no file for it: its camera_info is that of its source; expected "
+                "camera_info_url to name one"
+            )
+        width, height = await self._size()
+        if info.camera.size != (width, height):
+            got = info.camera.size
+            raise RosMessageError(
+                f"camera_info: expected the size of the pictures, {width}x{height}, got "
+                f"{got[0]}x{got[1]}"
+            )
+        async with self._writing:
+            await asyncio.to_thread(
+                write_camera_info,
+                self._path,
+                info.camera,
+                name=self._name,
+                rectification=info.rectification,
+                projection=info.projection,
+            )
+            self._info, self._read, self._told = info, True, None
+        logger.info("%s: set_camera_info: written to %s", self._name, self._path)
+        return self._path
+
+
+def _read(path: Path) -> CameraInfo:
+    with path.open("rb") as file:
+        said = file.read(MAX_FILE + 1)
+    if len(said) > MAX_FILE:
+        raise ConfigurationError(f"{path}: expected a camera_info of {MAX_FILE} bytes at most")
+    try:
+        return parse_camera_info(said.decode())
+    except UnicodeDecodeError as exc:
+        raise ConfigurationError(f"{path}: expected text: {exc}") from exc
+    except SmartCamError as exc:
+        raise ConfigurationError(f"{path}: {exc}") from exc

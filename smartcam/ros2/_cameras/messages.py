@@ -1,0 +1,211 @@
+"""Convert smartcam's values of a camera to messages of ROS; pure.
+
+Lengths are metres and angles radians on both sides, and axes are as REP-103 has them: a camera's
+plane has x right, y up and z towards the camera, right-handed. A calibration has brought poses into
+the robot's frame before they come here.
+"""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam._client._inside import localizations_of
+from smartcam._json import text_of
+from smartcam.exceptions import RosMessageError
+from smartcam.ros2._cameras.reading import calibration_of, calibrations_of, frame_of_robot
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.models import Localization, Result
+    from smartcam.ros2._types.types import RosTypes
+
+EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+
+POSES: Final = "geometry_msgs/msg/PoseArray"
+DETECTIONS: Final = "vision_msgs/msg/Detection3DArray"
+RESULT: Final = "smartcam_msgs/msg/Result"
+LOCALIZATION: Final = "smartcam_msgs/msg/Localization"
+
+MAX_ERROR_CHARACTERS = 1000
+"""Characters of an error in a message."""
+
+
+def error_text(error: BaseException) -> str:
+    """Return an error as a field ``error`` has it: never empty, one that UTF-8 can say."""
+    text = str(error) or type(error).__name__
+    return utf8(text[:MAX_ERROR_CHARACTERS])
+
+
+def utf8(text: str) -> str:
+    """Return a text without what no string of ROS can hold: NUL, and halves of pairs."""
+    return text.replace("\0", "\ufffd").encode(errors="replace").decode()
+
+
+class ResultMessages:
+    """Makes the messages of results.
+
+    Args:
+        types: types of the messages, from the node that publishes them.
+        camera: name of the camera, which is the frame of poses without a calibration.
+        frame_id: name of that frame in ROS.
+        calibration: calibration of the camera's settings, which names the robot's frame.
+        robot_frame: name of the robot's frame in ROS; empty: the calibration's own.
+
+    Attributes:
+        frame_id: name of the camera's frame in ROS.
+    """
+
+    def __init__(
+        self,
+        types: RosTypes,
+        camera: str,
+        frame_id: str,
+        calibration: Any = None,
+        robot_frame: str = "",
+    ) -> None:
+        self.frame_id: str = frame_id
+        self._camera, self._calibration = camera, calibration
+        own = {frame_of_robot(one) for one in calibrations_of(calibration).values()}
+        self._in_ros: dict[str, str] = dict.fromkeys(own, robot_frame) if robot_frame else {}
+        self._in_ros[camera] = frame_id
+        cls = {
+            name: types.message(name).cls
+            for name in (
+                "builtin_interfaces/msg/Time",
+                "std_msgs/msg/Header",
+                "geometry_msgs/msg/Point",
+                "geometry_msgs/msg/Quaternion",
+                "geometry_msgs/msg/Vector3",
+                "geometry_msgs/msg/Pose",
+                "geometry_msgs/msg/PoseStamped",
+                "geometry_msgs/msg/PoseWithCovariance",
+                POSES,
+                LOCALIZATION,
+                RESULT,
+                "vision_msgs/msg/BoundingBox3D",
+                "vision_msgs/msg/ObjectHypothesis",
+                "vision_msgs/msg/ObjectHypothesisWithPose",
+                "vision_msgs/msg/Detection3D",
+                DETECTIONS,
+            )
+        }
+        self._cls: Any = type(
+            "Classes", (), {name.rpartition("/")[2]: one for name, one in cls.items()}
+        )
+        self._no_covariance = np.zeros(36)
+        self._no_covariance.flags.writeable = False
+
+    def frame_of(self, result: Result) -> str:
+        """Return the frame of a result's poses.
+
+        Raises:
+            RosMessageError: they are in several.
+        """
+        found = localizations_of(result.value)
+        frames = {one.pose.header.frame_id for one in found or ()}
+        if len(frames) > 1:
+            raise RosMessageError(
+                f"{self._camera}: expected the poses of a result in one frame, got "
+                f"{', '.join(sorted(frames))}"
+            )
+        return self._frame(frames.pop() if frames else self._empty_frame(result.application))
+
+    def _frame(self, frame_id: str) -> str:
+        return self._in_ros.get(frame_id, frame_id)
+
+    def _empty_frame(self, application: int) -> str:
+        """Return the frame of a result in which nothing was found, as smartcam calls it."""
+        calibration = calibration_of(self._calibration, application)
+        return frame_of_robot(calibration) or self._camera
+
+    def header(self, at: datetime, frame_id: str) -> Any:
+        """Return a header."""
+        since, cls = at - EPOCH, self._cls
+        time = cls.Time(since.days * 86_400 + since.seconds, since.microseconds * 1000)
+        return cls.Header(time, frame_id)
+
+    def _pose(self, one: Localization) -> Any:
+        _, position, orientation = one.pose
+        cls = self._cls
+        return cls.Pose(cls.Point(*position), cls.Quaternion(*orientation))
+
+    def poses(self, result: Result, parts: Sequence[Localization]) -> Any:
+        """Return the ``PoseArray`` of a result.
+
+        Raises:
+            RosMessageError: they are in several frames.
+        """
+        header = self.header(result.received_at, self.frame_of(result))
+        return self._cls.PoseArray(header, [self._pose(one) for one in parts])
+
+    def detections(self, result: Result, parts: Sequence[Localization]) -> Any:
+        """Return the ``Detection3DArray`` of a result: one hypothesis for each part.
+
+        ``class_id`` is its feature, ``score`` its quality, ``bbox.center`` its pose; sizes and
+        covariances are 0, which says that they are not known.
+
+        Raises:
+            RosMessageError: they are in several frames.
+        """
+        cls = self._cls
+        header = self.header(result.received_at, self.frame_of(result))
+        no_size = cls.Vector3(0.0, 0.0, 0.0)
+        found = list[Any]()
+        for one in parts:
+            pose = self._pose(one)
+            hypothesis = cls.ObjectHypothesisWithPose(
+                cls.ObjectHypothesis(one.feature_id, one.quality),
+                cls.PoseWithCovariance(pose, self._no_covariance),
+            )
+            found.append(
+                cls.Detection3D(header, [hypothesis], cls.BoundingBox3D(pose, no_size), "")
+            )
+        return cls.Detection3DArray(header, found)
+
+    def localizations(self, parts: Sequence[Localization]) -> list[Any]:
+        """Return the thesis' ``Localization`` of each part."""
+        cls, made = self._cls, list[Any]()
+        for one in parts:
+            stamped = one.pose.header
+            header = self.header(stamped.stamp, self._frame(stamped.frame_id))
+            pose = cls.PoseStamped(header, self._pose(one))
+            made.append(cls.Localization(one.feature_id, one.quality, one.photo_index, pose))
+        return made
+
+    def result(self, result: Result, parts: Sequence[Localization] | None) -> Any:
+        """Return the message of a result as it came and as it was read.
+
+        Args:
+            result: result to send.
+            parts: localizations of the result, in metres; None where the result has none of that
+                kind: the message has the value as JSON then.
+        """
+        try:
+            frame_id = self.frame_of(result)
+        except RosMessageError:  # each part says its own
+            frame_id = ""
+        text, error = "", ""
+        if parts is None and not isinstance(result.value, bytes):
+            try:
+                text = text_of(result.value)
+            except Exception as exc:  # noqa: BLE001 - a plug-in's value
+                error = utf8(f"the value is no JSON: {exc!r:.200}")
+        return self._cls.Result(
+            self.header(result.received_at, frame_id),
+            self._camera,
+            max(result.application, 0),  # -1 where a camera does not say it
+            result.number,
+            error,
+            self.localizations(parts or ()),
+            text,
+            result.raw,
+        )
+
+    def failed(self, error: BaseException, at: datetime) -> Any:
+        """Return the message of a result that could not be read."""
+        header = self.header(at, self.frame_id)
+        return self._cls.Result(header, self._camera, 0, 0, error_text(error), [], "", b"")

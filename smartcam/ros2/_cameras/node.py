@@ -1,0 +1,259 @@
+"""A camera as a node of ROS: what it is made of, and its life."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import logging
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+from smartcam._server import Server
+from smartcam.exceptions import ConfigurationError
+from smartcam.ros2._cameras.calibrations import calibrations_of
+from smartcam.ros2._cameras.controls import CameraControls
+from smartcam.ros2._cameras.lifecycle import CameraLifecycle
+from smartcam.ros2._cameras.parameters import CameraParameters
+from smartcam.ros2._cameras.pictures import CameraPictures
+from smartcam.ros2._cameras.results import CameraResults
+from smartcam.ros2._cameras.robot_graph import CameraGraph
+from smartcam.ros2._cameras.services import CameraServices
+from smartcam.ros2._cameras.status import CameraStatus
+from smartcam.ros2._cameras.transforms import CameraFrames, StaticTransforms
+from smartcam.ros2._node.rosout import RosOut
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from smartcam.calibration import HandEyeCalibration
+    from smartcam.calibration._inside import ThesisCalibration
+    from smartcam.camera import Camera
+    from smartcam.frames import FrameSource
+    from smartcam.geometry import Transform
+    from smartcam.ros2._node.interface import NodeOfRos
+    from smartcam.settings import CameraSettings
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+
+class CameraPart(Protocol):
+    """A part of a camera's node, which owns what it declares, and its tasks."""
+
+    def start(self) -> Awaitable[None] | None:
+        """Declare it, and begin."""
+        ...
+
+    async def close(self) -> None:
+        """End it, within seconds; also where starting it failed."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraNodeOptions:
+    """The options of a camera's node.
+
+    Attributes:
+        frame_id: name of the camera's frame; empty for the camera's name.
+        parent_frame: name of the robot's frame; empty: as a calibration calls it.
+        flange_frame: name of the frame of the part of the robot that carries the camera; empty: as
+            a calibration calls it.
+        place: hand-eye calibration, which says where the camera is; None without.
+        calibrated_at: pose of the part that carries the camera, in the robot's frame, when the
+            calibration of the camera's settings was made; None where the camera stands still.
+        autostart: whether the life cycle goes to Active by itself.
+        application: id of the application to have running and ready once configured; None: that
+            of the camera's settings.
+        diagnostics_period: seconds between two diagnostics.
+        status_rate: most messages of status a second.
+        hardware_id: id of the hardware in diagnostics; empty for the camera's address.
+        settings: what the session with the camera is told, where that is not what the camera's own
+            settings say: the agent's, of a camera of a fleet.
+        heard: whether there is any sign of who has the session, the agent of a fleet; None where
+            nobody is between.
+        frames: parameters that say where its frames come from, by v4l2_camera's names:
+            ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
+        controls: function that returns the open source of the frames, whose device's controls
+            become parameters; None: there are none.
+        calibrations: folder that calibrations of the camera are written to, or the calibrations
+            that other faces of the camera have, too; None: the services for them refuse.
+    """
+
+    frame_id: str = ""
+    parent_frame: str = ""
+    flange_frame: str = ""
+    place: HandEyeCalibration | None = None
+    calibrated_at: Transform | None = None
+    autostart: bool = True
+    application: int | None = None
+    diagnostics_period: float = 1.0
+    status_rate: float = 20.0
+    hardware_id: str = ""
+    settings: CameraSettings | None = None
+    heard: Callable[[], bool] | None = None
+    frames: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    controls: Callable[[], Awaitable[FrameSource]] | None = None
+    calibrations: str | os.PathLike[str] | ThesisCalibration | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("diagnostics_period", self.diagnostics_period),
+            ("status_rate", self.status_rate),
+        ):
+            if not 0.01 <= value <= 3600:
+                raise ConfigurationError(f"{name}: {value!r}: expected 0.01 to 3600")
+
+
+PARTS: tuple[Callable[[CameraNode], CameraPart | None], ...] = (
+    lambda one: CameraParameters.of(one.camera, one.node, one.options, one.status),
+    lambda one: one.status,
+    lambda one: one.results,
+    lambda one: CameraGraph(
+        one.node, one.calibrations, owned=one.calibrations is not one.options.calibrations
+    ),
+    lambda one: one.services,
+    lambda one: one.rosout(),
+    lambda one: CameraPictures(
+        one.camera,
+        one.node,
+        frame_id=one.frames.optical,
+        camera_info_url=str(one.options.frames.get("camera_info_url", "")),
+    ),
+    lambda one: one.controls(),
+    lambda one: StaticTransforms(one.node, one.frames.transforms()),
+    lambda one: one.lifecycle,
+)
+"""Parts of a node, in the order in which they start. The life cycle is the last, so that its events
+are heard."""
+
+
+class CameraNode(Server):
+    """A camera as a node of ROS; ``async with`` opens and closes it.
+
+    The camera is its owner's: it is open, connected or not, and stays so. The node is opened and
+    closed with this. See :class:`CameraLifecycle` for what its states mean.
+
+    Args:
+        camera: open camera that the node stands for.
+        node: node of ROS 2, or of ROS 1 behind a rosbridge.
+        options: settings of the node.
+
+    Attributes:
+        lifecycle: life cycle of the node, which says whether results are published.
+        status: publisher of the camera's status and diagnostics.
+        results: publisher of the camera's results.
+        services: services by which other nodes use the camera.
+        calibrations: the camera's calibrations; None where there is no folder for them.
+    """
+
+    def __init__(
+        self, camera: Camera[Any], node: NodeOfRos, *, options: CameraNodeOptions | None = None
+    ) -> None:
+        self.camera: Camera[Any] = camera
+        self.calibrations: ThesisCalibration | None = calibrations_of(
+            (options or CameraNodeOptions()).calibrations, camera.name
+        )
+        self.node: Any = node
+        self.options: CameraNodeOptions = options or CameraNodeOptions()
+        self.lifecycle: CameraLifecycle
+        self.status: CameraStatus
+        self.results: CameraResults
+        self.services: CameraServices
+        self._renew()
+        self._stack: contextlib.AsyncExitStack | None = None
+        self._turn = asyncio.Lock()
+
+    def _renew(self) -> None:
+        camera, node, options = self.camera, self.node, self.options
+        self.lifecycle = CameraLifecycle(
+            camera, node, application=options.application, autostart=options.autostart
+        )
+        self.status = CameraStatus(camera, node, options, lambda: self.lifecycle.state.label)
+        self.results = CameraResults(
+            camera, node, frame_id=self.frame_id, robot_frame=self.frames.robot
+        )
+        self.results.active = False
+        self.services = CameraServices(
+            camera, node, self.results, self.lifecycle, self.calibrations
+        )
+        self.lifecycle.listen(self._on_transition)
+
+    @property
+    def frame_id(self) -> str:
+        """The frame of what it sees."""
+        return self.options.frame_id or self.camera.name
+
+    @property
+    def frames(self) -> CameraFrames:
+        """The names of the camera's frames, and where they are."""
+        options = self.options
+        return CameraFrames(
+            self.frame_id,
+            self.camera.settings.calibration,
+            place=options.place,
+            parent=options.parent_frame,
+            flange=options.flange_frame,
+            calibrated_at=options.calibrated_at,
+        )
+
+    def controls(self) -> CameraControls | None:
+        """Return the parameters of the frames' device; None where there are none."""
+        source = self.options.controls
+        if self.node.parameters is None or source is None:
+            return None
+        return CameraControls(self.node, source)
+
+    def rosout(self) -> RosOut | None:
+        """Return the publisher of the camera's warnings on ``/rosout``; None in ROS 1."""
+        if self.node.parameters is None:
+            return None
+        begins = (f"{self.camera.name} ", f"{self.camera.name}:")
+
+        def wanted(record: logging.LogRecord) -> bool:
+            return record.getMessage().startswith(begins)
+
+        return RosOut(self.node, logging.getLogger("smartcam"), wanted=wanted)
+
+    def _on_transition(self, _: object) -> None:
+        self.results.active = self.lifecycle.active
+
+    async def start(self) -> None:
+        """Open the node, and begin with all that it is made of.
+
+        Raises:
+            SmartCamError: something of it cannot be; all is undone.
+
+        Cancellation: leaves it closed.
+        """
+        async with self._turn:
+            if self._stack is not None:
+                return
+            if self.lifecycle.closed:
+                self._renew()
+            async with contextlib.AsyncExitStack() as stack:
+                await stack.enter_async_context(self.node)
+                for make in PARTS:
+                    part = make(self)
+                    if part is not None:
+                        stack.push_async_callback(_closed, part)
+                        begun = part.start()
+                        if inspect.isawaitable(begun):
+                            await begun
+                        await asyncio.sleep(0)  # to declare takes the engine a while
+                self._stack = stack.pop_all()
+
+    async def stop(self) -> None:
+        """End all of it, and the node. Idempotent, bounded."""
+        async with self._turn:
+            stack, self._stack = self._stack, None
+            if stack is not None:
+                await stack.aclose()
+
+
+async def _closed(part: CameraPart) -> None:
+    """Close a part; the others are closed whatever becomes of it."""
+    try:
+        await part.close()
+    except Exception:
+        logger.exception("%s ! it did not close", type(part).__name__)

@@ -1,0 +1,166 @@
+"""Parameters of a camera's node: what a fleet file says of the camera, and where it can be set."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError
+from smartcam.ros2._cameras.transforms import CameraFrames
+from smartcam.settings import masked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.camera import Camera
+    from smartcam.ros2._cameras.node import CameraNodeOptions
+    from smartcam.ros2._cameras.status import CameraStatus
+    from smartcam.settings import CameraSettings
+
+SWITCH_TIMEOUT = 9.0
+"""Seconds that a switch may take at most: setting a parameter is given up after 10."""
+
+MAX_APPLICATION_ID = 0xFFFFFFFF
+PERIODS = (0.1, 3600.0)
+"""Seconds between two diagnostics."""
+
+SAID: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
+    "url": ("where the camera is, without a password", lambda one: masked(one.address.url)),
+    "interpret_as": (
+        "what result containers hold; empty where that is not said",
+        lambda one: as_text(one.interpret_as),
+    ),
+    "y_down": ("the camera's y axis points down", lambda one: one.y_down),
+    "lenient": ("any non-zero byte is a true bool", lambda one: one.lenient),
+    "restore": (
+        "after a reconnect the application and the run state are had back",
+        lambda one: one.restore,
+    ),
+    "reconnect": ("a camera that is lost is tried again", lambda one: one.reconnect is not None),
+    "connect_timeout": ("seconds for a session", lambda one: one.connect_timeout),
+    "switch_timeout": (
+        "seconds for a switch until the camera is ready",
+        lambda one: one.switch_timeout,
+    ),
+    "request_timeout": ("seconds for the answer to a request", lambda one: one.request_timeout),
+    "liveness_timeout": (
+        "seconds for a sign of life of a camera that is asked for one; 0: no end",
+        lambda one: one.liveness_timeout or 0.0,
+    ),
+}
+"""Parameters that can only be read: the description, and the way to the value in the settings."""
+
+FRAMES = {
+    "video_device": "where frames come from",
+    "pixel_format": "of frames, as four characters",
+    "image_size": "width and height of frames in pixels",
+    "camera_info_url": "where the lens is said",
+}
+"""Names as v4l2_camera has them."""
+
+
+def as_text(spec: object) -> str:
+    """Return in one line how results are read."""
+    if spec is None:
+        return ""
+    if isinstance(spec, Mapping):
+        return json.dumps({str(key): as_text(one) for key, one in spec.items()})
+    return spec if isinstance(spec, str) else type(spec).__name__
+
+
+class CameraParameters:
+    """Declares the parameters by which a camera is known and set.
+
+    ``application`` is the active application, 0 where that is not known. Setting this parameter
+    switches the camera, for all who use it: the value counts once the camera is ready, and where
+    the camera refuses, the parameter is refused with its words.
+
+    Args:
+        camera: camera that the parameters are about.
+        node: node of ROS 2.
+        options: settings of the camera's node.
+        status: publisher of the status, which tells of the camera's changes and has the period of
+            diagnostics.
+    """
+
+    def __init__(
+        self, camera: Camera[Any], node: Any, options: CameraNodeOptions, status: CameraStatus
+    ) -> None:
+        self._camera, self._parameters = camera, node.parameters
+        self._options, self._status = options, status
+        self._declared: list[str] = []
+        self._stop_listening: Callable[[], None] | None = None
+
+    @classmethod
+    def of(
+        cls, camera: Camera[Any], node: Any, options: CameraNodeOptions, status: CameraStatus
+    ) -> CameraParameters | None:
+        """Return the parameters of a camera; None where the node has no parameters."""
+        if getattr(node, "parameters", None) is None:
+            return None
+        return cls(camera, node, options, status)
+
+    def start(self) -> None:
+        """Declare the parameters."""
+        options, camera = self._options, self._camera
+        settings = options.settings or camera.settings
+        for name, (description, value) in SAID.items():
+            self._declare(name, value(settings), description, read_only=True)
+        self._declare(
+            "application",
+            self._active(),
+            "the active application; 0: not known",
+            minimum=0,
+            maximum=MAX_APPLICATION_ID,
+            on_set=self._switch,
+        )
+        frame_id = options.frame_id or camera.name
+        self._declare("frame_id", frame_id, "of results", read_only=True)
+        self._declare(
+            "parent_frame", options.parent_frame, "that the camera's place is in", read_only=True
+        )
+        self._declare(
+            "diagnostics_period",
+            float(options.diagnostics_period),
+            "seconds between two diagnostics",
+            minimum=min(PERIODS[0], options.diagnostics_period),
+            maximum=PERIODS[1],
+            on_set=self._status.set_period,
+        )
+        for name, value in options.frames.items():
+            self._declare(name, value, FRAMES.get(name, ""), read_only=True)
+        if options.frames:
+            optical = CameraFrames(frame_id).optical
+            self._declare("camera_frame_id", optical, "of pictures", read_only=True)
+        self._stop_listening = self._status.listen(self._follow)
+
+    def _declare(self, name: str, value: object, description: str, **how: Any) -> None:
+        self._parameters.declare(name, value, description=description, **how)
+        self._declared.append(name)
+
+    async def close(self) -> None:
+        """Undeclare the parameters. Idempotent."""
+        if self._stop_listening is not None:
+            self._stop_listening()
+        declared, self._declared = self._declared, []
+        for name in declared:
+            with contextlib.suppress(ConfigurationError):  # somebody else has done so
+                self._parameters.undeclare(name)
+
+    def _active(self) -> int:
+        return (self._camera.active_application or 0) if self._camera.connected else 0
+
+    def _follow(self) -> None:
+        """Update the parameter ``application`` to the active application."""
+        self._parameters.update("application", self._active())
+
+    async def _switch(self, application: int) -> None:
+        camera = self._camera
+        settings = self._options.settings or camera.settings
+        limit = min(settings.switch_timeout, SWITCH_TIMEOUT)
+        if not camera.connected or await camera.query_application() != application:
+            await camera.switch_application(application, timeout=limit)
+        else:
+            await camera.wait_status(lambda status: not status.loading, limit)

@@ -1,0 +1,127 @@
+"""One picture on request, by a service."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam.exceptions import FrameFormatError, FrameTimeoutError, RosMessageError, SmartCamError
+from smartcam.frames import Frame, FrameSource, Moment, find_format
+from smartcam.frames._inside import jpeg_header, read_bitmap
+from smartcam.ros2._cameras.image_messages import image_fields, prepared
+from smartcam.ros2._cameras.messages import error_text
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.camera import Camera
+    from smartcam.ros2._cameras.lens import CameraLens
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+LONGEST: Final = 60.0
+"""Seconds that a request may give a picture, and has where it says none."""
+
+
+async def one_frame(
+    frames: FrameSource | None, camera: Camera[Any] | None, timeout: float
+) -> Frame:
+    """Return a picture: the first that is exposed after this, or the last one of the camera.
+
+    Raises:
+        SmartCamError: there is none in time.
+    """
+    if frames is not None:
+        return await frames.after(time.monotonic(), timeout=timeout)
+    if camera is None:
+        raise RosMessageError("there is nothing to take a picture of")
+    if camera.capabilities.read_image and not getattr(camera, "has_frames", False):
+        data = await camera.read_image(timeout=timeout)
+        return await asyncio.to_thread(frame_of_file, data, camera.name)
+    return await camera.frame_after(timeout=timeout)
+
+
+def frame_of_file(data: bytes, source: str) -> Frame:
+    """Return the frame of a file's bytes, a bitmap or a JPEG, that came just now; blocks.
+
+    Raises:
+        FrameFormatError: it is neither.
+    """
+    if data[:2] == b"\xff\xd8":
+        width, height, _ = jpeg_header(data, source)
+        name, kept, stride = "MJPEG", memoryview(data), 0
+    else:
+        try:
+            pixels = np.ascontiguousarray(read_bitmap(data))
+        except FrameFormatError as exc:
+            raise FrameFormatError(f"{source}: {exc}", source=source) from exc
+        height, width = pixels.shape[:2]
+        name, kept = "Mono8" if pixels.ndim == 2 else "RGB8", pixels.data.cast("B")
+        stride = pixels.nbytes // height
+    return Frame(
+        data=kept,
+        format=find_format(name),
+        width=width,
+        height=height,
+        stride=stride,
+        captured=time.monotonic(),
+        utc=time.time(),
+        moment=Moment.ARRIVAL,
+        duration=float("inf"),
+        sequence=0,
+        source=source,
+    )
+
+
+class PictureRequests:
+    """Serves ``smartcam_msgs/srv/RequestImage``: one picture, and the lens beside it.
+
+    Args:
+        node: node that serves.
+        frame_id: name of the camera's optical frame.
+        lens: the camera's lens.
+        take: function that returns a picture within so many seconds.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        frame_id: str,
+        lens: CameraLens,
+        take: Callable[[float], Awaitable[Frame]],
+    ) -> None:
+        self._node, self._frame_id, self._lens, self._take = node, frame_id, lens, take
+        self._one_at_a_time = asyncio.Lock()
+
+    async def serve(self, request: Any) -> dict[str, Any]:
+        """Answer a request."""
+        try:
+            return await self._serve(request.timeout)
+        except SmartCamError as exc:
+            logger.warning("%s ! a picture was asked for in vain: %s", self._node.full_name, exc)
+            return {"error": error_text(exc)}
+
+    async def _serve(self, asked: float) -> dict[str, Any]:
+        if not 0 <= asked <= LONGEST:
+            raise RosMessageError(f"timeout: expected 0 to {LONGEST:g} seconds, got {asked:g}")
+        timeout = asked or LONGEST
+        try:
+            async with asyncio.timeout(timeout):
+                await self._one_at_a_time.acquire()
+        except TimeoutError as exc:
+            raise FrameTimeoutError(
+                f"no picture in {timeout:g} s: those that were asked for before took as long"
+            ) from exc
+        try:
+            await self._lens.load()
+            frame = await asyncio.to_thread(prepared, await self._take(timeout))
+        finally:
+            self._one_at_a_time.release()
+        return {
+            "image": image_fields(frame, self._frame_id),
+            "camera_info": self._lens.fields(frame),
+        }

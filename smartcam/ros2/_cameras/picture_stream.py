@@ -1,0 +1,159 @@
+"""A stream of pictures on a topic, while somebody hears it: the newest only."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+from smartcam.backoff import Backoff
+from smartcam.exceptions import FrameFormatError, FrameTimeoutError, SmartCamError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+    from contextlib import AbstractAsyncContextManager
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+Item = TypeVar("Item")
+
+LOOK: Final = 0.1
+"""Seconds between two looks whether somebody hears."""
+
+SELDOM: Final = 1.0
+"""Seconds between two looks where the graph tells of who comes; and for looks after it has."""
+
+AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
+"""Delays after which a source that ended is opened again, while somebody hears."""
+
+
+class HeardPictures(Generic[Item]):
+    """Reads a source while one of its topics is heard, and has each frame published.
+
+    Args:
+        name: name of the camera, for the log.
+        publishers: publishers of the topics.
+        read: opens a reader whose iteration waits for so many seconds.
+        publish: publishes a frame; the next one is taken when it is done.
+
+    Attributes:
+        frames: frames that were published.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        publishers: Sequence[Any],
+        read: Callable[[float], AbstractAsyncContextManager[AsyncIterator[Item]]],
+        publish: Callable[[Item], Awaitable[None]],
+    ) -> None:
+        self.frames: int = 0
+        self._name, self._publishers = name, publishers
+        self._read, self._publish = read, publish
+        self._told = ""
+        self._woken = asyncio.Event()
+        self._watches: list[Callable[[], None]] = []
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begin to look whether somebody hears."""
+        if self._task is None:
+            watches = [getattr(one, "watch", None) for one in self._publishers]
+            if None not in watches:
+                self._watches = [watch(self._woken.set) for watch in watches if watch]
+            self._task = asyncio.get_running_loop().create_task(
+                self._run(), name=f"pictures of {self._name}"
+            )
+
+    def end(self) -> None:
+        """Read no longer, as soon as may be. Idempotent."""
+        watches, self._watches = self._watches, []
+        for end in watches:
+            end()
+        if self._task is not None:
+            self._task.cancel()
+
+    async def close(self) -> None:
+        """Read no longer. Idempotent.
+
+        Cancellation: it ends all the same.
+        """
+        self.end()
+        if self._task is not None:
+            await asyncio.wait([self._task])
+            self._task = None
+
+    @property
+    def heard(self) -> bool:
+        """True if somebody hears one of the topics, as far as is known."""
+        return any(getattr(one, "heard", True) for one in self._publishers)
+
+    async def _run(self) -> None:
+        while True:
+            await self._until_heard()
+            before = self.frames
+            delays = AGAIN.delays()
+            while self.heard:
+                await self._stream()
+                if self.frames > before:
+                    before, delays = self.frames, AGAIN.delays()
+                await self._pause(next(delays))
+
+    async def _until_heard(self) -> None:
+        """Wait until somebody hears; look seldom where the graph wakes it."""
+        loop = asyncio.get_running_loop()
+        often = 0.0
+        while not self.heard:
+            pause = LOOK if not self._watches or loop.time() < often else SELDOM
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause):
+                    await self._woken.wait()
+                often = loop.time() + SELDOM
+                self._woken.clear()
+                await asyncio.sleep(0)
+
+    async def _pause(self, seconds: float) -> None:
+        """Wait before the source is opened again, for as long as somebody hears."""
+        loop = asyncio.get_running_loop()
+        end = loop.time() + seconds
+        while self.heard and loop.time() < end:  # noqa: ASYNC110 - nothing tells of it
+            await asyncio.sleep(LOOK)
+
+    async def _stream(self) -> None:
+        """Publish until nobody hears, or the source ends."""
+        try:
+            async with self._read(LOOK) as reader:
+                while self.heard:
+                    with contextlib.suppress(FrameTimeoutError):
+                        await self._one(await anext(reader))
+        except StopAsyncIteration:
+            self._tell("the source of pictures ended; it is tried again while somebody hears")
+        except SmartCamError as exc:
+            self._tell(str(exc))
+        except Exception:
+            logger.exception("%s ! its pictures failed", self._name)
+
+    async def _one(self, frame: Item) -> None:
+        try:
+            await self._publish(frame)
+        except FrameFormatError as exc:  # the next one may be whole
+            self._tell(str(exc))
+            return
+        self.frames += 1
+        self._told = ""
+
+    def _tell(self, text: str) -> None:
+        """Say in the log what is wrong, once until pictures come again."""
+        if text != self._told:
+            self._told = text
+            logger.warning("%s ! %s", self._name, text)
+
+
+async def say_newest(publisher: Any, fields: dict[str, Any]) -> None:
+    """Publish the newest; a node of ROS 1 has a queue of its own for that."""
+    newest = getattr(publisher, "publish_newest", None)
+    if newest is None:
+        publisher.publish(fields)
+    else:
+        await newest(fields)

@@ -1,0 +1,218 @@
+"""A camera's pictures on ROS: ``image_raw``, ``camera_info``, ``image_raw/compressed``."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from smartcam.exceptions import ConfigurationError, RosError, UnsupportedError
+from smartcam.frames import Codecs, FrameSource
+from smartcam.ros2._cameras.image_messages import (
+    ENCODINGS,
+    compressed_fields,
+    compression,
+    image_fields,
+    prepared,
+)
+from smartcam.ros2._cameras.lens import CameraLens
+from smartcam.ros2._cameras.picture_requests import PictureRequests, one_frame
+from smartcam.ros2._cameras.picture_stream import HeardPictures, say_newest
+from smartcam.ros2._node.qos import DRIVER
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from contextlib import AbstractAsyncContextManager
+
+    from smartcam.camera import Camera
+    from smartcam.frames import Frame, FrameReader
+
+Value = TypeVar("Value")
+
+SIZE_TIMEOUT: Final = 10.0
+"""Seconds for a picture whose size is asked for."""
+
+RECENT: Final = 16
+"""Stamps of pictures that are remembered: each has one ``camera_info``."""
+
+
+class CameraPictures:
+    """Publishes what a camera sees, while somebody hears it, and serves single pictures.
+
+    Topics, private to the node: ``image_raw``, ``camera_info``, ``image_raw/compressed``; services:
+    ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp:
+    when it was captured. Who is slow gets the newest, and holds up nobody.
+
+    Args:
+        camera: the camera; None where ``frames`` is all there is.
+        node: open node of ROS.
+        frames: an open source of its pictures, which stays the caller's; None: the camera's own
+            :meth:`~smartcam.Camera.frames`, where it has some.
+        frame_id: the optical frame, z ahead and y down (REP-103); "": the node's name with
+            ``_optical``.
+        camera_info_url: the file of the lens, ``file:///PATH`` or a path, which need not be there
+            yet; "": none, and the lens is that of the frames.
+        quality: quality of JPEGs, 1 to 100.
+
+    Raises:
+        ConfigurationError: a value cannot be, or there is neither a camera nor a source.
+    """
+
+    def __init__(
+        self,
+        camera: Camera[Any] | None,
+        node: Any,
+        *,
+        frames: FrameSource | None = None,
+        frame_id: str = "",
+        camera_info_url: str = "",
+        quality: int = 85,
+    ) -> None:
+        if camera is None and frames is None:
+            raise ConfigurationError("pictures: expected a camera or a source of frames, got none")
+        if not 1 <= quality <= 100:
+            raise ConfigurationError(f"pictures: quality: expected 1 to 100, got {quality!r}")
+        self._camera, self._node, self._frames, self._quality = camera, node, frames, quality
+        self.frame_id: str = frame_id or f"{node.name}_optical"
+        self._lens = CameraLens(node.name, self.frame_id, camera_info_url, self._size_of_pictures)
+        self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
+        self._ends: list[Any] = []
+        self._streams: list[HeardPictures[Frame]] = []
+        self._stamps: collections.deque[float] = collections.deque(maxlen=RECENT)
+        self._size: tuple[int, int] | None = None
+        self._codecs = Codecs(threads=1)
+        self._thread: ThreadPoolExecutor | None = None
+
+    @property
+    def streams(self) -> bool:
+        """True if there are frames, and not only single pictures."""
+        if self._frames is not None:
+            return True
+        known = getattr(self._camera, "has_frames", None)
+        if known is not None:
+            return bool(known)
+        try:
+            self._read(1.0)
+        except UnsupportedError:
+            return False
+        return True
+
+    def start(self) -> None:
+        """Have the topics and services; the device streams when somebody hears."""
+        if self._thread is not None:
+            return
+        self._thread = ThreadPoolExecutor(1, "smartcam-ros2-pictures")
+        self._codecs = Codecs(threads=1)
+        self._codecs.begin()
+        node = self._node
+        if self.streams:
+            image = node.publisher("~/image_raw", "sensor_msgs/msg/Image", qos=DRIVER)
+            info = node.publisher("~/camera_info", "sensor_msgs/msg/CameraInfo", qos=DRIVER)
+            small = node.publisher(
+                "~/image_raw/compressed", "sensor_msgs/msg/CompressedImage", qos=DRIVER
+            )
+            self._ends += [image, info, small]
+            self._image, self._info, self._small = image, info, small
+            name = node.full_name
+            self._streams = [
+                HeardPictures(name, (image, info), self._read, self._publish_raw),
+                HeardPictures(
+                    name, (small,), partial(self._read, encoding="jpeg"), self._publish_small
+                ),
+            ]
+        self._ends.append(
+            node.serve("~/set_camera_info", "sensor_msgs/srv/SetCameraInfo", self._lens.set)
+        )
+        kind = "smartcam_msgs/srv/RequestImage"
+        self._ends.append(node.serve("~/request_image", kind, self._requests.serve))
+        for one in self._streams:
+            one.start()
+
+    async def close(self) -> None:
+        """Be gone; a source of the caller's stays open. Idempotent.
+
+        Cancellation: all is closed all the same.
+        """
+        streams, self._streams = self._streams, []
+        for one in streams:
+            one.end()
+        try:
+            for one in streams:
+                await one.close()
+        finally:
+            for end in self._ends:
+                end.close()
+            self._ends.clear()
+            thread, self._thread = self._thread, None
+            if thread is not None:
+                thread.shutdown(wait=False, cancel_futures=True)
+            await self._codecs.close()
+
+    # ------------------------------------------------------------------ frames
+
+    def _read(
+        self, timeout: float, encoding: Any = "raw"
+    ) -> AbstractAsyncContextManager[FrameReader]:
+        if self._frames is not None:
+            return self._frames.reader(timeout=timeout)
+        if self._camera is None:
+            raise ConfigurationError("pictures: there is no source")
+        quality = None if encoding == "raw" else self._quality
+        return self._camera.frames(encoding=encoding, quality=quality, timeout=timeout)
+
+    async def _one(self, timeout: float) -> Frame:
+        frame = await one_frame(self._frames, self._camera, timeout)
+        self._size = (frame.width, frame.height)
+        return frame
+
+    async def _size_of_pictures(self) -> tuple[int, int]:
+        if self._frames is not None:
+            return self._frames.format.width, self._frames.format.height
+        if self._size is None:
+            await self._one(SIZE_TIMEOUT)
+        return self._size or (0, 0)
+
+    # ------------------------------------------------------------------ messages
+
+    async def _publish_raw(self, frame: Frame) -> None:
+        self._size = (frame.width, frame.height)
+        if _heard(self._image):
+            ready = frame
+            if frame.format.name not in ENCODINGS:
+                ready = await self._in_thread(lambda: prepared(frame))
+            await say_newest(self._image, image_fields(ready, self.frame_id))
+        await self._publish_info(frame)
+
+    async def _publish_small(self, frame: Frame) -> None:
+        self._size = (frame.width, frame.height)
+        way = compression(frame)
+        small = frame
+        if way.first:
+            small = await self._codecs.converted(small, way.first)
+        if way.how == "png":
+            small = await self._codecs.png(small)
+        elif way.how == "jpeg":
+            small = await self._codecs.jpeg(small, quality=self._quality)
+        await say_newest(self._small, compressed_fields(small, way.text(), self.frame_id))
+        await self._publish_info(frame)
+
+    async def _publish_info(self, frame: Frame) -> None:
+        """Publish the lens beside a picture; where two streams have it, once."""
+        if frame.utc in self._stamps:
+            return
+        self._stamps.append(frame.utc)
+        if _heard(self._info):
+            await self._lens.load()
+            self._info.publish(self._lens.fields(frame))
+
+    async def _in_thread(self, work: Callable[[], Value]) -> Value:
+        """Have the thread for it do something; what is under way is finished."""
+        if self._thread is None:
+            raise RosError("these pictures are closed")
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+
+
+def _heard(publisher: Any) -> bool:
+    return bool(getattr(publisher, "heard", True))

@@ -1,0 +1,68 @@
+"""Find out how a camera's results are read, before they can be published."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam._client._inside import in_pixels, localizations_of, own_interpreter, without_poses
+from smartcam.interpreters import resolve
+
+if TYPE_CHECKING:
+    from smartcam._client._inside import Interpretation
+    from smartcam.camera import Camera
+    from smartcam.models import Localization, Result
+    from smartcam.settings import Address
+
+
+def reading_of(camera: Camera[Any]) -> Interpretation:
+    """Return the interpretation of results that no trigger reads otherwise."""
+    return camera._default  # noqa: SLF001 - smartcam's own
+
+
+def place_of(camera: Camera[Any]) -> Address:
+    """Return the address of a camera itself, as far as it is known."""
+    return camera._place  # noqa: SLF001 - smartcam's own
+
+
+def calibrations_of(given: Any) -> dict[int | None, Any]:
+    """Return the calibrations of a camera's settings by application; None: of all of them."""
+    if hasattr(given, "items") and not hasattr(given, "to_robot"):
+        return {number: one for number, one in given.items() if one is not None}
+    return {} if given is None else {None: given}
+
+
+def calibration_of(given: Any, application: int) -> Any:
+    """Return the calibration of an application in a camera's settings; None without one."""
+    found = calibrations_of(given)
+    return found.get(application, found.get(None))
+
+
+def frame_of_robot(calibration: Any) -> str:
+    """Return the frame that a calibration says its poses are in; empty where it says none."""
+    named = getattr(calibration, "robot_frame", None) or getattr(calibration, "frame", None)
+    return named if isinstance(named, str) else ""
+
+
+def calibrated(camera: Camera[Any], application: int) -> bool:
+    """Return True if a calibration brings an application's localizations to a robot."""
+    return calibration_of(camera.settings.calibration, application) is not None
+
+
+def localizations_in_metres(
+    camera: Camera[Any], result: Result[Any], spec: str | None = None
+) -> list[Localization] | None:
+    """Return a result's localizations; None where it has none, or has them in pixels.
+
+    Args:
+        camera: the camera.
+        result: a result of the camera.
+        spec: name of the interpreter of the result; None for the camera's own.
+    """
+    parts = localizations_of(result.value)
+    if parts is None or calibrated(camera, result.application):
+        return parts
+    reader = own_interpreter(camera, result.application) if spec is None else resolve(spec)
+    if in_pixels(reader):
+        return None
+    other = not parts and reader is not None and without_poses(reader) is not None
+    return None if other else parts  # an empty list may be of texts, or of records

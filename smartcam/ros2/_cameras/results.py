@@ -1,0 +1,334 @@
+"""The results of a camera on topics of its node, each once and in order.
+
+``~/results`` has all of them, ``~/localizations`` (``PoseArray``) and ``~/detections``
+(``Detection3DArray``) those that are localizations in metres.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import logging
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from smartcam._thesis import DEFAULT_QUEUED_RESULTS, MAX_DELAY, MAX_QUEUED_RESULTS
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam.exceptions import ConfigurationError, InterpretationError, SmartCamError
+from smartcam.ros2._cameras.messages import DETECTIONS, POSES, RESULT, ResultMessages
+from smartcam.ros2._cameras.reading import localizations_in_metres
+from smartcam.ros2._node.qos import DRIVER, QoS
+
+if TYPE_CHECKING:
+    from smartcam.camera import Camera
+    from smartcam.models import Result
+    from smartcam.streams import Subscription
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+TOPICS: Final = {"results": RESULT, "localizations": POSES, "detections": DETECTIONS}
+"""Names, private to the node, and types."""
+
+MAX_QUEUED_BYTES: Final = 1 << 24
+"""Bytes of the containers whose results wait for a topic with a delay."""
+
+MAX_WAITING_RESULTS: Final = 4096
+"""Results that wait to be published; the oldest beyond is dropped, counted."""
+
+
+class CameraResults:
+    """Publishes the results of a camera, whoever triggered it.
+
+    A header's stamp is when a result arrived, by the clock of the machine that has the session (of
+    a camera of a fleet: its agent's); no protocol of these cameras says when it was made. Results
+    that arrived together have the same one. Its ``frame_id`` is the camera's, or the robot's where
+    a calibration brought it there.
+
+    What cannot be read has only a message on ``~/results``, with its ``error``. Localizations in
+    pixels stand there as JSON, and nowhere else: the other topics have metres.
+
+    Args:
+        camera: camera whose results are published.
+        node: node that publishes them, of ROS 2 or ROS 1.
+        frame_id: name of the camera's frame; by default the camera's name.
+        robot_frame: name of the robot's frame; empty: as the calibration calls it.
+
+    Attributes:
+        active: whether results are published; otherwise they are let go as they come.
+        taken: results that came to be published, those that could not be read included.
+        failed: results that could not be read.
+        refused: messages that could not be made of a result.
+    """
+
+    def __init__(
+        self,
+        camera: Camera[Any],
+        node: Any,
+        *,
+        frame_id: str | None = None,
+        robot_frame: str = "",
+    ) -> None:
+        self.active: bool = True
+        self.taken: int = 0
+        self.failed: int = 0
+        self.refused: int = 0
+        self._camera, self._node = camera, node
+        calibration = camera.settings.calibration
+        self._messages = ResultMessages(
+            node.types, camera.name, frame_id or camera.name, calibration, robot_frame
+        )
+        self._publishers: dict[str, Any] = {}
+        self._outlet: _SubscriberOutlet | None = None
+        self._stream: Subscription[Result] | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def messages(self) -> ResultMessages:
+        """Maker of messages from this camera's results."""
+        return self._messages
+
+    @property
+    def dropped(self) -> int:
+        """Results that came faster than they could be published, and those a delay dropped."""
+        waiting = 0 if self._stream is None else self._stream.statistics().dropped
+        return waiting + (0 if self._outlet is None else self._outlet.dropped)
+
+    @property
+    def heard(self) -> bool:
+        """True if anybody hears any of the topics."""
+        outlet = () if self._outlet is None else (self._outlet,)
+        return any(_heard(one) for one in (*self._publishers.values(), *outlet))
+
+    def start(self) -> None:
+        """Have the topics, and publish what comes from now on. Idempotent.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        if self._task is not None:
+            return
+        try:
+            for name, kind in TOPICS.items():
+                self._declare(name, kind)
+        except BaseException:
+            self._withdraw()
+            raise
+        self._stream = self._camera.results(max_queue=MAX_WAITING_RESULTS)
+        self._task = asyncio.get_running_loop().create_task(
+            self._run(self._stream), name=f"{self._camera.name}: results to ROS"
+        )
+
+    def _declare(self, name: str, kind: str) -> None:
+        try:
+            self._publishers[name] = self._node.publisher(f"~/{name}", kind, qos=DRIVER)
+        except ConfigurationError as exc:
+            if kind != DETECTIONS:
+                raise
+            logger.info("%s: without %s: %s", self._node.full_name, name, exc)  # as in ROS 1
+
+    async def close(self) -> None:
+        """Publish no more, and have the topics no more. Idempotent."""
+        task, self._task = self._task, None
+        stream, self._stream = self._stream, None
+        try:
+            if task is not None:
+                task.cancel()
+                await asyncio.wait((task,))
+        finally:
+            if stream is not None:
+                stream.close()
+            self._withdraw()
+
+    def _withdraw(self) -> None:
+        self.publish_on("")
+        for publisher in self._publishers.values():
+            publisher.close()
+        self._publishers.clear()
+
+    def publish_on(
+        self, topic: str, min_delay: float = 0.0, queue_size: int = DEFAULT_QUEUED_RESULTS
+    ) -> None:
+        """Publish all results on one more topic, in place of the last one given here.
+
+        Args:
+            topic: name of the topic, whose messages are as on ``~/results``; empty for none.
+            min_delay: least seconds between two messages; results wait for that.
+            queue_size: most results that may wait; beyond, the oldest is dropped and counted.
+
+        Raises:
+            ConfigurationError: the topic has no valid name, or a number is out of range.
+        """
+        if not 0 <= min_delay <= MAX_DELAY:
+            raise ConfigurationError(
+                f"{self._camera.name}: min_delay {min_delay}: expected 0 to {MAX_DELAY:g} seconds"
+            )
+        if not 1 <= queue_size <= MAX_QUEUED_RESULTS:
+            raise ConfigurationError(
+                f"{self._camera.name}: queue_size {queue_size}: expected 1 to {MAX_QUEUED_RESULTS}"
+            )
+        before, self._outlet = self._outlet, None
+        if before is not None and before.topic == topic:
+            self._outlet = before.heir(min_delay, queue_size)
+            return
+        try:
+            if topic:
+                publisher = self._other_topic(topic, queue_size)
+                self._outlet = _SubscriberOutlet(topic, publisher, min_delay, queue_size)
+        except BaseException:
+            self._outlet = before
+            raise
+        if before is not None:
+            before.close()
+
+    def _other_topic(self, topic: str, depth: int) -> Any:
+        publisher = self._node.publisher(topic, RESULT, qos=QoS(depth=depth))
+        own = self._publishers.get("results")
+        if own is not None and _name(publisher) == _name(own):
+            publisher.close()
+            raise ConfigurationError(
+                f"{self._camera.name}: {_name(own)} has its results already: expected another "
+                "topic, or none"
+            )
+        return publisher
+
+    # ------------------------------------------------------------------ what comes
+
+    async def _run(self, stream: Subscription[Result]) -> None:
+        while True:
+            try:
+                result = await anext(stream)
+            except StopAsyncIteration:
+                return
+            except InterpretationError as exc:
+                self._take_failed(exc)
+            except SmartCamError as exc:
+                logger.warning("%s: no results any more: %s", self._camera.name, exc)
+                return
+            else:
+                self._take(result)
+            await asyncio.sleep(0)  # others want the loop, too
+
+    def _take(self, result: Result) -> None:
+        if not self.active:
+            return
+        self.taken += 1
+        parts, make = localizations_in_metres(self._camera, result), self._messages
+        if parts is not None:
+            self._say("localizations", lambda: make.poses(result, parts))
+            self._say("detections", lambda: make.detections(result, parts))
+        self._say_result(_Made(result.number, lambda: make.result(result, parts), len(result.raw)))
+
+    def _take_failed(self, error: InterpretationError) -> None:
+        if not self.active:
+            return
+        self.taken += 1
+        self.failed += 1
+        level = logging.DEBUG if self.failed > 1 else logging.WARNING
+        logger.log(level, "%s ! a result has no poses: %s", self._camera.name, error)
+        message = self._messages.failed(error, datetime.now(UTC))
+        self._say_result(_Made(0, lambda: message, 0))
+
+    def _say_result(self, made: _Made) -> None:
+        self._say("results", made.make)
+        if self._outlet is not None:
+            self._outlet.offer(made, self._put)
+
+    def _say(self, name: str, make: Any) -> None:
+        publisher = self._publishers.get(name)
+        if publisher is not None:
+            self._put(publisher, make)
+
+    def _put(self, publisher: Any, make: Any) -> None:
+        if not _heard(publisher):
+            return
+        try:
+            publisher.publish(make())
+        except SmartCamError as exc:
+            self.refused += 1
+            level = logging.DEBUG if self.refused > 1 else logging.WARNING
+            logger.log(level, "%s ! a result was not published: %s", self._node.full_name, exc)
+        except ENDS_PROGRAM:
+            raise
+        except BaseException:
+            self.refused += 1
+            logger.exception("%s ! a result was not published", self._node.full_name)
+
+
+def _heard(publisher: Any) -> bool:
+    """Return False if it is known that nobody hears a topic, else True."""
+    return bool(getattr(publisher, "heard", True))
+
+
+def _name(publisher: Any) -> str:
+    return str(getattr(publisher, "name", "") or publisher.topic)
+
+
+class _Made(NamedTuple):
+    """A message that is made when it is said."""
+
+    number: int
+    make: Any
+    size: int
+
+
+class _SubscriberOutlet:
+    """A topic with a delay between two messages, and a queue for that.
+
+    Attributes:
+        dropped: results that found no room, or were left when it was closed.
+    """
+
+    def __init__(self, topic: str, publisher: Any, min_delay: float, queue_size: int) -> None:
+        self.topic = topic
+        self.dropped: int = 0
+        self._publisher, self._min_delay, self._queue_size = publisher, min_delay, queue_size
+        self._queue: collections.deque[_Made] = collections.deque()
+        self._bytes = 0
+        self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def heard(self) -> bool:
+        """True if anybody hears the topic."""
+        return _heard(self._publisher)
+
+    def offer(self, made: _Made, put: Any) -> None:
+        """Have a message said, when it is time."""
+        if not self.heard:
+            return
+        self._queue.append(made)
+        self._bytes += made.size
+        self._go_on(put)
+        while len(self._queue) > self._queue_size or self._bytes > MAX_QUEUED_BYTES:
+            self._bytes -= self._queue.popleft().size
+            self.dropped += 1
+
+    def _go_on(self, put: Any) -> None:
+        while self._queue and self._timer is None:
+            made = self._queue.popleft()
+            self._bytes -= made.size
+            put(self._publisher, made.make)
+            if self._min_delay:
+                loop = asyncio.get_running_loop()
+                self._timer = loop.call_later(self._min_delay, self._next, put)
+
+    def _next(self, put: Any) -> None:
+        self._timer = None
+        self._go_on(put)
+
+    def heir(self, min_delay: float, queue_size: int) -> _SubscriberOutlet:
+        """Return one that goes on with the same publisher; what waited here is dropped."""
+        self._end()
+        made = _SubscriberOutlet(self.topic, self._publisher, min_delay, queue_size)
+        made.dropped = self.dropped
+        return made
+
+    def _end(self) -> None:
+        self.dropped += len(self._queue)
+        self._queue.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def close(self) -> None:
+        """Say nothing more; what waits is dropped."""
+        self._end()
+        self._publisher.close()

@@ -1,0 +1,157 @@
+"""Take pictures on topics and frames of TF from ROS, for a calibration."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._ros_names import resolve
+from smartcam.exceptions import RosError
+from smartcam.geometry import Code
+from smartcam.ros2._cameras.image_messages import frame_from, utc_of
+from smartcam.ros2._cameras.lens_messages import lens_from
+from smartcam.ros2._cameras.transform_listener import TransformListener
+from smartcam.ros2._node.qos import QoS
+
+if TYPE_CHECKING:
+    from smartcam.calibration._inside import ThesisCalibration
+    from smartcam.geometry import CameraModel, Transform
+
+IMAGE: Final = "sensor_msgs/msg/Image"
+COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
+
+CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
+
+LENS_WAIT: Final = 1.5
+"""Seconds that the lens of a camera on a topic is waited for, before a wizard begins."""
+
+PICTURE_WAIT: Final = 25.0
+"""Seconds that a picture on a topic is waited for."""
+
+MAX_APART: Final = 60.0
+"""Seconds between a stamp and this computer's clock beyond which the stamp is no time of ours."""
+
+
+class CameraGraph:
+    """The graph that a camera's node is in, for the calibrations of the camera.
+
+    Args:
+        node: open node of ROS.
+        calibrations: the calibrations; None where there are none.
+        owned: whether the calibrations end with the node, since no other face has them.
+    """
+
+    def __init__(self, node: Any, calibrations: ThesisCalibration | None, *, owned: bool) -> None:
+        self._node, self._calibrations, self._owned = node, calibrations, owned
+        self._transforms = TransformListener(node)
+
+    def start(self) -> None:
+        """Let the calibrations use the graph."""
+        if self._calibrations is not None:
+            self._calibrations.graph = self
+
+    async def close(self) -> None:
+        """Let them use it no more. Idempotent."""
+        calibrations = self._calibrations
+        if calibrations is not None and calibrations.graph is self:
+            calibrations.graph = None
+            if self._owned:
+                calibrations.close()
+        await self._transforms.close()
+
+    def check_topic(self, topic: str) -> None:
+        """Raise ConfigurationError where there can be no such topic."""
+        self._full(topic)
+
+    def listen(self) -> None:
+        """Hear transforms from now on."""
+        self._transforms.listen()
+
+    async def pose(self, frame: str, base: str, utc: float | None) -> Transform:
+        """Return the pose of a frame in another one, as :meth:`TransformListener.pose`."""
+        return await self._transforms.pose(frame, base, utc)
+
+    async def root(self, frame: str) -> str:
+        """Return the root of the tree that a frame is in."""
+        return await self._transforms.root(frame)
+
+    async def picture(self, topic: str) -> tuple[Any, float | None]:
+        """Return the grey levels of a picture that was taken after this call, and its time, UTC.
+
+        A stamp that is no time of this computer's clock tells nothing: then the second picture that
+        comes counts, and it has no time.
+
+        Raises:
+            CalibrationError: NO_PICTURE: none came in time.
+            FrameFormatError: it is no picture.
+        """
+        full = self._full(topic)
+        kind = self._kind(full)
+        came: list[float] = []
+        heard = self._node.subscribe(full, kind, qos=QoS(reliable=False, depth=1))
+        try:
+            async with asyncio.timeout(PICTURE_WAIT):
+                message, utc = await _fresh(heard, came)
+        except TimeoutError as exc:
+            raise self._missing(full, kind, came) from exc
+        except StopAsyncIteration as exc:
+            raise RosError(f"{full}: the node of the camera was closed meanwhile") from exc
+        finally:
+            heard.close()
+        frame = frame_from(message, source=topic)
+        return await asyncio.to_thread(frame.grey), utc
+
+    async def lens(self, topic: str) -> CameraModel | None:
+        """Return the lens that ``camera_info`` beside a topic with pictures tells.
+
+        None where nobody says it within :data:`LENS_WAIT`, or the lens was not calibrated.
+
+        Raises:
+            RosMessageError, CalibrationError: it is no lens, or one that smartcam has no model of.
+        """
+        beside = f"{self._full(topic).removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        heard = self._node.subscribe(beside, CAMERA_INFO, qos=QoS(reliable=False, depth=1))
+        try:
+            async with asyncio.timeout(LENS_WAIT):
+                found = lens_from(await anext(heard))
+        except (TimeoutError, StopAsyncIteration):
+            return None
+        finally:
+            heard.close()
+        return None if found is None else found.camera
+
+    def _full(self, topic: str) -> str:
+        return resolve(topic, self._node.namespace, self._node.name)
+
+    def _kind(self, topic: str) -> str:
+        """Return the type of a topic with pictures: what is known of it, or what its name says."""
+        graph = getattr(self._node, "graph", None)
+        types = [] if graph is None else graph.topics().get(topic, [])
+        for kind in (IMAGE, COMPRESSED):
+            if kind in types:
+                return kind
+        return COMPRESSED if topic.endswith("/compressed") else IMAGE
+
+    def _missing(self, topic: str, kind: str, came: list[float]) -> Exception:
+        old = f"; {len(came)} came that were taken before" if came else ""
+        return Code.NO_PICTURE.refusal(
+            f"{topic}: no picture came within {PICTURE_WAIT:g} s{old}; expected {kind} with the "
+            "time of its exposure, from a camera that is running",
+            kind,
+            len(came),
+        )
+
+
+async def _fresh(heard: Any, came: list[float]) -> tuple[Any, float | None]:
+    """Return the first picture that was taken from now on, and its time."""
+    begun = time.time()
+    while True:
+        message = await anext(heard)
+        utc = utc_of(message.header)
+        if abs(utc - time.time()) <= MAX_APART:
+            if utc >= begun:
+                return message, utc
+        elif came:
+            return message, None
+        came.append(utc)

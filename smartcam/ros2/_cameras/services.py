@@ -1,0 +1,224 @@
+"""The services of a camera's node: the thesis' eleven, those of std_srvs, and a typed trigger.
+
+An error never leaves a call without a reply where the reply has a field for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._client._inside import in_pixels
+from smartcam._json import object_text
+from smartcam._thesis import MAX_TIMEOUT, THESIS, said_spec
+from smartcam._thesis_calibration import CALIBRATION
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.interpreters import resolve
+from smartcam.ros2._cameras.calibrations import RosCalibrationFace
+from smartcam.ros2._cameras.messages import error_text
+from smartcam.ros2._cameras.reading import calibrated, localizations_in_metres
+from smartcam.ros2._cameras.thesis import RosThesisFace, ThesisServices
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.calibration._inside import ThesisCalibration
+    from smartcam.camera import Camera
+    from smartcam.ros2._cameras.results import CameraResults
+    from smartcam.ros2._cameras.thesis import ManagedCamera
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+MAX_RESULTS: Final = 1000
+"""Results that one answer brings."""
+
+MAX_INPUT_BYTES: Final = 1 << 16
+MAX_LAYOUT_CHARACTERS: Final = 10_000
+CLOSE_TIMEOUT: Final = 5.0
+
+
+class CameraServices:
+    """Serves a camera; calls go to it as those of any program do.
+
+    Two calls at once are as two programs': one trigger after the other, each within its own
+    timeout. A caller that goes away ends its call, and the camera stays usable.
+
+    Args:
+        camera: the camera.
+        node: the camera's node.
+        results: the results that the node publishes.
+        life: the node's life cycle.
+        calibrations: the camera's calibrations; None where there is no folder for them.
+    """
+
+    def __init__(
+        self,
+        camera: Camera[Any],
+        node: Any,
+        results: CameraResults,
+        life: ManagedCamera,
+        calibrations: ThesisCalibration | None = None,
+    ) -> None:
+        self._camera, self._node, self._results = camera, node, results
+        face = RosThesisFace(camera, node, results, life)
+        self._thesis = ThesisServices(face, node, results)
+        self._calibrating = RosCalibrationFace(camera, calibrations)
+        self._std: dict[str, tuple[str, Callable[[Any], Awaitable[str]]]] = {
+            "trigger": ("Trigger", self._trigger),
+            "start": ("Trigger", self._start),
+            "stop": ("Trigger", self._stop),
+            "reset_errors": ("Trigger", self._reset_errors),
+            "reboot": ("Trigger", self._reboot),
+            "run": ("SetBool", self._run),
+        }
+        # a trigger of another application has time of its own to go there and back
+        self._limit = MAX_TIMEOUT + 2 * camera.settings.switch_timeout + CLOSE_TIMEOUT
+        self._served: list[Any] = []
+
+    def start(self) -> None:
+        """Serve. Idempotent.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        if self._served:
+            return
+        try:
+            answers = dict.fromkeys(THESIS, self._thesis.answer)
+            answers |= dict.fromkeys(CALIBRATION, self._calibrating.answer)
+            for name, answer in answers.items():
+                do = functools.partial(answer, name)
+                self._serve(name, f"smartcam_msgs/srv/{name}", self._in_fields(do))
+            for name, (kind, tell) in self._std.items():
+                self._serve(name, f"std_srvs/srv/{kind}", self._in_words(tell))
+            typed = self._in_fields(self._trigger_results)
+            self._serve("trigger_results", "smartcam_msgs/srv/TriggerResults", typed)
+        except BaseException:
+            self._withdraw()
+            raise
+
+    async def close(self) -> None:
+        """Serve no more; calls under way are given up. Idempotent, bounded."""
+        served = self._withdraw()
+        await self._thesis.close()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                for one in served:
+                    if hasattr(one, "wait_closed"):
+                        await one.wait_closed()
+        except TimeoutError:
+            logger.warning("%s ! a call does not end", self._node.full_name)
+
+    def _withdraw(self) -> list[Any]:
+        served, self._served = self._served, []
+        for one in served:
+            one.close()
+        return served
+
+    # ------------------------------------------------------------------ errors become fields
+
+    def _serve(self, name: str, kind: str, handler: Any) -> None:
+        response = self._node.types.service(kind).response
+
+        async def answer(request: Any) -> Any:
+            return response.new(**await handler(request))
+
+        self._served.append(self._node.serve(f"~/{name}", kind, answer, timeout=self._limit))
+
+    def _in_fields(
+        self, do: Callable[[Any], Awaitable[dict[str, Any]]]
+    ) -> Callable[[Any], Awaitable[dict[str, Any]]]:
+        """Return a handler that answers with the fields of ``do``, or with ``error``."""
+
+        async def handler(request: Any) -> dict[str, Any]:
+            try:
+                return {"error": "", **await do(request)}
+            except Exception as exc:  # noqa: BLE001 - whatever it is, the caller hears of it
+                return {"error": self._told(exc)}
+
+        return handler
+
+    def _in_words(
+        self, do: Callable[[Any], Awaitable[str]]
+    ) -> Callable[[Any], Awaitable[dict[str, Any]]]:
+        """Return a handler that answers with ``success`` and the text of ``do``, or the error."""
+
+        async def handler(request: Any) -> dict[str, Any]:
+            try:
+                return {"success": True, "message": await do(request)}
+            except Exception as exc:  # noqa: BLE001 - whatever it is, the caller hears of it
+                return {"success": False, "message": self._told(exc)}
+
+        return handler
+
+    def _told(self, error: Exception) -> str:
+        if not isinstance(error, SmartCamError):
+            logger.error("%s ! a service failed", self._node.full_name, exc_info=error)
+            return error_text(RuntimeError(f"{type(error).__name__}: {error}"))
+        return error_text(error)
+
+    # ------------------------------------------------------------------ std_srvs
+
+    async def _trigger(self, _: object) -> str:
+        return object_text((await self._camera.trigger())._asdict())
+
+    async def _start(self, _: object) -> str:
+        await self._camera.start()
+        return ""
+
+    async def _stop(self, _: object) -> str:
+        await self._camera.stop()
+        return ""
+
+    async def _run(self, request: Any) -> str:
+        return await (self._start if request.data else self._stop)(request)
+
+    async def _reset_errors(self, _: object) -> str:
+        return str(await self._camera.reset_errors())
+
+    async def _reboot(self, _: object) -> str:
+        await self._camera.reboot()
+        return ""
+
+    # ------------------------------------------------------------------ typed
+
+    async def _trigger_results(self, request: Any) -> dict[str, Any]:
+        camera = self._camera
+        wanted, spec = request.results_per_trigger or 1, said_spec(request.interpret_as)
+        self._check(request, wanted, spec)
+        results = await camera.trigger(
+            request.application_id or None,
+            interpret_as=spec,
+            input=bytes(request.input) or None,
+            timeout=request.timeout or DEFAULT_TRIGGER_TIMEOUT,
+            when_busy="refuse" if request.refuse_when_busy else "wait",
+            results_per_trigger=wanted,
+        )
+        make = self._results.messages.result
+        found = [make(one, localizations_in_metres(camera, one, spec)) for one in results]
+        return {"results": found}
+
+    def _check(self, request: Any, wanted: int, spec: str | None) -> None:
+        name = self._camera.name
+        if not 0 <= request.timeout <= MAX_TIMEOUT:
+            raise ConfigurationError(
+                f"{name}: timeout {request.timeout}: expected seconds up to {MAX_TIMEOUT:g}, or 0 "
+                f"for {DEFAULT_TRIGGER_TIMEOUT:g}"
+            )
+        for what, got, most in (
+            ("results_per_trigger", wanted, MAX_RESULTS),
+            ("bytes of input", len(request.input), MAX_INPUT_BYTES),
+            ("characters of interpret_as", len(spec or ""), MAX_LAYOUT_CHARACTERS),
+        ):
+            if got > most:
+                raise ConfigurationError(f"{name}: {what}: expected {most} at most, got {got}")
+        if spec is not None and in_pixels(resolve(spec)):
+            application = request.application_id or self._camera.active_application or 0
+            if not calibrated(self._camera, application):
+                raise ConfigurationError(
+                    f"{name}: interpret_as {spec!r:.80}: expected lengths, since poses in ROS are "
+                    "in metres, got pixels"
+                )

@@ -1,0 +1,109 @@
+"""A camera's status on a topic that the thesis' Setup names, beside ``~/status``."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._ros_names import resolve
+from smartcam.exceptions import SmartCamError
+from smartcam.ros2._cameras.health import STATUS_TYPE, KnownState, status_fields
+from smartcam.ros2._node.qos import LATCHED
+
+if TYPE_CHECKING:
+    from smartcam.camera import Camera
+    from smartcam.ros2._cameras.messages import ResultMessages
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+LEAST: Final = 0.05
+"""Seconds between two messages."""
+
+MAX_WAITING_EVENTS: Final = 64
+"""Events that wait; what counts is the state after them."""
+
+
+class CameraStatusTopic:
+    """Publishes a camera's status, latched, when it changes, on one topic at most.
+
+    Args:
+        camera: camera whose status is published.
+        node: node that publishes the topic.
+        messages: maker of the headers.
+    """
+
+    def __init__(self, camera: Camera[Any], node: Any, messages: ResultMessages) -> None:
+        self._camera, self._node, self._messages = camera, node, messages
+        self._topic = ""
+        self._publisher: Any = None
+        self._task: asyncio.Task[None] | None = None
+        self._ending: set[asyncio.Task[None]] = set()
+
+    def resolve(self, topic: str) -> str:
+        """Return a topic's full name; empty for none, and for the one that a node always has.
+
+        Raises:
+            ConfigurationError: the topic cannot be.
+        """
+        if not topic:
+            return ""
+        full = resolve(topic, self._node.namespace, self._node.name, "topic")
+        return "" if full == f"{self._node.full_name}/status" else full
+
+    def publish_on(self, topic: str) -> None:
+        """Publish on a topic, instead of the one that was said before; empty for none.
+
+        Raises:
+            ConfigurationError: the topic cannot be.
+        """
+        full = self.resolve(topic)
+        if full == self._topic:
+            return
+        self._end()
+        if full:
+            self._publisher = self._node.publisher(full, STATUS_TYPE, qos=LATCHED)
+            self._topic = full
+            self._task = asyncio.get_running_loop().create_task(
+                self._follow(self._publisher), name=f"{self._camera.name}: status to {full}"
+            )
+
+    def _end(self) -> None:
+        task, self._task = self._task, None
+        publisher, self._publisher, self._topic = self._publisher, None, ""
+        if task is not None:
+            task.cancel()
+            self._ending.add(task)
+            task.add_done_callback(self._ending.discard)
+        if publisher is not None:
+            publisher.close()
+
+    async def close(self) -> None:
+        """Publish no more. Idempotent."""
+        self._end()
+        if self._ending:
+            await asyncio.wait(tuple(self._ending))
+
+    async def _follow(self, publisher: Any) -> None:
+        said: dict[str, Any] | None = None
+        async with self._camera.events(max_queue=MAX_WAITING_EVENTS) as events:
+            while True:
+                fields = status_fields(KnownState.of(self._camera))
+                if fields != said:
+                    said = fields
+                    self._say(publisher, fields)
+                    await asyncio.sleep(LEAST)
+                try:
+                    await anext(events)
+                except (SmartCamError, StopAsyncIteration):
+                    break  # nothing more will come, and the status says why
+        if status_fields(KnownState.of(self._camera)) != said:
+            self._say(publisher, status_fields(KnownState.of(self._camera)))
+
+    def _say(self, publisher: Any, fields: dict[str, Any]) -> None:
+        header = self._messages.header(datetime.now(UTC), self._messages.frame_id)
+        try:
+            publisher.publish(publisher.type.new(header=header, **fields))
+        except SmartCamError as exc:
+            logger.warning("%s ! its status was not said: %s", self._node.full_name, exc)

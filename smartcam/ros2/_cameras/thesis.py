@@ -1,0 +1,216 @@
+"""The thesis' six services at a camera's node: a face of them that speaks in messages.
+
+There one node had many cameras, and ``camera_name`` said which. Here each camera has a node of its
+own, so the field may be empty; a name that is not this camera's is an error, since who says it
+talks to another camera than they think. What publishes goes through the node's life cycle.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, Any, Protocol
+
+from smartcam._thesis import THESIS, ThesisCall
+from smartcam.exceptions import ConfigurationError
+from smartcam.ros2._cameras.lifecycle import have_application
+from smartcam.ros2._cameras.messages import utf8
+from smartcam.ros2._cameras.reading import calibrated, place_of, reading_of
+from smartcam.ros2._cameras.status_topic import CameraStatusTopic
+from smartcam.settings import validated
+
+if TYPE_CHECKING:
+    from smartcam._client._inside import Interpretation
+    from smartcam._thesis import ThesisService
+    from smartcam.camera import Camera
+    from smartcam.ros2._cameras.results import CameraResults
+    from smartcam.settings import Address
+
+
+class ManagedCamera(Protocol):
+    """The life cycle that the thesis' services go through."""
+
+    @property
+    def state(self) -> Any:
+        """The present state, with its ``label``."""
+
+    async def configure(self) -> None:
+        """Go from Unconfigured to Inactive."""
+
+    async def activate(self) -> None:
+        """Go from Inactive to Active."""
+
+    async def deactivate(self) -> None:
+        """Go from Active to Inactive."""
+
+    async def cleanup(self) -> None:
+        """Go from Inactive to Unconfigured."""
+
+
+class RosThesisFace:
+    """A camera's node as the thesis' services see it.
+
+    Args:
+        camera: the camera.
+        node: the camera's node.
+        results: the results that the node publishes.
+        life: the node's life cycle.
+    """
+
+    def __init__(
+        self, camera: Camera[Any], node: Any, results: CameraResults, life: ManagedCamera
+    ) -> None:
+        self._camera, self._results, self._life = camera, results, life
+        self._status = CameraStatusTopic(camera, node, results.messages)
+        self.name: str = camera.name
+        self._stopped = False
+
+    @property
+    def stopped(self) -> bool:
+        """True if SmartcameraStop has closed the camera, and nobody has configured it since."""
+        return self._stopped and self._state not in {"inactive", "active"}
+
+    @stopped.setter
+    def stopped(self, stopped: bool) -> None:
+        self._stopped = stopped
+
+    @property
+    def address(self) -> Address:
+        """Address of the camera itself."""
+        return place_of(self._camera)
+
+    @property
+    def application(self) -> int | None:
+        """The id of the active application; None where that is not known."""
+        return self._camera.active_application
+
+    @property
+    def reading(self) -> Interpretation:
+        """Interpretation by which results are read."""
+        return reading_of(self._camera)
+
+    def check_reading(self, spec: str) -> None:
+        """Raise ConfigurationError where results cannot be read by ``spec``."""
+        self._camera._interpretation(spec)  # noqa: SLF001 - smartcam's own
+
+    def read_as(self, spec: str | None) -> None:
+        """Read results by ``spec`` from now on; None: as the settings say."""
+        self._camera._read_by(spec)  # noqa: SLF001 - smartcam's own
+
+    def is_calibrated(self, application: int) -> bool:
+        """Return True if a calibration turns an application's localizations into a robot's."""
+        return calibrated(self._camera, application)
+
+    def check_status_topic(self, topic: str) -> None:
+        """Raise ConfigurationError where there can be no such topic."""
+        self._status.resolve(topic)
+
+    def publish_status(self, topic: str) -> dict[str, Any]:
+        """Publish the status on this topic, and on none that was said before."""
+        self._status.publish_on(topic)
+        return {}
+
+    async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
+        """Publish results on this topic, and have the node active."""
+        self._results.publish_on(topic, min_delay, queue)
+        if self._state == "active":
+            return {}
+        try:
+            await self._life.activate()
+        except BaseException:
+            self._results.publish_on("")
+            raise
+        return {}
+
+    async def end_publishing(self) -> None:
+        """Publish no results, and the status on no topic that a request has named."""
+        self._results.publish_on("")
+        self._status.publish_on("")
+        if self._state == "active":
+            await self._life.deactivate()
+        if self._state == "inactive":
+            await self._life.cleanup()
+
+    async def have_session(self) -> None:
+        """Have the node configured."""
+        if self._state not in {"inactive", "active"}:
+            await self._life.configure()
+
+    async def ensure(self, application: int, timeout: float) -> None:
+        """Have an application running and ready."""
+        await have_application(self._camera, application, timeout)
+
+    async def switch(self, application: int, timeout: float) -> None:
+        """Load an application."""
+        await self._camera.switch_application(application, timeout=timeout)
+
+    async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
+        """Trigger; return the result's application, and its value as ``spec`` reads it."""
+        result = await self._camera.trigger(application, interpret_as=spec, timeout=timeout)
+        return result.application, result.value
+
+    async def close(self) -> None:
+        """Publish no status any more, and read results as the settings say. Idempotent."""
+        self.read_as(None)
+        await self._status.close()
+
+    @property
+    def _state(self) -> str:
+        return str(self._life.state.label)
+
+
+class ThesisServices:
+    """Answers requests of the six services with messages' fields.
+
+    Args:
+        face: the camera.
+        node: node of the camera.
+        results: results of the camera, which make messages of localizations.
+    """
+
+    def __init__(self, face: RosThesisFace, node: Any, results: CameraResults) -> None:
+        self._face, self._node, self._messages = face, node, results.messages
+        self._settling = asyncio.Lock()  # what is published changes for one after the other
+
+    async def close(self) -> None:
+        """Publish nothing any more that a request has asked for. Idempotent."""
+        await self._face.close()
+
+    async def answer(self, name: str, message: Any) -> dict[str, Any]:
+        """Do what a request asks for; return the fields of its answer but ``error``.
+
+        Raises:
+            SmartCamError: as the service ends.
+        """
+        self._check_name(message.camera_name)
+        service = THESIS[name]
+        request = self._request(name, service, message)
+        call = ThesisCall(self._face, request, request.timeout or service.timeout)
+        async with self._settling if service.settles else contextlib.nullcontext():
+            return self._said(await service.answer(call))
+
+    def _request(self, name: str, service: ThesisService, message: Any) -> Any:
+        known = [one for one in service.request.model_fields if hasattr(message, one)]
+        fields = {one: getattr(message, one) for one in known}
+        return validated(service.request, fields, f"{self._face.name}: {name}")
+
+    def _said(self, found: dict[str, Any]) -> dict[str, Any]:
+        if "strings" in found:
+            found["strings"] = [utf8(one) for one in found["strings"]]
+        if "localizations" in found:
+            found["localizations"] = self._messages.localizations(found["localizations"])
+        return found
+
+    def _check_name(self, name: str) -> None:
+        """See that a request is meant for this camera.
+
+        Raises:
+            ConfigurationError: it names another one.
+        """
+        camera, node = self._face.name, self._node
+        known = {camera, node.full_name, node.name}
+        if name and name.strip("/") not in {one.strip("/") for one in known}:
+            raise ConfigurationError(
+                f"camera_name {name!r:.80}: this is the node of {camera!r}: expected "
+                "that, or an empty text"
+            )

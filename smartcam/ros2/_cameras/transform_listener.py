@@ -1,0 +1,342 @@
+"""Hear ``/tf`` and ``/tf_static`` while somebody asks where a frame is, within bounds.
+
+Nothing is extrapolated. A pose that is wanted now is refused where the newest transform on the way
+is old: a robot whose driver has died stands in TF where it stood last.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import bisect
+import collections
+import logging
+import time
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+
+from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code, Transform
+from smartcam.ros2._cameras.image_messages import utc_of
+from smartcam.ros2._node.qos import QoS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+TYPE: Final = "tf2_msgs/msg/TFMessage"
+TOPICS: Final = {"/tf": QoS(depth=100), "/tf_static": QoS(latched=True, depth=100)}
+"""Topics of transforms, with the qualities of tf2's own listener."""
+
+LINGER: Final = 60.0
+"""Seconds for which transforms are heard after the last question."""
+
+WAIT: Final = 3.0
+"""Seconds that a transform which is not known yet is waited for."""
+
+MAX_AGE: Final = 2.0
+"""Seconds since the newest transform of a frame that moves, by its arrival and by its stamp."""
+
+MAX_GAP: Final = 1.0
+"""Seconds between two transforms that one in between is interpolated from."""
+
+NEAR: Final = 0.25
+"""Seconds before the first transform that was heard for which that one is still taken."""
+
+MAX_BACK: Final = 10.0
+"""Seconds that a stamp may be behind the newest one; beyond, the clock was set back."""
+
+MAX_FRAMES: Final = 2000
+"""Frames that are known at a time; others are left out, which the log tells."""
+
+MAX_MOMENTS: Final = 300
+"""Transforms of one frame that are kept; the oldest goes first."""
+
+MAX_NAMED: Final = 20
+"""Frames that the text of an error names."""
+
+Found = TypeVar("Found")
+
+
+@dataclass(eq=False)
+class _FrameLink:
+    """A frame and its parent.
+
+    Attributes:
+        child: the frame.
+        parent: the frame that it is in.
+        static: message of a transform that does not change; None of one that does.
+        times: times of the moments, UTC, in order.
+        moments: messages of the transform at these times.
+        came: moment at which the newest one arrived, of the monotonic clock.
+    """
+
+    child: str
+    parent: str
+    static: Any = None
+    times: collections.deque[float] = field(
+        default_factory=lambda: collections.deque[float](maxlen=MAX_MOMENTS)
+    )
+    moments: collections.deque[Any] = field(
+        default_factory=lambda: collections.deque[Any](maxlen=MAX_MOMENTS)
+    )
+    came: float = 0.0
+
+    def add(self, utc: float, message: Any) -> None:
+        """Take where the frame is at a moment; one older than the newest counts for nothing."""
+        if self.times and utc < self.times[-1] - MAX_BACK:  # the clock was set back
+            self.times.clear()
+            self.moments.clear()
+        if not self.times or utc > self.times[-1]:
+            self.times.append(utc)
+            self.moments.append(message)
+            self.came = time.monotonic()
+
+    def check_new(self) -> None:
+        """Raise (BAD_TIME) where the newest transform is old."""
+        silent, behind = time.monotonic() - self.came, time.time() - self.times[-1]
+        if silent > MAX_AGE or abs(behind) > MAX_AGE:
+            way = "behind" if behind > 0 else "ahead of"
+            raise Code.BAD_TIME.refusal(
+                f"TF: {self.parent} -> {self.child}: the newest transform came {silent:.1f} s ago, "
+                f"and its stamp is {abs(behind):.1f} s {way} this computer's clock; expected "
+                f"{MAX_AGE:g} s at most, from a robot that is running and clocks that agree",
+                MAX_AGE,
+                round(max(silent, abs(behind)), 3),
+            )
+
+    def at(self, utc: float) -> Transform:
+        """Return the transform at a time, interpolated.
+
+        Raises:
+            CalibrationError: BAD_TIME: it is not known; NOT_RIGID: it is none.
+        """
+        if self.static is not None:
+            return _transform(self, self.static, None)
+        place = bisect.bisect_left(self.times, utc)
+        if place < len(self.times) and self.times[place] == utc:
+            return _transform(self, self.moments[place], utc)
+        if place == 0 and self.times[0] - utc <= NEAR:
+            return _transform(self, self.moments[0], utc)
+        if place in {0, len(self.times)} or self.times[place] - self.times[place - 1] > MAX_GAP:
+            raise Code.BAD_TIME.refusal(
+                f"TF: {self.parent} -> {self.child}: nothing is known of {_text(utc)}; expected a "
+                f"time from {_text(self.times[0])} to {_text(self.times[-1])}, with transforms "
+                f"{MAX_GAP:g} s apart at most",
+                (self.times[0], self.times[-1]),
+                utc,
+            )
+        before, after = (
+            _transform(self, self.moments[one], self.times[one]) for one in (place - 1, place)
+        )
+        return before.between(after, _time(utc))
+
+
+class TransformListener:
+    """Hears transforms of a node's graph, from the first question on.
+
+    Args:
+        node: open node of ROS.
+    """
+
+    def __init__(self, node: Any) -> None:
+        self._node = node
+        self._links: dict[str, _FrameLink] = {}
+        self._heard: list[Any] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._news = asyncio.Event()
+        self._timer: asyncio.TimerHandle | None = None
+        self._full = False
+
+    def listen(self) -> None:
+        """Hear transforms, until :data:`LINGER` seconds after the last question.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        loop = asyncio.get_running_loop()
+        if not self._heard:
+            for topic, qos in TOPICS.items():
+                heard = self._node.subscribe(topic, TYPE, qos=qos)
+                self._heard.append(heard)
+                task = loop.create_task(self._take(heard, static=qos.latched))
+                self._tasks.add(task)
+                task.add_done_callback(self._tasks.discard)
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = loop.call_later(LINGER, self._rest)
+
+    def _rest(self) -> None:
+        """Hear no more, and know nothing."""
+        if self._timer is not None:
+            self._timer.cancel()
+        heard, self._heard, self._timer = self._heard, [], None
+        for one in heard:
+            one.close()
+        for task in self._tasks:
+            task.cancel()
+        self._links.clear()
+
+    async def close(self) -> None:
+        """Hear no more. Idempotent."""
+        self._rest()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _take(self, heard: Any, *, static: bool) -> None:
+        async for message in heard:
+            for one in message.transforms:
+                self._add(one, static=static)
+            self._news.set()
+
+    def _add(self, message: Any, *, static: bool) -> None:
+        child = message.child_frame_id.strip("/")
+        parent = message.header.frame_id.strip("/")
+        if not child or not parent or child == parent:
+            return
+        link = self._links.get(child)
+        if link is None or link.parent != parent or (link.static is None) == static:
+            if link is None and len(self._links) >= MAX_FRAMES:
+                if not self._full:
+                    logger.warning("TF: more than %s frames; %s is left out", MAX_FRAMES, child)
+                self._full = True
+                return
+            link = self._links[child] = _FrameLink(child, parent)
+        if static:
+            link.static = message.transform
+        else:
+            link.add(utc_of(message.header), message.transform)
+
+    # ------------------------------------------------------------------ questions
+
+    async def pose(self, frame: str, base: str, utc: float | None = None) -> Transform:
+        """Return the pose of a frame in another one, ``T_base_frame``.
+
+        Args:
+            frame: the frame.
+            base: the frame that it is looked at in.
+            utc: time, seconds since 1970; None for the newest that all on the way are known at.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: TF does not lead there; ``BAD_TIME``: not at that
+                time, or the newest is old; ``NOT_RIGID``: a transform is none.
+            RosError: the node is not open.
+        """
+        frame, base = frame.strip("/"), base.strip("/")
+        return await self._until(lambda: self._pose(frame, base, utc))
+
+    async def root(self, frame: str) -> str:
+        """Return the root of the tree that a frame is in.
+
+        Raises:
+            CalibrationError: ``WRONG_FRAME``: TF does not know the frame.
+        """
+
+        def found() -> str:
+            chain = self._chain(frame.strip("/"))
+            if not chain:
+                raise self._strange(frame)
+            return chain[-1].parent
+
+        return await self._until(found)
+
+    async def _until(self, look: Callable[[], Found]) -> Found:
+        """Return the answer of a look, as soon as there is one; bounded."""
+        self.listen()
+        deadline = asyncio.get_running_loop().time() + WAIT
+        while True:
+            self._news.clear()
+            try:
+                return look()
+            except CalibrationError:
+                if asyncio.get_running_loop().time() >= deadline:
+                    raise
+            try:
+                async with asyncio.timeout_at(deadline):
+                    await self._news.wait()
+            except TimeoutError:
+                continue
+
+    def _chain(self, frame: str) -> list[_FrameLink]:
+        """Return the links from a frame up to its root."""
+        found: list[_FrameLink] = []
+        seen = {frame}
+        while (link := self._links.get(frame)) is not None:
+            found.append(link)
+            frame = link.parent
+            if frame in seen:
+                raise Code.WRONG_FRAME.refusal(f"TF: {frame} is above itself; expected a tree")
+            seen.add(frame)
+        return found
+
+    def _pose(self, frame: str, base: str, utc: float | None) -> Transform:
+        up, down = self._chain(frame), self._chain(base)
+        above = {frame, *(one.parent for one in up)}
+        below = {base, *(one.parent for one in down)}
+        shared = above & below
+        if not shared:
+            raise self._strange(frame if not up else base if not down else frame, base)
+        up = _until_shared(up, frame, shared)
+        down = _until_shared(down, base, shared)
+        at = utc
+        moving = [one for one in (*up, *down) if one.static is None]
+        if at is None and moving:
+            for one in moving:
+                one.check_new()
+            at = min(one.times[-1] for one in moving)
+        lead = _product(up, frame, at)
+        back = _product(down, base, at)
+        found = back.inverse() @ lead
+        when = None if not moving or at is None else _time(at)
+        return Transform(base, frame, found.rotation, found.translation, when)
+
+    def _strange(self, frame: str, base: str = "") -> CalibrationError:
+        known = sorted({*self._links, *(one.parent for one in self._links.values())})
+        some = ", ".join(known[:MAX_NAMED]) or "no frame at all"
+        way = f" to {base!r}" if base and base != frame else ""
+        return Code.WRONG_FRAME.refusal(
+            f"TF: no way leads from {frame!r}{way}; expected frames of one tree on /tf and "
+            f"/tf_static, which have {some}",
+            known[:MAX_NAMED],
+            frame,
+        )
+
+
+def _until_shared(chain: list[_FrameLink], frame: str, shared: set[str]) -> list[_FrameLink]:
+    """Return the links of a chain up to the first frame that both have."""
+    found: list[_FrameLink] = []
+    for one in chain:
+        if frame in shared:
+            break
+        found.append(one)
+        frame = one.parent
+    return found
+
+
+def _product(chain: list[_FrameLink], frame: str, at: float | None) -> Transform:
+    """Return the pose of a frame in the last parent of its chain."""
+    found = Transform(frame, frame, np.eye(3), np.zeros(3))
+    for one in chain:
+        found = one.at(0.0 if at is None else at).undated() @ found
+    return found
+
+
+def _transform(link: _FrameLink, message: Any, utc: float | None) -> Transform:
+    moved, turned = message.translation, message.rotation
+    return Transform.from_quaternion(
+        link.parent,
+        link.child,
+        (moved.x, moved.y, moved.z),
+        (turned.x, turned.y, turned.z, turned.w),
+        None if utc is None else _time(utc),
+    )
+
+
+def _time(utc: float) -> datetime:
+    return datetime.fromtimestamp(utc, UTC)
+
+
+def _text(utc: float) -> str:
+    return _time(utc).isoformat(timespec="milliseconds")

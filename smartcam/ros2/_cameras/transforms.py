@@ -1,0 +1,193 @@
+"""``/tf_static``: where a camera is, where its calibration says so.
+
+Frames as in REP-103 and REP-105: metres, right-handed; the camera's is the optical one, x right,
+y down and z ahead, whose name has the suffix ``_optical``.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.geometry import Transform
+from smartcam.ros2._cameras.image_messages import stamp_fields
+from smartcam.ros2._cameras.reading import calibrations_of
+from smartcam.ros2._node.qos import LATCHED
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+TOPIC = "/tf_static"
+
+TYPE = "tf2_msgs/msg/TFMessage"
+
+
+class CameraFrames:
+    """Names a camera's frames, in its messages and on ``/tf_static`` alike.
+
+    Args:
+        frame_id: name of the camera's frame, in which its results are without a calibration.
+        calibration: calibration of the camera's settings, or one for each application; None
+            without.
+        place: hand-eye calibration of the camera; None without.
+        parent: name of the robot's frame; empty: as a calibration calls it.
+        flange: name of the frame of the part of the robot that carries the camera; empty: as a
+            calibration calls it.
+        calibrated_at: pose of that part in the robot's frame when ``calibration`` was made; None
+            where the camera stands still.
+
+    Attributes:
+        optical: name of the frame of the camera's pictures, z ahead and y down.
+        robot: name of the frame of results with a calibration; empty: the calibration's own.
+    """
+
+    def __init__(
+        self,
+        frame_id: str,
+        calibration: Any = None,
+        *,
+        place: Any = None,
+        parent: str = "",
+        flange: str = "",
+        calibrated_at: Transform | None = None,
+    ) -> None:
+        self._frame_id, self._parent, self._flange = frame_id, parent, flange
+        self._calibrations = calibrations_of(calibration)
+        self._place, self._calibrated_at = place, calibrated_at
+        self.optical: str = f"{frame_id.removesuffix('_optical')}_optical"
+        self.robot: str = parent if calibrated_at is None else f"{frame_id}_robot"
+
+    def transforms(self) -> list[Transform]:
+        """Return the transforms that the calibrations give.
+
+        ================== ================================= ==================================
+        calibration        parent                            child
+        ================== ================================= ==================================
+        plane              the robot                         the camera's frame
+        sheet              the robot                         the camera's frame with ``_sheet``
+        plane or sheet,    the part of the robot that        the robot's frame as it was when
+        carried camera     carries the camera                the camera was calibrated
+        hand-eye           the robot's base; its flange,     the pictures' frame
+                           where the robot carries the
+                           camera
+        ================== ================================= ==================================
+
+        Of several applications each has a child with ``_APPLICATION`` at its end.
+        """
+        found = [] if self._place is None else [self._of_pictures(self._place)]
+        if self._calibrated_at is not None:
+            seen_from = self._calibrated_at.inverse()
+            return [*found, _named(seen_from, self._flange or seen_from.target, self.robot)]
+        for application, calibration in self._calibrations.items():
+            end = "" if application is None else f"_{application}"
+            found += self._of_plane(calibration, end)
+        return found
+
+    def _of_pictures(self, place: Any) -> Transform:
+        pose: Transform = place.camera_pose
+        said = self._flange if place.setup == "eye-in-hand" else self._parent
+        return _named(pose, said or pose.target, self.optical)
+
+    def _of_plane(self, calibration: Any, end: str) -> list[Transform]:
+        """Return the frame of a plane; none where a calibration has no plane."""
+        plane = getattr(calibration, "plane", calibration)
+        if getattr(plane, "kind", "") != "plane":
+            return []
+        name = self._frame_id if plane is calibration else f"{self._frame_id}_sheet"
+        child, parent = f"{name}{end}", self._parent or plane.robot_frame
+        try:
+            return [Transform(parent, child, plane.rotation, plane.origin)]
+        except CalibrationError as exc:
+            logger.info("%s: no frame of its plane: %s", child, exc)
+            return []
+
+
+def _named(transform: Transform, parent: str, child: str) -> Transform:
+    return Transform(parent, child, transform.rotation, transform.translation)
+
+
+def transform_fields(transform: Transform, utc: float) -> dict[str, Any]:
+    """Return ``geometry_msgs/TransformStamped``: the source's pose in the target, its parent."""
+    x, y, z, w = (float(one) for one in transform.quaternion / np.linalg.norm(transform.quaternion))
+    across, down, ahead = (float(one) for one in transform.translation)
+    return {
+        "header": {"stamp": stamp_fields(utc), "frame_id": transform.target},
+        "child_frame_id": transform.source,
+        "transform": {
+            "translation": {"x": across, "y": down, "z": ahead},
+            "rotation": {"x": x, "y": y, "z": z, "w": w},
+        },
+    }
+
+
+class StaticTransforms:
+    """Publishes where frames are that do not move, latched: one publisher of all of a node's.
+
+    Args:
+        node: open node of ROS.
+        transforms: each from a child, its source, into its parent, its target.
+
+    Raises:
+        ConfigurationError: as :meth:`replace`.
+    """
+
+    def __init__(self, node: Any, transforms: Iterable[Transform] = ()) -> None:
+        self._node = node
+        self._transforms = _checked(transforms)
+        self._publisher: Any = None
+
+    def start(self) -> None:
+        """Publish the transforms, if there are any."""
+        if self._publisher is None and self._transforms:
+            self._publisher = self._node.publisher(TOPIC, TYPE, qos=LATCHED)
+            self._say()
+
+    async def close(self) -> None:
+        """Be gone. Idempotent."""
+        publisher, self._publisher = self._publisher, None
+        if publisher is not None:
+            publisher.close()
+
+    def replace(self, transforms: Iterable[Transform]) -> None:
+        """Publish others in their place, as after a new calibration.
+
+        Who has heard the old ones keeps those whose child is none of the new ones: TF forgets
+        nothing.
+
+        Raises:
+            ConfigurationError: a frame without a name or with a ``/`` in front, that is its own
+                parent, or that has two.
+        """
+        self._transforms = _checked(transforms)
+        if self._publisher is not None:
+            self._say()
+        else:
+            self.start()
+
+    def _say(self) -> None:
+        now = time.time()
+        self._publisher.publish(transforms=[transform_fields(one, now) for one in self._transforms])
+
+
+def _checked(transforms: Iterable[Transform]) -> tuple[Transform, ...]:
+    kept: dict[str, Transform] = {}
+    for one in transforms:
+        for name in (one.target, one.source):
+            if not name or name.startswith("/"):
+                raise ConfigurationError(
+                    f"tf: {one.label}: expected names of frames without / in front, got {name!r}"
+                )
+        if one.target == one.source or one.source in kept:
+            other = kept[one.source].target if one.source in kept else one.target
+            raise ConfigurationError(
+                f"tf: {one.source}: expected one parent that is another frame, got {one.target} "
+                f"and {other}"
+            )
+        kept[one.source] = one
+    return tuple(kept.values())

@@ -1,0 +1,39 @@
+"""The graph of nodes, as rclpy knows it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam._ros_names import full_name
+
+if TYPE_CHECKING:
+    from smartcam.ros2._native.node import NativeNode
+
+
+class NativeGraph:
+    """A node's view of the others.
+
+    Every method raises a :class:`~smartcam.RosError` where the node is not open.
+
+    Args:
+        node: node that asks.
+    """
+
+    def __init__(self, node: NativeNode) -> None:
+        self._node = node
+
+    def nodes(self) -> list[str]:
+        """Return the full names of all nodes, as ``ros2 node list``."""
+        found = self._ask("get_node_names_and_namespaces")
+        return sorted(full_name(namespace, name) for name, namespace in found)
+
+    def topics(self) -> dict[str, list[str]]:
+        """Return the types of each topic by its name, as ``ros2 topic list -t``."""
+        return {name: sorted(types) for name, types in self._ask("get_topic_names_and_types")}
+
+    def services(self) -> dict[str, list[str]]:
+        """Return the types of each service by its name, as ``ros2 service list -t``."""
+        return {name: sorted(types) for name, types in self._ask("get_service_names_and_types")}
+
+    def _ask(self, question: str) -> Any:
+        return self._node.made(lambda ros: getattr(ros, question)())

@@ -1,0 +1,71 @@
+"""The life cycle of a node of rclpy: ROS' own state machine, which follows one of smartcam's.
+
+rclpy's own callbacks of a transition block its thread until the transition has ended. A camera may
+take long for one, so the order is the other way round: smartcam's life cycle does the work in the
+event loop, and has ROS' machine make each step. The machine tells of each step and answers who
+asks for the state; who asks for a change is answered here.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import RosError
+from smartcam.ros2._native.installed import class_of
+from smartcam.ros2._native.services import ServiceCalls
+from smartcam.ros2._node.named_node import HANDLER_TIMEOUT
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.ros2._native.node import NativeNode
+    from smartcam.ros2._node.lifecycle import Lifecycle, LifecycleTransition
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+CHANGE_STATE = "lifecycle_msgs/srv/ChangeState"
+
+
+class NativeLifecycle:
+    """Has ROS' own state machine follow a life cycle of smartcam's.
+
+    Args:
+        node: open node of rclpy.
+        life: life cycle that is followed.
+        handler: coroutine function that answers ``change_state``.
+
+    Raises:
+        RosError: rclpy's node has its life cycle in another place.
+    """
+
+    def __init__(
+        self, node: NativeNode, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]
+    ) -> None:
+        ros = node.ros
+        self._machine: Any = getattr(ros, "_state_machine", None)
+        service: Any = getattr(ros, "_service_change_state", None)
+        if self._machine is None or service is None:
+            raise RosError(
+                f"{node.full_name}: this rclpy has its life cycle in another place: expected that "
+                "of Humble to Kilted; without rclpy smartcam has one of its own"
+            )
+        self._name = node.full_name
+        kind = node.types.service(CHANGE_STATE)
+        self._calls = ServiceCalls(
+            node, service.srv_name, kind, class_of(CHANGE_STATE), handler, HANDLER_TIMEOUT
+        )
+        service.callback = self._calls.on_request
+        self._stop_listening = life.listen(self._follow)
+
+    def _follow(self, transition: LifecycleTransition) -> None:
+        try:
+            self._machine.trigger_transition_by_id(transition.id, True)
+        except Exception as exc:  # noqa: BLE001 - the context is gone, and who asks with it
+            logger.warning("%s ! %s: %s", self._name, transition.label, exc)
+
+    def close(self) -> None:
+        """Follow no more; changes under way are given up. Idempotent."""
+        self._stop_listening()
+        self._calls.close()
+        self._machine = None

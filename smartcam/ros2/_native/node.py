@@ -1,0 +1,383 @@
+"""A node of ROS 2 in asyncio, through the rclpy that is installed."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import time
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from smartcam.exceptions import ConfigurationError, RosError
+from smartcam.ros2._native.graph import NativeGraph
+from smartcam.ros2._native.installed import checked_message, checked_service, rclpy
+from smartcam.ros2._native.lifecycle import NativeLifecycle
+from smartcam.ros2._native.outbox import MessageThread
+from smartcam.ros2._native.parameters import NativeParameters
+from smartcam.ros2._native.services import NativeClient, NativeService
+from smartcam.ros2._native.spinning import NativeContext, SpunNode
+from smartcam.ros2._native.stamps import RosStamps
+from smartcam.ros2._native.topics import NativePublisher, NativeSubscription
+from smartcam.ros2._node.named_node import HANDLER_TIMEOUT, NamedNode
+from smartcam.ros2._node.node import CLOSE_TIMEOUT
+from smartcam.ros2._node.qos import DEFAULT, SERVICES, QoS
+
+if TYPE_CHECKING:
+    import concurrent.futures
+    from collections.abc import Awaitable, Callable, Coroutine
+
+    from smartcam.ros2._node.lifecycle import Lifecycle
+    from smartcam.ros2._types.types import RosTypes
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+OPEN_TIMEOUT = 60.0
+"""Seconds for rclpy to make a node; a busy machine takes long to import rclpy for the first one."""
+
+TELL_MISSING_AFTER = 1.0
+"""Seconds after which the log has what is missing, all at once."""
+
+BILLION = 1_000_000_000
+
+End = TypeVar("End")
+
+
+class NativeNode(NamedNode):
+    """A node of ROS 2 through rclpy, for the middleware that the user runs.
+
+    As :class:`smartcam.ros2.Node`, with parameters, life cycle, graph and time of ROS' own. What
+    is published or served with a type whose package is not built for the ROS that is installed is
+    left out, and told in the log.
+
+    Args:
+        name: name of the node, of letters, digits and ``_``.
+        namespace: namespace of the node, such as ``/line1``.
+        context: context shared with other nodes of this process; None for one of its own.
+        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``.
+        managed: whether the node has a life cycle, which :meth:`manage` then has to follow.
+
+    Attributes:
+        parameters: parameters of the node.
+        graph: view of the other nodes.
+
+    Raises:
+        ConfigurationError: a name or domain cannot be, or there is no rclpy.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        namespace: str = "/",
+        context: NativeContext | None = None,
+        domain: int | None = None,
+        managed: bool = True,
+    ) -> None:
+        super().__init__(name, namespace)
+        self.context: NativeContext = context or NativeContext(domain=domain)
+        self.parameters: NativeParameters = NativeParameters(self)
+        self.graph: NativeGraph = NativeGraph(self)
+        self.outbox: MessageThread
+        self.side_by_side: Any = None
+        self.stamps: RosStamps = RosStamps(self._time_shift)
+        self._clock: Any = None
+        self._managed = managed
+        self._spun: SpunNode | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._dead: RosError | None = None
+        self._ended = asyncio.Event()
+        self._ends: set[Any] = set()
+        self._missing: dict[str, list[str]] = {}
+        self._telling: asyncio.TimerHandle | None = None
+
+    @property
+    def types(self) -> RosTypes:
+        """The messages and services that the node speaks."""
+        return self.context.types
+
+    @property
+    def is_open(self) -> bool:
+        """True from the end of ``start()`` until ``stop()``."""
+        return self._spun is not None
+
+    @property
+    def ros(self) -> Any:
+        """The node of rclpy."""
+        return None if self._spun is None else self._spun.ros
+
+    @property
+    def executor(self) -> Any:
+        """The executor of rclpy."""
+        return None if self._spun is None else self._spun.executor
+
+    @property
+    def has_sim_time(self) -> bool:
+        """True if ROS' time is not the system's, as the parameter ``use_sim_time`` is set."""
+        return self._clock is not None and bool(self._clock.ros_time_is_active)
+
+    def _time_shift(self) -> float:
+        """Return the seconds by which ROS' time is ahead of the system's."""
+        return float(self._clock.now().nanoseconds - time.time_ns()) / BILLION
+
+    # ------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open it.
+
+        Raises:
+            RosError: rclpy makes no node.
+
+        Cancellation: leaves it closed.
+        """
+        if self._spun is not None:
+            return
+        self._loop = asyncio.get_running_loop()
+        self._dead, self._ended = None, asyncio.Event()
+        on_end = functools.partial(self._on_end, self._ended)
+        spun = SpunNode(
+            self.context, self.name, self.namespace, self._loop, on_end, managed=self._managed
+        )
+        await spun.start(OPEN_TIMEOUT)
+        self._spun = spun
+        self.outbox = MessageThread(f"smartcam-rclpy-outbox {self.full_name}")
+        self.side_by_side = rclpy("callback_groups").ReentrantCallbackGroup()
+        self._clock = spun.ros.get_clock()
+        self.name, self.namespace = spun.ros.get_name(), spun.ros.get_namespace()  # remapped
+        try:
+            self.parameters.open()
+        except BaseException:
+            await self.stop()
+            raise
+
+    def _on_end(self, ended: asyncio.Event, why: RosError | None) -> None:
+        ended.set()
+        if why is not None and ended is self._ended and self._spun is not None:
+            self._dead = why
+            logger.error("%s", why)
+            for end in tuple(self._ends):
+                if isinstance(end, NativeClient):
+                    end.fail(str(why))
+
+    async def stop(self) -> None:
+        """Close it, with all that it publishes, hears, serves and calls. Idempotent, bounded."""
+        spun = self._spun
+        if spun is None:
+            return
+        self._tell_missing()
+        services = [one for one in self._ends if isinstance(one, NativeService)]
+        for end in tuple(self._ends):
+            end.close()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await self.parameters.close()
+                for one in services:
+                    await one.wait_closed()
+                await asyncio.to_thread(self.outbox.close, CLOSE_TIMEOUT / 2)
+        except TimeoutError:
+            pass  # a handler that does not end when it is cancelled is its author's
+        finally:
+            self._spun = None
+            spun.end()
+            await self._wait_ended()
+
+    async def _wait_ended(self) -> None:
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await self._ended.wait()
+        except TimeoutError:
+            logger.warning("%s ! rclpy does not end", self.full_name)
+
+    def check_open(self) -> None:
+        """Do nothing while the node is open.
+
+        Raises:
+            RosError: the node is not open, or rclpy is gone.
+        """
+        if self._dead is not None:
+            raise RosError(str(self._dead))
+        super().check_open()
+
+    # ------------------------------------------------------------------ for its ends
+
+    def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
+        """Have something done in the event loop; return False where that is gone."""
+        spun = self._spun
+        return spun is not None and spun.in_loop(do, *given)
+
+    def submit(
+        self, work: Callable[[], Coroutine[Any, Any, None]]
+    ) -> concurrent.futures.Future[None]:
+        """Return the future of a coroutine that the event loop carries out.
+
+        Raises:
+            RosError: the event loop is gone.
+        """
+        loop = self._loop
+        if loop is None or loop.is_closed():
+            raise RosError(f"{self.full_name}: its event loop is closed")
+        return asyncio.run_coroutine_threadsafe(work(), loop)
+
+    def wake(self) -> None:
+        """Have rclpy look for what is new."""
+        if self._spun is not None:
+            self._spun.wake()
+
+    def made(self, make: Callable[[Any], Any]) -> Any:
+        """Return an end that rclpy makes.
+
+        Raises:
+            RosError: rclpy makes none.
+        """
+        self.check_open()
+        try:
+            return make(self.ros)
+        except Exception as exc:
+            raise RosError(f"{self.full_name}: {type(exc).__name__}: {exc!s:.300}") from exc
+
+    def unmade(self, what: str, end: Any) -> None:
+        """Have rclpy take an end back."""
+        ros = self.ros
+        if ros is not None:
+            getattr(ros, f"destroy_{what}")(end)
+
+    def forget(self, end: Any) -> None:
+        """Take note that an end was closed."""
+        self._ends.discard(end)
+
+    def _kept(self, end: End) -> End:
+        self._ends.add(end)
+        return end
+
+    # ------------------------------------------------------------------ what it has
+
+    def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativePublisher:
+        """Publish on a topic.
+
+        Args:
+            topic: name of the topic, absolute, relative to the namespace, or private (``~/it``).
+            type: type of the messages, such as ``std_msgs/msg/String``.
+            qos: quality of service.
+
+        Raises:
+            ConfigurationError: the topic cannot be, or the type is not known or has other fields.
+            RosError: the node is not open.
+        """
+        kind, name = self.types.message(type), self._resolved(topic, "topic")
+        cls = checked_message(kind)
+        self._note_missing(cls, type, name)
+        return self._kept(NativePublisher(self, name, kind, qos, cls))
+
+    def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> NativeSubscription:
+        """Hear a topic; read it by ``async for``.
+
+        Args:
+            topic: name of the topic, absolute, relative to the namespace, or private (``~/it``).
+            type: type of the messages, such as ``std_msgs/msg/String``.
+            qos: quality of service; its depth is that of the queue.
+
+        Raises:
+            ConfigurationError: the topic cannot be, or the type is not built for this ROS.
+            RosError: the node is not open.
+        """
+        kind, name = self.types.message(type), self._resolved(topic, "topic")
+        cls = self._built(checked_message(kind), type)
+        return self._kept(NativeSubscription(self, name, kind, qos, cls))
+
+    def serve(
+        self,
+        service: str,
+        type: str,
+        handler: Callable[[Any], Awaitable[Any]],
+        *,
+        qos: QoS = SERVICES,
+        timeout: float = HANDLER_TIMEOUT,
+    ) -> NativeService:
+        """Serve a service.
+
+        Args:
+            service: name of the service, resolved as that of a topic.
+            type: type of the service, such as ``std_srvs/srv/Trigger``.
+            handler: coroutine function that takes each request and returns the response, or a
+                mapping of its fields.
+            qos: quality of service; ROS' own for services is used.
+            timeout: seconds that the handler may take.
+
+        Raises:
+            ConfigurationError: the name cannot be, or the type is not known or has other fields.
+            RosError: the node is not open.
+        """
+        del qos
+        kind, name = self.types.service(type), self._resolved(service, "service")
+        cls = checked_service(kind)
+        self._note_missing(cls, type, name)
+        return self._kept(NativeService(self, name, kind, cls, handler, timeout))
+
+    def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> NativeClient:
+        """Return a client that calls a service.
+
+        Args:
+            service: name of the service, resolved as that of a topic.
+            type: type of the service, such as ``std_srvs/srv/Trigger``.
+            qos: quality of service; ROS' own for services is used.
+
+        Raises:
+            ConfigurationError: the name cannot be, or the type is not built for this ROS.
+            RosError: the node is not open.
+        """
+        del qos
+        kind, name = self.types.service(type), self._resolved(service, "service")
+        return self._kept(NativeClient(self, name, kind, self._built(checked_service(kind), type)))
+
+    def manage(self, life: Lifecycle, handler: Callable[[Any], Awaitable[Any]]) -> NativeLifecycle:
+        """Have ROS' own life cycle follow one of smartcam's.
+
+        Args:
+            life: life cycle that says what the state is.
+            handler: coroutine function that answers ``change_state``.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        self.check_open()
+        return NativeLifecycle(self, life, handler)
+
+    # ------------------------------------------------------------------ what is not built
+
+    def _built(self, cls: Any, type: str) -> Any:
+        if cls is None:
+            raise ConfigurationError(
+                f"{type}: its package is not built for the ROS that is installed"
+                f"{how_to_build(type)}"
+            )
+        return cls
+
+    def _note_missing(self, cls: Any, type: str, name: str) -> None:
+        if cls is not None:
+            return
+        self._missing.setdefault(type.partition("/")[0], []).append(name)
+        if self._telling is None:
+            loop = asyncio.get_running_loop()
+            self._telling = loop.call_later(TELL_MISSING_AFTER, self._tell_missing)
+
+    def _tell_missing(self) -> None:
+        if self._telling is not None:
+            self._telling.cancel()
+            self._telling = None
+        missing, self._missing = self._missing, {}
+        for package, names in missing.items():
+            logger.warning(
+                "%s ! without %s: %s is not built for the ROS that is installed%s",
+                self.full_name,
+                ", ".join(sorted(set(names))),
+                package,
+                how_to_build(package),
+            )
+
+
+def how_to_build(type: str) -> str:
+    """Return the way to have the package of a type, as the end of a sentence."""
+    package = type.partition("/")[0]
+    if package == "smartcam_msgs":
+        return "; copy ros2/smartcam_msgs into a workspace, build it with colcon and source it"
+    return f"; apt install ros-DISTRIBUTION-{package.replace('_', '-')}, or build and source it"

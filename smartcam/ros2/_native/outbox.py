@@ -1,0 +1,96 @@
+"""The thread that hands a node's messages to the middleware, which may have it wait."""
+
+from __future__ import annotations
+
+import collections
+import logging
+import threading
+from typing import TYPE_CHECKING, NamedTuple
+
+from smartcam.exceptions import RosError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+MAX_WAITING_MESSAGES = 10_000
+"""Messages of a node that wait for the middleware; the oldest beyond is dropped and counted."""
+
+MAX_WAITING_BYTES = 1 << 26
+"""Bytes of a node's messages that wait for the middleware."""
+
+
+class _ThreadJob(NamedTuple):
+    do: Callable[[], None]
+    size: int
+    dropped: Callable[[], None] | None  # None: the job is never dropped
+
+
+class MessageThread:
+    """Does what may wait in a thread, in order, with a bound on what waits.
+
+    Args:
+        name: name of the thread.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._jobs: collections.deque[_ThreadJob] = collections.deque()
+        self._bytes = 0
+        self._changed = threading.Condition()
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(
+        self, do: Callable[[], None], size: int = 0, dropped: Callable[[], None] | None = None
+    ) -> None:
+        """Have a job done; it is dropped where it can be, and too much waits.
+
+        Raises:
+            RosError: the thread ends, or has ended.
+        """
+        with self._changed:
+            if self._closing:
+                raise RosError(f"{self._thread.name}: it is closed")
+            self._jobs.append(_ThreadJob(do, size, dropped))
+            self._bytes += size
+            while len(self._jobs) > MAX_WAITING_MESSAGES or self._bytes > MAX_WAITING_BYTES:
+                if not self._drop_oldest():
+                    break
+            self._changed.notify()
+
+    def _drop_oldest(self) -> bool:
+        for place, job in enumerate(self._jobs):
+            if job.dropped is not None and place < len(self._jobs) - 1:
+                del self._jobs[place]
+                self._bytes -= job.size
+                job.dropped()
+                return True
+        return False
+
+    def close(self, timeout: float) -> bool:
+        """Do what waits, and end; blocks.
+
+        Returns:
+            Whether the thread has ended in time.
+        """
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._jobs and not self._closing:
+                    self._changed.wait()
+                if not self._jobs:
+                    return
+                job = self._jobs.popleft()
+                self._bytes -= job.size
+            try:
+                job.do()
+            except Exception as exc:  # noqa: BLE001 - the middleware's own, of any kind
+                logger.debug("%s ! %s", self._thread.name, exc)

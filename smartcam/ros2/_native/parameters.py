@@ -1,0 +1,174 @@
+"""Parameters of a node of rclpy: ROS has and serves them, and hooks are carried out here."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextvars
+import logging
+import threading
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError, RosError, SmartCamError
+from smartcam.ros2._native.installed import class_of, rclpy, to_ros
+from smartcam.ros2._node.parameter_services import reason
+from smartcam.ros2._node.parameter_values import decode_value
+from smartcam.ros2._node.parameters import SET_TIMEOUT, RosParameters
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from smartcam.ros2._native.node import NativeNode
+    from smartcam.ros2._node.parameter_values import Typed
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+SIM_TIME = "use_sim_time"
+"""The parameter that rclpy has itself."""
+
+HOOK_TIMEOUT = 2 * SET_TIMEOUT + 1.0
+"""Seconds that a thread of rclpy waits for the hooks of a set, and for the sets before it."""
+
+_asked_by_ros: contextvars.ContextVar[bool] = contextvars.ContextVar("asked_by_ros", default=False)
+
+
+class NativeParameters(RosParameters):
+    """The parameters of a node of rclpy, which declares, serves and tells of them.
+
+    What is set by others comes here before rclpy takes the value: its hook is carried out, or
+    refuses. Values of the command line or of a parameter file count when one is declared.
+
+    Args:
+        node: node that has the parameters.
+    """
+
+    def __init__(self, node: NativeNode) -> None:
+        super().__init__(node, served=False)  # type: ignore[arg-type]  # as far as it is used
+        self.undeclare(SIM_TIME)
+        self._native = node
+        self._ros: Any = None
+        self._own = threading.local()  # set while this side tells rclpy of a value
+
+    def open(self) -> None:
+        """Have ROS know what is declared."""
+        self._ros = self._native.ros
+        self._ros.add_on_set_parameters_callback(self._on_set)
+        for name in self.names():
+            self._declare_in_ros(name)
+
+    async def close(self) -> None:
+        """Give up sets that are under way; what is declared stays."""
+        self._ros = None
+        await super().close()
+
+    # ------------------------------------------------------------------ from here to ROS
+
+    def _tell(self, **what: Any) -> None:
+        """Have ROS know that parameters are new, changed or deleted."""
+        if getattr(self, "_ros", None) is None:
+            return
+        for name in what.get("new", ()):
+            self._declare_in_ros(name)
+        changed = what.get("changed", ())
+        if changed and not _asked_by_ros.get():
+            self._put(lambda: self._ros.set_parameters([self._parameter(one) for one in changed]))
+        for name in what.get("deleted", ()):
+            if not self._ros.describe_parameter(name).read_only:  # which rclpy keeps for good
+                self._put(lambda name=name: self._ros.undeclare_parameter(name))
+
+    def _put(self, do: Any) -> Any:
+        self._own.now = True
+        try:
+            return do()
+        except Exception as exc:  # noqa: BLE001 - rclpy's own, of any kind
+            logger.warning("%s ! a parameter: %s", self._native.full_name, exc)
+        finally:
+            self._own.now = False
+
+    def _declare_in_ros(self, name: str) -> None:
+        description = self.describe(name)
+        kind = self._native.types.message("rcl_interfaces/msg/ParameterDescriptor")
+        told = to_ros(kind, description.encode(), class_of(kind.name))
+        given = self._parameter(name)
+        self._own.now = True
+        try:
+            made = self._ros.declare_parameter(
+                name, given.value, told, ignore_override=description.read_only
+            )
+        except Exception as exc:
+            del self._declared[name]
+            raise ConfigurationError(f"parameter {name!r}: {exc!s:.300}") from exc
+        finally:
+            self._own.now = False
+        if made.value != given.value:
+            self._begin_with(name, decode_value(made.get_parameter_value()))
+
+    def _begin_with(self, name: str, value: Typed) -> None:
+        """Carry out the value that the command line, or a parameter file, has for a parameter."""
+
+        async def begin() -> None:
+            _asked_by_ros.set(True)
+            try:
+                await self.carry_out({name: value})
+            except SmartCamError as exc:
+                logger.warning("%s ! parameter %s: %s", self._native.full_name, name, exc)
+                _asked_by_ros.set(False)
+                self._tell(changed=[name])
+
+        task = asyncio.get_running_loop().create_task(begin())
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    def _parameter(self, name: str) -> Any:
+        value = self._of(name).value
+        plain: Any = value.value
+        if isinstance(plain, bytes):
+            plain = [bytes([one]) for one in plain]
+        kinds = rclpy("parameter").Parameter
+        plain = list(plain) if isinstance(plain, tuple) else plain
+        return kinds(name, kinds.Type(value.number), plain)
+
+    # ------------------------------------------------------------------ from ROS to here
+
+    def _on_set(self, parameters: Sequence[Any]) -> Any:
+        """Answer whether values may be; in the thread that sets them, and within a bound."""
+        result = class_of("rcl_interfaces/msg/SetParametersResult")
+        if getattr(self._own, "now", False):
+            return result(successful=True)
+        try:
+            self._carry_out({one.name: one for one in parameters})
+        except concurrent.futures.CancelledError:
+            return result(successful=False, reason=f"{self._native.full_name} is closed")
+        except TimeoutError:
+            text = f"no answer within {HOOK_TIMEOUT:g} s; whether it took effect is unknown"
+            return result(successful=False, reason=text)
+        except SmartCamError as exc:
+            return result(successful=False, reason=reason(exc))
+        except Exception as exc:
+            logger.exception("%s ! parameters", self._native.full_name)
+            return result(successful=False, reason=f"{type(exc).__name__}: {exc!s:.300}")
+        return result(successful=True)
+
+    def _carry_out(self, given: Mapping[str, Any]) -> None:
+        values = {
+            name: decode_value(one.get_parameter_value())
+            for name, one in given.items()
+            if self.find(name) is not None  # others are rclpy's own
+        }
+        if not values:
+            return
+
+        async def in_loop() -> None:
+            task = asyncio.current_task()
+            if self._ros is None or task is None:
+                raise RosError(f"{self._native.full_name} is closed")
+            self._tasks.add(task)  # which closing gives up
+            task.add_done_callback(self._ended)
+            _asked_by_ros.set(True)
+            await self.set_all(values)
+
+        waiting = self._native.submit(in_loop)
+        try:
+            waiting.result(HOOK_TIMEOUT)
+        finally:
+            waiting.cancel()

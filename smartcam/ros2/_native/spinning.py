@@ -1,0 +1,298 @@
+"""A node of rclpy, and the thread that owns it: it makes the node, spins it, and ends it."""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import logging
+import threading
+import time
+import weakref
+from typing import TYPE_CHECKING, Any, cast
+
+from smartcam._ros_names import check_domain
+from smartcam.exceptions import ConfigurationError, RosError
+from smartcam.ros2._native.installed import distribution, rclpy
+from smartcam.ros2._types.types import RosTypes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+THREADS = 4
+"""Threads of a node's executor: a set of parameters takes one until its hook has answered."""
+
+LOOK_AGAIN = 1.0
+"""Seconds between two looks of a spinning thread whether its event loop is still there."""
+
+AFTER_ERROR = 0.05
+"""Seconds that a spinning thread rests after an error, so that one that repeats takes no core."""
+
+EXIT_TIMEOUT = 2.0
+"""Seconds that the end of the program waits for a node that nobody has closed."""
+
+MAX_TOLD = 100
+"""Errors of a spinning thread that are remembered, so that each is told once."""
+
+
+class NoReplyError(Exception):
+    """A call that gets no reply; raised in a callback, and caught where it is spun."""
+
+
+class NativeContext:
+    """The context of rclpy that nodes share, opened by the first of them.
+
+    Args:
+        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
+        distribution: name of the distribution whose messages are used; "": as far as it is known,
+            that of the ROS that is installed.
+        args: arguments for ROS, such as ``--ros-args -p use_sim_time:=true``.
+
+    Raises:
+        ConfigurationError: there is no such domain or distribution, or no rclpy.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(
+        self, *, domain: int | None = None, distribution: str = "", args: Sequence[str] = ()
+    ) -> None:
+        self.domain: int | None = None if domain is None else check_domain(domain)
+        self.args: tuple[str, ...] = tuple(args)
+        rclpy()
+        self.types: RosTypes = RosTypes(distribution or _distribution())
+        self._lock = threading.Lock()
+        self._context: Any = None
+        self._users = 0
+
+    def open(self) -> Any:
+        """Return the context of rclpy, for one more user; blocks.
+
+        Raises:
+            ConfigurationError: rclpy refuses the arguments for ROS.
+            RosError: rclpy does not begin.
+        """
+        with self._lock:
+            if not self._users:
+                self._context = self._begin()
+            self._users += 1
+            return self._context
+
+    def _begin(self) -> Any:
+        made = rclpy("context").Context()
+        no_signals = rclpy("signals").SignalHandlerOptions.NO  # they are the program's
+        try:
+            rclpy().init(
+                args=["smartcam", *self.args],
+                context=made,
+                domain_id=self.domain,
+                signal_handler_options=no_signals,
+            )
+        except Exception as exc:
+            kind = ConfigurationError if self.args else RosError
+            raise kind(f"rclpy does not begin: {type(exc).__name__}: {exc!s:.300}") from exc
+        return made
+
+    def close(self) -> None:
+        """One user is done; the last one shuts the context down; blocks."""
+        with self._lock:
+            self._users -= 1
+            if self._users:
+                return
+            context, self._context = self._context, None
+        with contextlib.suppress(Exception):  # who has shut it down already
+            context.try_shutdown()
+
+
+_distribution = distribution
+
+
+class SpunNode:
+    """A node of rclpy, made, spun and ended by a thread of its own.
+
+    Args:
+        context: context that the node shares with others.
+        name: name of the node.
+        namespace: namespace of the node.
+        loop: event loop of the node's users.
+        on_end: function called in the event loop when the thread has ended, with the reason where
+            that was not asked for.
+        managed: whether the node has a life cycle.
+
+    Attributes:
+        ros: the node of rclpy; None before it is made.
+        executor: executor of rclpy; None before the node is made.
+    """
+
+    def __init__(
+        self,
+        context: NativeContext,
+        name: str,
+        namespace: str,
+        loop: asyncio.AbstractEventLoop,
+        on_end: Callable[[RosError | None], None],
+        *,
+        managed: bool,
+    ) -> None:
+        self.ros: Any = None
+        self.executor: Any = None
+        self._context, self._name, self._namespace = context, name, namespace
+        self._loop, self._on_end, self._managed = loop, on_end, managed
+        self._stopping = threading.Event()
+        self._told: set[str] = set()
+        self._made: asyncio.Future[None] = loop.create_future()
+        self._thread = threading.Thread(
+            target=self._run, name=f"smartcam-rclpy {namespace}/{name}", daemon=True
+        )
+
+    async def start(self, timeout: float) -> None:
+        """Make the node, and spin it.
+
+        Raises:
+            ConfigurationError: rclpy refuses its arguments.
+            RosError: rclpy makes no node, or not in time.
+
+        Cancellation: the thread ends by itself.
+        """
+        _open.add(self)
+        self._thread.start()
+        try:
+            async with asyncio.timeout(timeout):
+                await asyncio.shield(self._made)
+        except TimeoutError as exc:
+            self.end()
+            raise RosError(f"{self._name}: rclpy made no node within {timeout:g} s") from exc
+        except BaseException:
+            self.end()
+            raise
+
+    def end(self) -> None:
+        """Have the thread end the node, and itself."""
+        self._stopping.set()
+        with contextlib.suppress(Exception):  # it may be ending
+            if self.executor is not None:
+                self.executor.create_task(_nothing, None)  # only work makes it look up
+
+    def wake(self) -> None:
+        """Have the thread look for what is new."""
+        with contextlib.suppress(Exception):  # it may be ending
+            if self.executor is not None:
+                self.executor.wake()
+
+    def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
+        """Have something done in the event loop; return False where that is gone."""
+        try:
+            self._loop.call_soon_threadsafe(do, *given)
+        except RuntimeError:
+            return False
+        return True
+
+    def abandon(self) -> None:
+        """End it at the program's end, where nobody has done so; bounded."""
+        self.end()
+        self._thread.join(EXIT_TIMEOUT)
+
+    # ------------------------------------------------------------------ in the thread
+
+    def _run(self) -> None:
+        why: RosError | None = None
+        try:
+            context = self._context.open()
+        except BaseException as exc:  # noqa: BLE001 - told to who waits
+            self.in_loop(self._tell, exc)
+            _open.discard(self)
+            return
+        try:
+            self._make(context)
+            self.in_loop(self._tell, None)
+            why = self._spin(context)
+        except BaseException as exc:  # noqa: BLE001 - told to who waits, or when all has ended
+            why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
+        finally:
+            self._close()
+            self._context.close()
+            _open.discard(self)
+            self.in_loop(self._tell, why)
+            self.in_loop(self._on_end, why)
+
+    def _tell(self, error: BaseException | None) -> None:
+        if self._made.done():
+            return
+        if error is None:
+            self._made.set_result(None)
+        else:
+            self._made.set_exception(error)
+            self._made.exception()  # who waited may be gone
+
+    def _make(self, context: Any) -> None:
+        namespace = "" if self._namespace == "/" else self._namespace
+        make = managed_node if self._managed else rclpy("node").Node
+        self.ros = make(self._name, namespace=namespace, context=context)
+        self.executor = rclpy("executors").MultiThreadedExecutor(THREADS, context=context)
+        self.executor.add_node(self.ros)
+
+    def _spin(self, context: Any) -> RosError | None:
+        """Spin until that is to end; return the reason where nobody has asked for the end."""
+        shut_down = rclpy("executors").ExternalShutdownException
+        while not self._stopping.is_set():
+            if self._loop.is_closed():
+                logger.error("%s ! its event loop is closed: the node is taken back", self._name)
+                return RosError(f"{self._name}: its event loop is closed")
+            if not context.ok():
+                return RosError(f"{self._name}: rclpy's context was shut down: the node is gone")
+            try:
+                self.executor.spin_once(LOOK_AGAIN)
+            except shut_down:
+                continue
+            except NoReplyError:
+                pass
+            except Exception as exc:  # noqa: BLE001 - of an end that was closed meanwhile, mostly
+                self._tell_error(exc)
+        return None
+
+    def _tell_error(self, error: Exception) -> None:
+        text = f"{type(error).__name__}: {error!s:.300}"
+        closed = type(error).__name__ == "InvalidHandle"
+        if text not in self._told and len(self._told) < MAX_TOLD:
+            self._told.add(text)
+            level = logging.DEBUG if closed else logging.WARNING
+            logger.log(level, "%s ! a callback of rclpy failed: %s", self._name, text)
+        time.sleep(AFTER_ERROR)
+
+    def _close(self) -> None:
+        with contextlib.suppress(Exception):  # of a context that is gone, all handles are
+            self.executor.shutdown(EXIT_TIMEOUT)
+        with contextlib.suppress(Exception):
+            self.ros.destroy_node()
+        # rclpy's state machine would keep the node in the graph until both are garbage collected
+        vars(self.ros or self).pop("_state_machine", None)
+        self.ros = self.executor = None
+
+
+def managed_node(name: str, *, namespace: str, context: Any) -> Any:
+    """Return a node of rclpy with a life cycle whose services run side by side; blocks."""
+    life, groups = rclpy("lifecycle"), rclpy("callback_groups")
+    node_class = rclpy("node").Node
+    bases = (life.LifecycleNodeMixin, node_class)
+    made = cast("Any", type("SmartcamNode", bases, {"__init__": _nothing}))()
+    node_class.__init__(made, name, namespace=namespace, context=context)
+    life.LifecycleNodeMixin.__init__(
+        made,
+        enable_communication_interface=True,
+        callback_group=groups.ReentrantCallbackGroup(),
+    )
+    return made
+
+
+def _nothing(_self: Any) -> None:
+    pass
+
+
+_open: weakref.WeakSet[SpunNode] = weakref.WeakSet()
+
+
+@atexit.register
+def _abandon() -> None:
+    for one in tuple(_open):
+        one.abandon()

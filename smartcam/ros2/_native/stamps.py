@@ -1,0 +1,69 @@
+"""The stamps of messages in ROS' time, where a node has ``use_sim_time``.
+
+All stamps are made by the system's clock. Where messages leave the node they become ROS' time: a
+stamp is moved by as much as ROS' time is ahead when its first message leaves. Later messages of the
+same stamp, such as the lens beside a picture, get the same.
+"""
+
+from __future__ import annotations
+
+import collections
+import threading
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.ros2._types.types import MessageType
+
+HEADER = "std_msgs/msg/Header"
+
+MAX_STAMPS = 256
+"""RosStamps that are remembered with what they became."""
+
+BILLION = 1_000_000_000
+
+
+class RosStamps:
+    """Moves the stamps of messages to ROS' time.
+
+    Args:
+        shift: function that returns the seconds by which ROS' time is ahead of the system's.
+    """
+
+    def __init__(self, shift: Callable[[], float]) -> None:
+        self._shift = shift
+        self._known: collections.OrderedDict[int, int] = collections.OrderedDict()
+        self._lock = threading.Lock()
+
+    def moved(self, kind: MessageType, data: bytes) -> bytes:
+        """Return a message with the stamps of its headers in ROS' time."""
+        message = kind.decode(data)
+        for header in headers(kind, message):
+            stamp = header.stamp
+            moved = self._moved(stamp.sec * BILLION + stamp.nanosec)
+            stamp.sec, stamp.nanosec = divmod(moved, BILLION)
+        return kind.encode(message)
+
+    def _moved(self, stamp: int) -> int:
+        with self._lock:
+            known = self._known.get(stamp)
+            if known is None:
+                known = max(0, stamp + round(self._shift() * BILLION))
+                self._known[stamp] = known
+                if len(self._known) > MAX_STAMPS:
+                    self._known.popitem(last=False)
+            return known
+
+
+def headers(kind: MessageType, message: Any) -> Iterator[Any]:
+    """Yield the headers in a message."""
+    for field in kind.fields:
+        if not field.nested:
+            continue
+        value = getattr(message, field.attribute)
+        for one in value if field.shape else (value,):
+            if field.type == HEADER:
+                yield one
+            else:
+                yield from headers(kind.nested[field.type], one)

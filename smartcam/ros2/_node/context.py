@@ -1,0 +1,276 @@
+"""The context that the nodes of a process share: a session of Zenoh, a domain, and its graph."""
+
+from __future__ import annotations
+
+import collections
+import itertools
+import logging
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+from smartcam._ros_names import check_domain
+from smartcam._zenoh import BusLink, ZenohSession, quietly
+from smartcam.exceptions import ConfigurationError
+from smartcam.ros2._node.graph import OTHER_END, RosGraph
+from smartcam.ros2._types.types import RosTypes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from smartcam.ros2._node.tokens import Entity
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+ROUTER = "tcp/localhost:7447"
+"""Endpoint of the router of rmw_zenoh's nodes (``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``)."""
+
+MAX_LONG_MESSAGE_BYTES = 1 << 26
+"""Bytes of long messages that wait to be said; the oldest of a topic go first."""
+
+SETTINGS: Mapping[str, Any] = {
+    # who publishes latched keeps messages by their times
+    "timestamping/enabled": {"router": True, "peer": True, "client": True},
+    # nodes of rmw_zenoh are peers, and learn of each other from their router
+    "scouting/gossip/enabled": True,
+}
+"""Settings of a Zenoh session that carries ROS nodes, as the sessions of rmw_zenoh have them."""
+
+
+CALM, MAX_DIRECT = 0.5, 8
+"""Seconds, and messages that the event loop hands to the engine itself in that time. The engine's
+queue has room for 16 and drops the rest silently while its own thread gets no processor or the link
+takes nothing. A thread, which waits for room, hands over all others: with 0.01 s, 3 of 4 bursts of
+1000 results lost some on a machine that kept the engine's thread waiting; with 0.5 s, none of 8."""
+
+PRIORITIES = ("DATA_LOW", "BACKGROUND", "DATA")
+"""Priorities of long messages of which only the newest counts. The engine has one message of each
+priority and link under way; topics take the priorities in turn, so that the two pictures of a pair
+do not meet in one."""
+
+PAUSE, RATE = 0.002, 5e8
+"""Seconds, and bytes a second: the time that a healthy link needs for one long message."""
+
+
+class NewestSlot:
+    """A thread, and a priority, for long messages of which the newest counts.
+
+    Attributes:
+        lane: name of the thread.
+        priority: name of the engine's priority.
+    """
+
+    def __init__(self, priority: str) -> None:
+        self.lane: str = f"newest-{priority.lower()}"
+        self.priority: str = priority
+        self._free = 0.0
+
+    def wait(self, size: int) -> None:
+        """Wait until the message before should be taken; ``size`` bytes come now."""
+        time.sleep(max(0.0, self._free - time.monotonic()))
+        self._free = time.monotonic() + PAUSE + size / RATE
+
+
+class RosContext:
+    """The context that nodes share, opened by the first of them.
+
+    Args:
+        session: open session of Zenoh, which stays open; None for a session of its own.
+        connect: endpoints that a session of its own connects to.
+        listen: endpoints that a session of its own listens on, which makes it the router.
+        domain: number of the domain; None for that of the variable ``ROS_DOMAIN_ID``, or 0.
+        distribution: name of the ROS distribution whose messages and type hashes are used.
+
+    Raises:
+        ConfigurationError: there is no such domain or distribution.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(
+        self,
+        session: ZenohSession | None = None,
+        *,
+        connect: str | Sequence[str] = ROUTER,
+        listen: str | Sequence[str] = (),
+        domain: int | None = None,
+        distribution: str = "jazzy",
+    ) -> None:
+        self.domain: int = check_domain(_environments() if domain is None else domain)
+        self.types: RosTypes = RosTypes(distribution)
+        self._owns = session is None
+        if session is None:
+            heard = _endpoints(listen)
+            link = BusLink(heard, () if heard else _endpoints(connect))
+            session = ZenohSession(link, SETTINGS, what="ROS 2")
+        self.zenoh: ZenohSession = session
+        self.graph: RosGraph = RosGraph(self.domain)
+        self.zid: str = ""
+        self._users = 0
+        self._numbers = 0
+        self._ends: dict[tuple[str, str], list[Entity]] = {}
+        self._watchers: dict[tuple[str, str], list[Callable[[Entity, bool], None]]] = {}
+        self._lock = threading.Lock()
+        self._threads: dict[str, ThreadPoolExecutor] = {}
+        self._long: collections.Counter[object] = collections.Counter()
+        self._in_lane: collections.Counter[str] = collections.Counter()
+        self._calm_since, self._said_directly, self._crowded = 0.0, 0, 0.0
+        self._slots = itertools.cycle(NewestSlot(one) for one in PRIORITIES)
+        self._stop_listening: Callable[[], None] = _nothing
+
+    async def open(self, timeout: float) -> None:
+        """Open the session, if no node has done so.
+
+        Raises:
+            ConnectFailedError: there is no router within ``timeout`` seconds.
+        """
+        self._users += 1
+        if self._users > 1:
+            return
+        try:
+            if self._owns:
+                await self.zenoh.open(timeout)
+            self.zid = str(self.zenoh.session.info.zid())
+            self.graph.open(self.zenoh)
+        except BaseException:
+            self._users -= 1
+            raise
+        self._stop_listening = self.graph.listen(self._compare)
+
+    async def close(self) -> None:
+        """Let a node go; the last one closes the session, if it is the context's own."""
+        self._users -= 1
+        if self._users:
+            return
+        self._stop_listening()
+        self._stop_listening = _nothing
+        self.graph.close()
+        for thread in self._threads.values():
+            thread.shutdown(wait=False)  # what waits sees that it is closed, and takes itself back
+        self._threads.clear()
+        if self._owns:
+            await self.zenoh.close()
+
+    def next_id(self) -> int:
+        """Return a number that nothing else in this session has."""
+        self._numbers += 1
+        return self._numbers
+
+    # ------------------------------------------------------------------ who talks past whom
+
+    def add(self, entity: Entity) -> None:
+        """Add an end of this process; say if another end talks past it."""
+        self._ends.setdefault((entity.name, entity.kind), []).append(entity)
+        for other in self.graph.ends(entity.name, OTHER_END[entity.kind]):
+            self._differ(entity, other)
+
+    def remove(self, entity: Entity) -> None:
+        """Remove an end that is gone."""
+        ends = self._ends.get((entity.name, entity.kind), [])
+        if entity in ends:
+            ends.remove(entity)
+        if not ends:
+            self._ends.pop((entity.name, entity.kind), None)
+
+    def watch(
+        self, name: str, kind: str, watcher: Callable[[Entity, bool], None]
+    ) -> Callable[[], None]:
+        """Have ``watcher(entity, present)`` called for ends that come and go from now on.
+
+        Args:
+            name: name of the topic or service.
+            kind: of them.
+            watcher: function that is called in the event loop.
+
+        Returns:
+            What ends it.
+        """
+        found = self._watchers.setdefault((name, kind), [])
+        found.append(watcher)
+
+        def end() -> None:
+            found.remove(watcher)
+            if not found and self._watchers.get((name, kind)) is found:
+                del self._watchers[name, kind]
+
+        return end
+
+    def _compare(self, other: Entity, present: bool) -> None:
+        for watcher in tuple(self._watchers.get((other.name, other.kind), ())):
+            watcher(other, present)
+        if present and other.kind in OTHER_END:
+            for one in self._ends.get((other.name, OTHER_END[other.kind]), ()):
+                self._differ(one, other)
+
+    def _differ(self, one: Entity, other: Entity) -> None:
+        if (one.type, one.hash) != (other.type, other.hash):
+            logger.warning(
+                "%s of %s is %s %s here, but %s of %s has %s %s: they do not hear each other",
+                one.name,
+                one.full_node,
+                one.ros_type,
+                one.hash,
+                other.kind,
+                other.full_node,
+                other.ros_type,
+                other.hash,
+            )
+
+    # ------------------------------------------------------------------ what may wait
+
+    def slot(self) -> NewestSlot:
+        """Return the slot of one more topic of which the newest counts."""
+        return next(self._slots)
+
+    def waits(self, owner: object) -> bool:
+        """Return True if messages of an owner wait to be sent."""
+        return bool(self._long[owner])
+
+    def calm(self) -> bool:
+        """Return True if the event loop may hand one more short message to the engine."""
+        now = time.monotonic()
+        if self._in_lane["short"] or now - self._crowded < CALM:
+            # the thread may wait in the engine, and would have the loop wait, too; and the engine
+            # has just been full
+            return False
+        if now - self._calm_since > CALM:
+            self._calm_since, self._said_directly = now, 0
+        self._said_directly += 1
+        return self._said_directly <= MAX_DIRECT
+
+    def say_later(self, owner: object, say: Callable[[], None], lane: str) -> None:
+        """Have the thread of a lane call ``say``, which may wait for room; in order."""
+        thread = self._threads.get(lane)
+        if thread is None:
+            thread = self._threads[lane] = ThreadPoolExecutor(1, f"smartcam-ros2-{lane}")
+        with self._lock:
+            self._long[owner] += 1
+            self._in_lane[lane] += 1
+        thread.submit(quietly, say).add_done_callback(lambda _: self._said(owner, lane))
+
+    def _said(self, owner: object, lane: str) -> None:
+        with self._lock:
+            self._in_lane[lane] -= 1
+            if lane == "short":
+                self._crowded = time.monotonic()
+            self._long[owner] -= 1
+            if not self._long[owner]:
+                del self._long[owner]
+
+
+def _environments() -> int:
+    text = os.environ.get("ROS_DOMAIN_ID", "").strip()
+    if not text:
+        return 0
+    if not text.isdecimal():
+        raise ConfigurationError(f"ROS_DOMAIN_ID is {text!r:.40}: expected a number from 0")
+    return int(text)
+
+
+def _endpoints(given: str | Sequence[str]) -> tuple[str, ...]:
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
+def _nothing() -> None:
+    pass

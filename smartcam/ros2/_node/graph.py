@@ -1,0 +1,159 @@
+"""Keep the graph: the nodes of a domain, with what they publish, hear, serve and call."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam._zenoh import ZenohDeclared, direct
+from smartcam.ros2._node.tokens import (
+    CLIENT,
+    NODE,
+    PUBLISHER,
+    SERVICE,
+    SUBSCRIPTION,
+    Entity,
+    pattern,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from typing import Any
+
+    from smartcam._zenoh import ZenohSession
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+MAX_ENTITIES = 100_000
+"""Nodes and ends of topics and services that are kept in mind; what comes beyond is not."""
+
+
+class RosGraph:
+    """The known graph of a domain, kept by the tokens of those who come and go.
+
+    Args:
+        domain: the number.
+    """
+
+    def __init__(self, domain: int) -> None:
+        self._domain = domain
+        self._entities: dict[str, Entity] = {}
+        self._by_gid: dict[bytes, Entity] = {}
+        self._by_name: dict[tuple[str, str], dict[str, Entity]] = {}
+        self._listeners: list[Callable[[Entity, bool], None]] = []
+        self._declared: ZenohDeclared | None = None
+        self._told = False
+
+    def open(self, session: ZenohSession) -> None:
+        """Watch."""
+        put = session.engine.SampleKind.PUT
+
+        def on_sample(sample: Any) -> None:
+            session.in_loop(declared.call, 0, self.take, str(sample.key_expr), sample.kind == put)
+
+        self._declared = declared = ZenohDeclared(session)
+        declared.of(
+            lambda opened: opened.liveliness().declare_subscriber(
+                pattern(self._domain), direct(on_sample), history=True
+            )
+        )
+
+    def close(self) -> None:
+        """Watch no more. Idempotent."""
+        if self._declared is not None:
+            self._declared.close()
+
+    def listen(self, listener: Callable[[Entity, bool], None]) -> Callable[[], None]:
+        """Have ``listener(entity, present)`` called for who comes and goes; return what ends it.
+
+        For those that are there already it is called at once.
+        """
+        self._listeners.append(listener)
+        for entity in tuple(self._entities.values()):
+            listener(entity, True)
+        return lambda: self._listeners.remove(listener)
+
+    def take(self, token: str, present: bool) -> None:
+        """Take in that somebody has come, or gone."""
+        known = self._entities.get(token)
+        if (known is not None) == present:
+            return
+        if known is not None:
+            del self._entities[token]
+            self._by_gid.pop(known.gid, None)
+            ends = self._by_name[known.name, known.kind]
+            del ends[token]
+            if not ends:
+                del self._by_name[known.name, known.kind]
+            self._tell(known, False)
+            return
+        try:
+            entity = Entity.parse(token)
+        except ValueError as exc:
+            logger.debug("the graph: %s", exc)
+            return
+        if len(self._entities) >= MAX_ENTITIES:
+            if not self._told:
+                self._told = True
+                logger.warning("the graph has more than %d entities", MAX_ENTITIES)
+            return
+        self._entities[token] = entity
+        self._by_gid[entity.gid] = entity
+        self._by_name.setdefault((entity.name, entity.kind), {})[token] = entity
+        self._tell(entity, True)
+
+    def _tell(self, entity: Entity, present: bool) -> None:
+        for listener in tuple(self._listeners):
+            try:
+                listener(entity, present)
+            except ENDS_PROGRAM:
+                raise
+            except BaseException:
+                logger.exception("the graph: who heard of %s", entity.token)
+
+    # ------------------------------------------------------------------ questions
+
+    def __iter__(self) -> Iterator[Entity]:
+        return iter(tuple(self._entities.values()))
+
+    def by_gid(self, gid: bytes) -> Entity | None:
+        """Return the entity that has a GID; None where none has it."""
+        return self._by_gid.get(gid)
+
+    def nodes(self) -> list[str]:
+        """Return the full names of all nodes, as ``ros2 node list``."""
+        return sorted(one.full_node for one in self if one.kind == NODE)
+
+    def topics(self) -> dict[str, list[str]]:
+        """Return the types of each topic by its name, as ``ros2 topic list -t``."""
+        return self._types({PUBLISHER, SUBSCRIPTION})
+
+    def services(self) -> dict[str, list[str]]:
+        """Return the types of each service by its name, as ``ros2 service list -t``."""
+        return self._types({SERVICE})
+
+    def ends(self, name: str, kind: str) -> list[Entity]:
+        """Return the ends of a topic or a service.
+
+        Args:
+            name: absolute.
+            kind: ``"MP"`` who publishes, ``"MS"`` who subscribes, ``"SS"`` who serves, ``"SC"`` who
+                calls.
+        """
+        return list(self._by_name.get((name, kind), {}).values())
+
+    def of_node(self, full_name: str) -> list[Entity]:
+        """Return the ends of a node, as ``ros2 node info``."""
+        return [one for one in self if one.kind != NODE and one.full_node == full_name]
+
+    def _types(self, kinds: set[str]) -> dict[str, list[str]]:
+        found: dict[str, set[str]] = {}
+        for one in self:
+            if one.kind in kinds:
+                found.setdefault(one.name, set()).add(one.ros_type)
+        return {name: sorted(found[name]) for name in sorted(found)}
+
+
+OTHER_END = {PUBLISHER: SUBSCRIPTION, SUBSCRIPTION: PUBLISHER, SERVICE: CLIENT, CLIENT: SERVICE}
+"""Whom each kind of end talks to."""

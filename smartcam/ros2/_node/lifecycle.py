@@ -1,0 +1,280 @@
+"""The states of a managed node, and the ways between them.
+
+Ids and labels are lifecycle_msgs' and rcl_lifecycle's (``default_state_machine.c``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam.exceptions import ResponseTimeoutError, RosError, SmartCamError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+
+class LifecycleState(NamedTuple):
+    """A state, as ``lifecycle_msgs/msg/State`` has it."""
+
+    id: int
+    label: str
+
+
+class LifecycleTransition(NamedTuple):
+    """A way from a state to another, as ``lifecycle_msgs/msg/TransitionDescription`` has it."""
+
+    id: int
+    label: str
+    start: LifecycleState
+    goal: LifecycleState
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The message's fields."""
+        return {
+            "transition": {"id": self.id, "label": self.label},
+            "start_state": self.start._asdict(),
+            "goal_state": self.goal._asdict(),
+        }
+
+
+STATES = tuple(
+    LifecycleState(number, label)
+    for number, label in (
+        (0, "unknown"),
+        (1, "unconfigured"),
+        (2, "inactive"),
+        (3, "active"),
+        (4, "finalized"),
+        (10, "configuring"),
+        (11, "cleaningup"),
+        (12, "shuttingdown"),
+        (13, "activating"),
+        (14, "deactivating"),
+        (15, "errorprocessing"),
+    )
+)
+"""States of a node, in the order in which rcl names them."""
+
+_STATE = {state.label: state for state in STATES}
+UNCONFIGURED, INACTIVE, ACTIVE, FINALIZED = (
+    _STATE[label] for label in ("unconfigured", "inactive", "active", "finalized")
+)
+
+SUCCESS, FAILURE, ERROR = "transition_success", "transition_failure", "transition_error"
+
+TRANSITIONS = tuple(
+    LifecycleTransition(number, label, _STATE[start], _STATE[goal])
+    for number, label, start, goal in (
+        (1, "configure", "unconfigured", "configuring"),
+        (10, SUCCESS, "configuring", "inactive"),
+        (11, FAILURE, "configuring", "unconfigured"),
+        (12, ERROR, "configuring", "errorprocessing"),
+        (2, "cleanup", "inactive", "cleaningup"),
+        (20, SUCCESS, "cleaningup", "unconfigured"),
+        (21, FAILURE, "cleaningup", "inactive"),
+        (22, ERROR, "cleaningup", "errorprocessing"),
+        (3, "activate", "inactive", "activating"),
+        (30, SUCCESS, "activating", "active"),
+        (31, FAILURE, "activating", "inactive"),
+        (32, ERROR, "activating", "errorprocessing"),
+        (4, "deactivate", "active", "deactivating"),
+        (40, SUCCESS, "deactivating", "inactive"),
+        (41, FAILURE, "deactivating", "active"),
+        (42, ERROR, "deactivating", "errorprocessing"),
+        (5, "shutdown", "unconfigured", "shuttingdown"),
+        (6, "shutdown", "inactive", "shuttingdown"),
+        (7, "shutdown", "active", "shuttingdown"),
+        (50, SUCCESS, "shuttingdown", "finalized"),
+        (51, FAILURE, "shuttingdown", "finalized"),
+        (52, ERROR, "shuttingdown", "errorprocessing"),
+        (60, SUCCESS, "errorprocessing", "unconfigured"),
+        (61, FAILURE, "errorprocessing", "finalized"),
+        (62, ERROR, "errorprocessing", "finalized"),
+    )
+)
+"""Transitions, in the order in which rcl names them. Nobody can ask for one from number 10 on."""
+
+PRIVATE = 10
+"""Ids from here on are of transitions that follow by themselves."""
+
+
+class Lifecycle:
+    """The states of a managed node, and the ways between them; one at a time.
+
+    A transition that has begun goes on when who asked for it gives up. What it has to do may fail
+    with a :exc:`~smartcam.SmartCamError`, which leads back; any other error leads over error
+    processing to Unconfigured.
+
+    Args:
+        name: the node's, for texts.
+        work: what there is to do for a transition, by its label.
+        timeout: seconds that a transition may take.
+
+    Attributes:
+        state: the present one; a transition's own while it is under way.
+        closed: nothing can be asked for any more.
+    """
+
+    def __init__(
+        self, name: str, work: Mapping[str, Callable[[], Awaitable[None]]], timeout: float
+    ) -> None:
+        self.name: str = name
+        self.state: LifecycleState = UNCONFIGURED
+        self._work, self._timeout = work, timeout
+        self._heard: list[Callable[[LifecycleTransition], None]] = []
+        self._task: asyncio.Task[None] | None = None
+        self.closed: bool = False
+
+    @property
+    def active(self) -> bool:
+        """True if results are to be published."""
+        return self.state is ACTIVE
+
+    @property
+    def available(self) -> list[LifecycleTransition]:
+        """The transitions that begin at the present state."""
+        return [one for one in TRANSITIONS if one.start is self.state]
+
+    def listen(self, heard: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
+        """Have ``heard`` called after each step; return what ends that."""
+        self._heard.append(heard)
+        return lambda: self._heard.remove(heard) if heard in self._heard else None
+
+    async def settled(self) -> None:
+        """Wait until no transition is under way.
+
+        Raises:
+            RosError: one is, for longer than it may take.
+        """
+        try:
+            async with asyncio.timeout(self._timeout):
+                while self._task is not None and not self._task.done():
+                    await asyncio.wait((self._task,))
+        except TimeoutError as exc:
+            text = f"{self.name}: other transitions took {self._timeout:g} s"
+            raise RosError(text) from exc
+
+    async def change(self, label: str = "", number: int = 0) -> None:
+        """Make a transition, once none is under way.
+
+        Args:
+            label: name of the transition; where there is one, ``number`` does not count, as in
+                rclcpp_lifecycle.
+            number: id of the transition.
+
+        Raises:
+            RosError: the transition does not begin at the present state.
+            SmartCamError: the transition failed; the error says why.
+
+        Cancellation: a transition that has begun goes on.
+        """
+        await self.settled()
+        transition = self._find(label, number)
+        self._begins()
+        self._enter(transition)
+        self._task = asyncio.get_running_loop().create_task(self._finish(transition))
+        self._task.add_done_callback(self._finished)
+        await asyncio.shield(self._task)
+
+    def _begins(self) -> None:
+        """Begin a transition that was asked for."""
+
+    async def configure(self) -> None:
+        """Have it configured: from Unconfigured to Inactive, else nothing; as :meth:`change`."""
+        await self._have("configure", INACTIVE, ACTIVE)
+
+    async def activate(self) -> None:
+        """Have it active: from Inactive to Active, else nothing; as :meth:`change`."""
+        await self._have("activate", ACTIVE)
+
+    async def deactivate(self) -> None:
+        """Have it not active: from Active to Inactive, else nothing; as :meth:`change`."""
+        await self._have("deactivate", INACTIVE, UNCONFIGURED)
+
+    async def cleanup(self) -> None:
+        """Have it not configured: from Inactive to Unconfigured, else nothing; as `change`."""
+        await self._have("cleanup", UNCONFIGURED)
+
+    async def shutdown(self) -> None:
+        """Have it Finalized, for good; as :meth:`change`."""
+        await self._have("shutdown", FINALIZED)
+
+    async def _have(self, label: str, *enough: LifecycleState) -> None:
+        await self.settled()
+        if self.closed or self.state not in enough:
+            await self.change(label)
+
+    async def close(self) -> None:
+        """Give up what is under way, and be Finalized. Idempotent."""
+        self.closed = True
+        task = self._task
+        if task is not None and not task.done():
+            task.cancel()
+            await asyncio.wait((task,))
+        for label in ("shutdown", SUCCESS):
+            step = next((one for one in self.available if one.label == label), None)
+            if step is not None and self.state is not FINALIZED:
+                self._enter(step)
+
+    def _find(self, label: str, number: int) -> LifecycleTransition:
+        possible = [one for one in self.available if one.id < PRIVATE]
+        for one in possible:
+            if not self.closed and (one.label == label if label else one.id == number):
+                return one
+        wanted = repr(label[:40]) if label else f"transition {number}"
+        ways = ", ".join(f"{one.label} ({one.id})" for one in possible) or "nothing"
+        state = "closed" if self.closed else self.state.label
+        raise RosError(f"{self.name}: {wanted}: it is {state}, where {ways} can be asked for")
+
+    async def _finish(self, transition: LifecycleTransition) -> None:
+        try:
+            async with asyncio.timeout(self._timeout):
+                work = self._work.get(transition.label)
+                if work is not None:
+                    await work()
+        except SmartCamError:
+            self._follow(FAILURE)
+            raise
+        except TimeoutError as exc:
+            self._follow(FAILURE)
+            text = f"{self.name}: {transition.label}: it took more than {self._timeout:g} s"
+            raise ResponseTimeoutError(text, waited=self._timeout) from exc
+        except asyncio.CancelledError:
+            raise
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:
+            logger.exception("%s ! %s failed", self.name, transition.label)
+            self._follow(ERROR)
+            self._follow(SUCCESS)  # there is nothing that would have to be put back
+            text = f"{self.name}: {transition.label}: {type(exc).__name__}: {exc}"
+            raise RosError(text) from exc
+        self._follow(SUCCESS)
+
+    def _finished(self, task: asyncio.Task[None]) -> None:
+        """Look at how it ended; one that was cancelled, before it began perhaps, has failed."""
+        if task.cancelled():
+            self._follow(FAILURE)
+        else:
+            task.exception()
+
+    def _follow(self, label: str) -> None:
+        self._enter(next(one for one in self.available if one.label == label))
+
+    def _enter(self, transition: LifecycleTransition) -> None:
+        self.state = transition.goal
+        if self.state.id < PRIVATE:
+            logger.info("%s = %s", self.name, self.state.label)
+        for heard in tuple(self._heard):
+            try:
+                heard(transition)
+            except ENDS_PROGRAM:
+                raise
+            except BaseException:
+                logger.exception("%s ! who was told that it is %s", self.name, self.state.label)

@@ -1,0 +1,267 @@
+"""A node of ROS 2 in asyncio, without an installation of ROS."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from smartcam._ros_names import resolve
+from smartcam._zenoh import ZenohDeclared
+from smartcam.ros2._node.context import ROUTER, RosContext
+from smartcam.ros2._node.named_node import HANDLER_TIMEOUT, NamedNode
+from smartcam.ros2._node.parameter_client import CALL_TIMEOUT, ParameterClient
+from smartcam.ros2._node.parameters import RosParameters
+from smartcam.ros2._node.qos import DEFAULT, SERVICES, QoS
+from smartcam.ros2._node.services import RosClient, RosService
+from smartcam.ros2._node.tokens import CLIENT, NODE, PUBLISHER, SERVICE, SUBSCRIPTION, Entity
+from smartcam.ros2._node.topics import RosEnd, RosPublisher, RosSubscription
+from smartcam.ros2._node.type_description import TypeDescriptions
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+
+    from smartcam.ros2._node.graph import RosGraph
+    from smartcam.ros2._node.tokens import Kind
+    from smartcam.ros2._types.types import RosTypes
+
+OPEN_TIMEOUT = 10.0
+"""Seconds for coming to a router."""
+
+CLOSE_TIMEOUT = 5.0
+
+End = TypeVar("End", bound=RosEnd)
+
+
+class Node(NamedNode):
+    """A node of ROS 2, for programs that use rmw_zenoh; ``async with`` opens and closes it.
+
+    ::
+
+        async with smartcam.ros2.Node("viewer") as node:
+            async for message in node.subscribe("/chatter", "std_msgs/msg/String"):
+                print(message.data)
+
+    Args:
+        name: name of the node, of letters, digits and ``_``.
+        namespace: namespace of the node, such as ``/line1``.
+        connect: endpoints of the Zenoh router; default: rmw_zenoh's own.
+        listen: endpoints to listen on instead, as the router.
+        domain: the number that keeps systems apart; None for the variable ``ROS_DOMAIN_ID``.
+        distribution: name of the ROS distribution, whose type hashes are part of all names.
+        context: context shared with other nodes of this process, in place of the arguments above.
+        parameters: whether other nodes see its parameters and types, by seven services and a topic.
+        open_timeout: seconds for coming to the router.
+
+    Attributes:
+        parameters: parameters of the node.
+
+    Raises:
+        ConfigurationError: a name, domain or distribution cannot be.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        namespace: str = "/",
+        connect: str | Sequence[str] = ROUTER,
+        listen: str | Sequence[str] = (),
+        domain: int | None = None,
+        distribution: str = "jazzy",
+        context: RosContext | None = None,
+        parameters: bool = True,
+        open_timeout: float = OPEN_TIMEOUT,
+    ) -> None:
+        super().__init__(name, namespace)
+        self.context: RosContext = context or RosContext(
+            connect=connect, listen=listen, domain=domain, distribution=distribution
+        )
+        self._open_timeout = open_timeout
+        self._id = 0
+        self._token: ZenohDeclared | None = None
+        self._ends: set[RosEnd] = set()
+        self.parameters: RosParameters = RosParameters(self, served=parameters)
+        self._descriptions = (
+            TypeDescriptions(self, lambda: [end.entity for end in self._ends])
+            if parameters
+            else None
+        )
+
+    @property
+    def types(self) -> RosTypes:
+        """The messages and services that it speaks."""
+        return self.context.types
+
+    @property
+    def graph(self) -> RosGraph:
+        """Graph of the node's domain."""
+        return self.context.graph
+
+    @property
+    def is_open(self) -> bool:
+        """True from the end of ``start()`` until ``stop()``."""
+        return self._token is not None
+
+    # ------------------------------------------------------------------ life
+
+    async def start(self) -> None:
+        """Open it.
+
+        Raises:
+            ConnectFailedError: there is no router, or it cannot listen.
+
+        Cancellation: leaves it closed.
+        """
+        if self._token is not None:
+            return
+        await self.context.open(self._open_timeout)
+        try:
+            self._id = self.context.next_id()
+            token = self._entity(NODE, self._id).token
+            self._token = ZenohDeclared(self.context.zenoh).of(
+                lambda session: session.liveliness().declare_token(token)
+            )
+        except BaseException:
+            await self.context.close()
+            raise
+        try:
+            self.parameters.open()
+            if self._descriptions is not None:
+                self._descriptions.open()
+        except BaseException:
+            await self.stop()
+            raise
+
+    async def stop(self) -> None:
+        """Close it, with all that it publishes, hears, serves and calls. Idempotent."""
+        token, self._token = self._token, None
+        if token is None:
+            return
+        services = [one for one in self._ends if isinstance(one, RosService)]
+        for end in tuple(self._ends):
+            end.close()
+        token.close()
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                await self.parameters.close()
+                for one in services:
+                    await one.wait_closed()
+        except TimeoutError:
+            pass  # a handler that does not end when it is cancelled is its author's
+        finally:
+            await self.context.close()
+
+    # ------------------------------------------------------------------ what it has
+
+    def publisher(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosPublisher:
+        """Publish on a topic.
+
+        Args:
+            topic: absolute, relative to the namespace, or private (``~/it``).
+            type: such as ``std_msgs/msg/String``.
+            qos: quality of service.
+
+        Raises:
+            ConfigurationError: the topic cannot be, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind = self.types.message(type)
+        entity = self._end(PUBLISHER, topic, "topic", kind.dds, kind.hash, qos)
+        return self._kept(RosPublisher(self.context, entity, kind, self._ends.discard))
+
+    def subscribe(self, topic: str, type: str, *, qos: QoS = DEFAULT) -> RosSubscription:
+        """Hear a topic; read it by ``async for``.
+
+        Args:
+            topic: absolute, relative to the namespace, or private (``~/it``).
+            type: such as ``std_msgs/msg/String``.
+            qos: quality of service; its depth is that of the queue.
+
+        Raises:
+            ConfigurationError: the topic cannot be, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind = self.types.message(type)
+        entity = self._end(SUBSCRIPTION, topic, "topic", kind.dds, kind.hash, qos)
+        return self._kept(RosSubscription(self.context, entity, kind, self._ends.discard))
+
+    def serve(
+        self,
+        service: str,
+        type: str,
+        handler: Callable[[Any], Awaitable[Any]],
+        *,
+        qos: QoS = SERVICES,
+        timeout: float = HANDLER_TIMEOUT,
+    ) -> RosService:
+        """Serve a service.
+
+        Args:
+            service: name of the service, resolved as that of a topic.
+            type: type of the service, such as ``std_srvs/srv/Trigger``.
+            handler: coroutine function that takes each request and returns the response, or a
+                mapping of its fields; where it raises, the response says so, if it has fields for
+                that, such as ``success`` or ``error``; else the call gets no reply. The log has it.
+            qos: quality of service.
+            timeout: seconds that the handler may take.
+
+        Raises:
+            ConfigurationError: the name cannot be, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind = self.types.service(type)
+        entity = self._end(SERVICE, service, "service", kind.dds, kind.hash, qos)
+        return self._kept(
+            RosService(self.context, entity, kind, handler, timeout, self._ends.discard)
+        )
+
+    def client(self, service: str, type: str, *, qos: QoS = SERVICES) -> RosClient:
+        """Return a client that calls a service.
+
+        Args:
+            service: name of the service, resolved as that of a topic.
+            type: type of the service, such as ``std_srvs/srv/Trigger``.
+            qos: quality of service.
+
+        Raises:
+            ConfigurationError: the name cannot be, or there is no such type.
+            RosError: the node is not open.
+        """
+        kind = self.types.service(type)
+        entity = self._end(CLIENT, service, "service", kind.dds, kind.hash, qos)
+        return self._kept(RosClient(self.context, entity, kind, self._ends.discard))
+
+    def parameters_of(self, name: str, *, timeout: float = CALL_TIMEOUT) -> ParameterClient:
+        """Return a client that lists, gets, describes and sets another node's parameters.
+
+        Args:
+            name: name of the other node, absolute or relative to the namespace.
+            timeout: seconds for one call.
+
+        Raises:
+            ConfigurationError: the name cannot be.
+        """
+        return ParameterClient(self, resolve(name, self.namespace, self.name, "node"), timeout)
+
+    def _kept(self, end: End) -> End:
+        self._ends.add(end)
+        return end
+
+    def _end(
+        self,
+        kind: Kind,
+        name: str,
+        what: str,
+        dds: str,
+        hashed: str,
+        qos: QoS,
+    ) -> Entity:
+        full = self._resolved(name, what)
+        return self._entity(kind, self.context.next_id(), full, dds, hashed, qos)
+
+    def _entity(self, kind: Kind, number: int, *more: Any) -> Entity:
+        context = self.context
+        return Entity(
+            kind, context.domain, context.zid, self._id, number, self.namespace, self.name, *more
+        )

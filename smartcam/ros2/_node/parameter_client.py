@@ -1,0 +1,134 @@
+"""Another node's parameters."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import ConfigurationError, ServiceCallError
+from smartcam.ros2._node.parameter_values import (
+    ParameterDescription,
+    decode_value,
+    encode_value,
+    typed,
+)
+from smartcam.ros2._node.qos import PARAMETERS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from typing import Self
+
+    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.services import RosClient
+
+CALL_TIMEOUT = 15.0
+"""Seconds; a node of ours gives a set ten."""
+
+
+class ParameterClient:
+    """Another node's parameters; made by :meth:`Node.parameters_of`, and closed with its node.
+
+    Every method raises a :class:`~smartcam.ServiceCallError` where there is no such node, or the
+    node does not answer. A cancelled call leaves the client usable; whether a cancelled set is
+    carried out is not known.
+
+    Args:
+        node: node that asks.
+        name: full name of the other node.
+        timeout: seconds for one call.
+    """
+
+    def __init__(self, node: Node, name: str, timeout: float = CALL_TIMEOUT) -> None:
+        self.name: str = name
+        self._node, self._timeout = node, timeout
+        self._clients: dict[str, RosClient] = {}
+
+    async def list(self, *prefixes: str, depth: int = 0) -> list[str]:
+        """Return the names of parameters.
+
+        Args:
+            *prefixes: only these, and what is in these groups; none is all.
+            depth: how many parts of a name below that; 0 is any.
+        """
+        reply = await self._call(
+            "list_parameters", "ListParameters", prefixes=prefixes, depth=depth
+        )
+        return list(reply.result.names)
+
+    async def get(self, *names: str) -> dict[str, Any]:
+        """Return values by their names; arrays are tuples, None is not set.
+
+        Raises:
+            ServiceCallError: one of them is not declared there.
+        """
+        reply = await self._call("get_parameters", "GetParameters", names=names)
+        self._check("get_parameters", names, reply.values)
+        found = zip(names, reply.values, strict=True)
+        return {name: decode_value(value).value for name, value in found}
+
+    async def describe(self, *names: str) -> dict[str, ParameterDescription]:
+        """Return the descriptions of parameters by their names.
+
+        Raises:
+            ServiceCallError: one of them is not declared there.
+        """
+        reply = await self._call("describe_parameters", "DescribeParameters", names=names)
+        self._check("describe_parameters", names, reply.descriptors)
+        found = zip(names, reply.descriptors, strict=True)
+        return {name: ParameterDescription.decode(one) for name, one in found}
+
+    async def set(self, values: Mapping[str, object] | None = None, /, **more: object) -> None:
+        """Set parameters, all or none.
+
+        Args:
+            values: by their names; an ``int`` is no double.
+            **more: further ones.
+
+        Raises:
+            ConfigurationError: a value can be none.
+            ServiceCallError: the node refused, with its reason.
+        """
+        both = {**(values or {}), **more}
+        if not both:
+            raise ConfigurationError(f"{self.name}: expected parameters to set, got none")
+        reply = await self._call(
+            "set_parameters_atomically",
+            "SetParametersAtomically",
+            parameters=[
+                {"name": name, "value": encode_value(typed(name, value))}
+                for name, value in both.items()
+            ],
+        )
+        if not reply.result.successful:
+            raise ServiceCallError(
+                f"{self.name} refused to set {', '.join(both):.200}: "
+                f"{reply.result.reason[:1000] or 'it does not say why'}",
+                service=f"{self.name}/set_parameters_atomically",
+            )
+
+    async def _call(self, service: str, type: str, **fields: Any) -> Any:
+        client = self._clients.get(service)
+        if client is None:
+            client = self._clients[service] = self._node.client(
+                f"{self.name}/{service}", f"rcl_interfaces/srv/{type}", qos=PARAMETERS
+            )
+        return await client.call(timeout=self._timeout, **fields)
+
+    def _check(self, service: str, names: Sequence[str], got: Sequence[Any]) -> None:
+        if len(got) != len(names):
+            raise ServiceCallError(
+                f"{self.name}: {len(got)} answers for {len(names)} names: not all of "
+                f"{', '.join(names):.200} are declared there",
+                service=f"{self.name}/{service}",
+            )
+
+    def close(self) -> None:
+        """Ask no more. Idempotent."""
+        clients, self._clients = self._clients, {}
+        for client in clients.values():
+            client.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()

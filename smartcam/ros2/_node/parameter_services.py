@@ -1,0 +1,205 @@
+"""The services and the topic by which other nodes see a node's parameters.
+
+Names, QoS and answers as ``parameter_service.cpp`` and ``node_parameters.cpp`` of rclcpp: one name
+that is not declared leaves an answer empty.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from smartcam.exceptions import SmartCamError
+from smartcam.ros2._node.parameter_values import decode_value, encode_value
+from smartcam.ros2._node.qos import PARAMETERS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.parameter_values import Typed
+    from smartcam.ros2._node.parameters import RosParameters
+    from smartcam.ros2._node.topics import RosPublisher
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+MAX_NAMES = 1024
+"""Names in a request; one with more is refused: a list is empty, a set says why."""
+
+MAX_REASON_CHARACTERS = 1000
+"""Characters of why a set did not work."""
+
+TURN = 64
+"""Names until other things have their turn."""
+
+SEPARATOR: Final = "."
+DEPTH_RECURSIVE: Final = 0
+
+
+Answer = TypeVar("Answer")
+
+
+class ParameterServices:
+    """Serves a node's parameters to other nodes.
+
+    Args:
+        node: node that has the parameters.
+        parameters: parameters to serve.
+    """
+
+    def __init__(self, node: Node, parameters: RosParameters) -> None:
+        self._node, self._parameters = node, parameters
+        self._events: RosPublisher | None = None
+
+    def open(self) -> None:
+        """Serve, and publish what there is."""
+        self._events = self._node.publisher(
+            "/parameter_events", "rcl_interfaces/msg/ParameterEvent", qos=PARAMETERS
+        )
+        for name, type, handler in (
+            ("describe_parameters", "DescribeParameters", self._describe),
+            ("get_parameter_types", "GetParameterTypes", self._get_types),
+            ("get_parameters", "GetParameters", self._get),
+            ("list_parameters", "ListParameters", self._list),
+            ("set_parameters", "SetParameters", self._set),
+            ("set_parameters_atomically", "SetParametersAtomically", self._set_atomically),
+        ):
+            self._node.serve(f"~/{name}", f"rcl_interfaces/srv/{type}", handler, qos=PARAMETERS)
+        self.tell(new=self._parameters.names())
+
+    def close(self) -> None:
+        """Publish no more; the node closes its ends."""
+        self._events = None
+
+    def tell(
+        self,
+        *,
+        new: Sequence[str] = (),
+        changed: Sequence[str] = (),
+        deleted: Mapping[str, Typed] | None = None,
+    ) -> None:
+        """Publish that parameters are new, changed or gone."""
+        if self._events is None or not (new or changed or deleted):
+            return
+        seconds, rest = divmod(time.time_ns(), 1_000_000_000)
+        self._events.publish(
+            stamp={"sec": seconds, "nanosec": rest},
+            node=self._node.full_name,
+            new_parameters=self._said(new),
+            changed_parameters=self._said(changed),
+            deleted_parameters=[
+                {"name": name, "value": encode_value(was)} for name, was in (deleted or {}).items()
+            ],
+        )
+
+    def _said(self, names: Iterable[str]) -> list[dict[str, Any]]:
+        found = ((name, self._parameters.find(name)) for name in names)
+        return [{"name": name, "value": encode_value(one)} for name, one in found if one]
+
+    # ------------------------------------------------------------------ to read
+
+    async def _describe(self, request: Any) -> dict[str, Any]:
+        kind = self._node.types.message("rcl_interfaces/msg/ParameterDescriptor")
+        describe = self._parameters.describe
+        return {
+            "descriptors": await self._each(
+                request.names, lambda name, _: kind.new(**describe(name).encode())
+            )
+        }
+
+    async def _get_types(self, request: Any) -> dict[str, Any]:
+        return {"types": bytes(await self._each(request.names, lambda _, value: value.number))}
+
+    async def _get(self, request: Any) -> dict[str, Any]:
+        kind = self._node.types.message("rcl_interfaces/msg/ParameterValue")
+        return {
+            "values": await self._each(
+                request.names, lambda _, value: kind.new(**encode_value(value))
+            )
+        }
+
+    async def _each(
+        self, names: Sequence[str], make: Callable[[str, Typed], Answer]
+    ) -> list[Answer]:
+        """Return an answer for each name; none at all where one is not declared, or too many."""
+        if self._too_many(names):
+            return []
+        made = []
+        for place, name in enumerate(names, 1):
+            value = self._parameters.find(name)
+            if value is None:
+                return []
+            made.append(make(name, value))
+            if not place % TURN:
+                await asyncio.sleep(0)
+        return made
+
+    async def _list(self, request: Any) -> dict[str, Any]:
+        if self._too_many(request.prefixes):
+            return {}
+        names: list[str] = []
+        prefixes: dict[str, None] = {}
+        for place, name in enumerate(self._parameters.names(), 1):
+            if _listed(name, request.prefixes, request.depth):
+                names.append(name)
+                if SEPARATOR in name:
+                    prefixes[name.rpartition(SEPARATOR)[0]] = None
+            if not place % TURN:
+                await asyncio.sleep(0)
+        return {"result": {"names": names, "prefixes": list(prefixes)}}
+
+    # ------------------------------------------------------------------ to set
+
+    async def _set(self, request: Any) -> dict[str, Any]:
+        if why := self._too_many(request.parameters):
+            refused = {"successful": False, "reason": why}
+            return {"results": [refused] * len(request.parameters)}
+        results = []
+        for one in request.parameters:
+            results.append(await self._result([one]))
+            await asyncio.sleep(0)
+        return {"results": results}
+
+    async def _set_atomically(self, request: Any) -> dict[str, Any]:
+        if why := self._too_many(request.parameters):
+            return {"result": {"successful": False, "reason": why}}
+        if not request.parameters:
+            return {"result": {"successful": False, "reason": "expected a parameter, got none"}}
+        return {"result": await self._result(request.parameters)}
+
+    def _too_many(self, names: Sequence[Any]) -> str:
+        """Return why a request is refused for its many names, which the log gets; else ""."""
+        if len(names) <= MAX_NAMES:
+            return ""
+        why = f"a request with {len(names)} names: expected {MAX_NAMES} at most"
+        logger.warning("%s ! %s", self._node.full_name, why)
+        return why
+
+    async def _result(self, parameters: Sequence[Any]) -> dict[str, Any]:
+        try:
+            values = {one.name: decode_value(one.value) for one in parameters}
+            await self._parameters.carry_out(values)
+        except SmartCamError as exc:
+            return {"successful": False, "reason": reason(exc)}
+        return {"successful": True}
+
+
+def reason(exc: SmartCamError) -> str:
+    """Return why a set did not work, as text that a message can have."""
+    text = "; ".join((str(exc), *getattr(exc, "__notes__", ())))
+    return text[:MAX_REASON_CHARACTERS].replace("\0", " ").encode(errors="replace").decode()
+
+
+def _listed(name: str, prefixes: Sequence[str], depth: int) -> bool:
+    """Return True if a name is asked for: up to ``depth`` parts of it below a prefix."""
+    for prefix in prefixes or ("",):
+        if name == prefix:
+            return True
+        start = f"{prefix}{SEPARATOR}" if prefixes else ""
+        if name.startswith(start) and (
+            depth == DEPTH_RECURSIVE or name.count(SEPARATOR, len(start)) < depth
+        ):
+            return True
+    return False

@@ -1,0 +1,299 @@
+"""Values of ROS parameters: their types and ranges, and how messages say them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.exceptions import ConfigurationError, RosMessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+TYPES: Final = (
+    "not set",
+    "bool",
+    "integer",
+    "double",
+    "string",
+    "byte_array",
+    "bool_array",
+    "integer_array",
+    "double_array",
+    "string_array",
+)
+"""The names of types by their numbers in messages (``rcl_interfaces/msg/ParameterType``)."""
+
+NOT_SET, BOOL, INTEGER, DOUBLE, STRING, BYTES = range(6)
+_TO_ARRAY: Final = 5
+"""Difference between the number of an array type and that of its elements."""
+
+_NUMBERS: Final = (INTEGER, DOUBLE)
+_INT64: Final = (-(1 << 63), (1 << 63) - 1)
+
+_CLOSE: Final = 1e-9
+"""Largest deviation of a double from a bound or a step, as a part of either."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterDescription:
+    """The description of a parameter, without its value.
+
+    Attributes:
+        name: name of the parameter.
+        type: name of the type, such as ``integer`` or ``double_array``.
+        description: explanation for people.
+        read_only: whether nobody can set it.
+        minimum, maximum: bounds of a number; None is any.
+        step: step of a number from the minimum on; None is any.
+        constraints: further constraints, for people.
+        dynamic: whether the type may change.
+    """
+
+    name: str
+    type: str
+    description: str = ""
+    read_only: bool = False
+    minimum: float | None = None
+    maximum: float | None = None
+    step: float | None = None
+    constraints: str = ""
+    dynamic: bool = False
+
+    def check_range(self, value: Any) -> None:
+        """Look whether a number of its type is in the range.
+
+        Raises:
+            ConfigurationError: it is not.
+        """
+        if not isinstance(value, int | float) or self.minimum is None or self.maximum is None:
+            return
+        if self.type == TYPES[DOUBLE]:
+            fits = _double_fits(float(value), self.minimum, self.maximum, self.step or 0.0)
+        else:
+            first, step = int(self.minimum), int(self.step or 0)
+            fits = first <= value <= self.maximum and not (
+                step and value != self.maximum and (int(value) - first) % step
+            )
+        if not fits:
+            step_text = f" in steps of {self.step}" if self.step else ""
+            raise ConfigurationError(
+                f"parameter {self.name!r}: {value} is out of its range: expected {self.minimum} "
+                f"to {self.maximum}{step_text}"
+            )
+
+    def encode(self) -> dict[str, Any]:
+        """Return the fields of a ``rcl_interfaces/msg/ParameterDescriptor``."""
+        found: dict[str, Any] = {
+            "name": self.name,
+            "type": TYPES.index(self.type),
+            "description": self.description,
+            "additional_constraints": self.constraints,
+            "read_only": self.read_only,
+            "dynamic_typing": self.dynamic,
+        }
+        if self.minimum is not None and self.maximum is not None:
+            field = "integer_range" if self.type == TYPES[INTEGER] else "floating_point_range"
+            found[field] = [
+                {"from_value": self.minimum, "to_value": self.maximum, "step": self.step or 0}
+            ]
+        return found
+
+    @classmethod
+    def decode(cls, message: Any) -> ParameterDescription:
+        """Read a description from a ``rcl_interfaces/msg/ParameterDescriptor``.
+
+        Raises:
+            RosMessageError: there is no such type.
+        """
+        ranges = message.integer_range or message.floating_point_range
+        return cls(
+            message.name,
+            type_name(message.type),
+            message.description,
+            message.read_only,
+            ranges[0].from_value if ranges else None,
+            ranges[0].to_value if ranges else None,
+            (ranges[0].step or None) if ranges else None,
+            message.additional_constraints,
+            message.dynamic_typing,
+        )
+
+
+def _double_fits(value: float, first: float, last: float, step: float) -> bool:
+    if math.isclose(value, first, rel_tol=_CLOSE) or math.isclose(value, last, rel_tol=_CLOSE):
+        return True
+    if not first <= value <= last:
+        return False
+    if not step:
+        return True
+    if not math.isfinite(value):
+        return False
+    nearest = first + round((value - first) / step) * step
+    return math.isclose(value, nearest, rel_tol=_CLOSE, abs_tol=_CLOSE * step)
+
+
+def range_of(
+    name: str, number: int, minimum: float | None, maximum: float | None, step: float | None
+) -> tuple[float | None, float | None, float | None]:
+    """Return a range as it is declared: both bounds, or neither.
+
+    Raises:
+        ConfigurationError: there can be none, or it holds nothing.
+    """
+    if minimum is None and maximum is None and step is None:
+        return None, None, None
+    if number not in _NUMBERS:
+        raise ConfigurationError(
+            f"parameter {name!r}: {TYPES[number]} has no range: expected integer or double"
+        )
+    least, most = _INT64 if number == INTEGER else (-math.inf, math.inf)
+    first, last = least if minimum is None else minimum, most if maximum is None else maximum
+    if step is not None and (minimum is None or not math.isfinite(minimum) or not step > 0):
+        raise ConfigurationError(
+            f"parameter {name!r}: step {step}: expected a number above 0, and a minimum"
+        )
+    if number == INTEGER:
+        wrong = [one for one in (first, last, step) if one is not None and not _whole(one)]
+        if wrong:
+            raise ConfigurationError(
+                f"parameter {name!r}: a range of {wrong[0]}: expected whole numbers of 64 bits"
+            )
+    else:
+        first, last, step = float(first), float(last), None if step is None else float(step)
+    if not first <= last:
+        raise ConfigurationError(f"parameter {name!r}: nothing is in {first} to {last}")
+    return first, last, step
+
+
+def _whole(value: float) -> bool:
+    return (
+        isinstance(value, int) and not isinstance(value, bool) and _INT64[0] <= value <= _INT64[1]
+    )
+
+
+def type_name(number: int) -> str:
+    """Return a type's name.
+
+    Raises:
+        RosMessageError: there is none of this number.
+    """
+    if not 0 <= number < len(TYPES):
+        raise RosMessageError(
+            f"parameter type {number}: expected 0 to {len(TYPES) - 1}, as ParameterType has"
+        )
+    return TYPES[number]
+
+
+class Typed(NamedTuple):
+    """A value with the number of its type; None where it is not set. Arrays are tuples."""
+
+    number: int
+    value: Any
+
+    @property
+    def type(self) -> str:
+        """The name of its type."""
+        return TYPES[self.number]
+
+    def __str__(self) -> str:
+        return f"{self.type} {self.value!r:.80}"
+
+
+def typed(name: str, given: object, declared: int = NOT_SET) -> Typed:
+    """Return a value with its type.
+
+    Args:
+        name: name of the parameter, for texts.
+        given: a value of Python, or of numpy; or with its type already.
+        declared: the type of a list without elements.
+
+    Raises:
+        ConfigurationError: it can be none.
+    """
+    if isinstance(given, Typed):
+        return given
+    if isinstance(given, np.ndarray | np.generic):
+        given = given.tolist()
+    if isinstance(given, list | tuple):
+        return _array(name, given, declared)
+    number = _number_of(type(given))
+    if number == NOT_SET:
+        raise ConfigurationError(
+            f"parameter {name!r}: got {type(given).__name__}, expected bool, int, float, str, "
+            "bytes, or a list of bool, int, float or str"
+        )
+    _check_elements(name, number, (given,))
+    return Typed(number, _PLAIN[number](given))
+
+
+def _array(name: str, given: Sequence[Any], declared: int) -> Typed:
+    if not given:
+        if declared < BYTES:
+            raise ConfigurationError(
+                f"parameter {name!r}: a list without elements: expected its type, too"
+            )
+        return Typed(declared, b"" if declared == BYTES else ())
+    numbers = {_number_of(one) for one in set(map(type, given))}
+    number = numbers.pop()
+    if numbers or not BOOL <= number <= STRING:
+        names = sorted({type(one).__name__ for one in given})
+        raise ConfigurationError(
+            f"parameter {name!r}: expected a list of bool, of int, of float or of str, got "
+            f"{', '.join(names)}"
+        )
+    _check_elements(name, number, given)
+    return Typed(number + _TO_ARRAY, tuple(map(_PLAIN[number], given)))
+
+
+_PLAIN: Final[dict[int, Callable[[Any], Any]]] = {
+    BOOL: bool, INTEGER: int, DOUBLE: float, STRING: str, BYTES: bytes,
+}  # fmt: skip
+
+
+def _number_of(kind: type) -> int:
+    for number, one in ((BOOL, bool), (INTEGER, int), (DOUBLE, float), (STRING, str)):
+        if issubclass(kind, one):
+            return number
+    return BYTES if issubclass(kind, bytes | bytearray) else NOT_SET
+
+
+def _check_elements(name: str, number: int, given: Sequence[Any]) -> None:
+    if number == INTEGER and not (_whole(min(given)) and _whole(max(given))):
+        raise ConfigurationError(f"parameter {name!r}: expected integers of 64 bits")
+    if number == STRING:
+        text = "".join(given)
+        try:
+            text.encode()
+        except UnicodeEncodeError as exc:
+            raise ConfigurationError(f"parameter {name!r}: {text!r:.80}: {exc.reason}") from exc
+        if "\0" in text:
+            raise ConfigurationError(f"parameter {name!r}: {text!r:.80}: expected text without NUL")
+
+
+def encode_value(value: Typed) -> dict[str, Any]:
+    """Return the fields of a ``rcl_interfaces/msg/ParameterValue``."""
+    plain = value.value
+    field = f"{value.type}_value"
+    return {"type": value.number, field: list(plain) if isinstance(plain, tuple) else plain}
+
+
+def decode_value(message: Any) -> Typed:
+    """Read a ``rcl_interfaces/msg/ParameterValue``.
+
+    Raises:
+        RosMessageError: there is no such type.
+    """
+    number = int(message.type)
+    name = type_name(number)
+    if number == NOT_SET:
+        return Typed(number, None)
+    value = getattr(message, f"{name}_value")
+    if number == BYTES:
+        return Typed(number, bytes(value))
+    if number > BYTES:
+        value = tuple(value.tolist() if isinstance(value, np.ndarray) else value)
+    return Typed(number, value)

@@ -1,0 +1,352 @@
+"""The parameters of a node: what is declared, and how it is set."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError, RosError, SmartCamError
+from smartcam.ros2._node.parameter_services import ParameterServices
+from smartcam.ros2._node.parameter_values import (
+    TYPES,
+    ParameterDescription,
+    Typed,
+    range_of,
+    typed,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from smartcam.ros2._node.node import Node
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+SET_TIMEOUT = 10.0
+"""Seconds that a hook may take, and that a set waits for those before it."""
+
+MAX_VALUE_SIZE = 1 << 16
+"""Characters, bytes or elements of a value."""
+
+MAX_NAME_CHARACTERS = 256
+MAX_PARAMETERS = 1024
+
+
+class _Declared:
+    """A parameter that is declared, with its value."""
+
+    __slots__ = ("description", "on_set", "value")
+
+    def __init__(
+        self, description: ParameterDescription, value: Typed, on_set: Callable[[Any], Any] | None
+    ) -> None:
+        self.description, self.value, self.on_set = description, value, on_set
+
+    def fitting(self, given: object, *, by_node: bool = False) -> Typed:
+        """Return a value as it would be kept.
+
+        Raises:
+            ConfigurationError: it is of another type, or out of range, or nobody can set it.
+        """
+        name = self.description.name
+        if self.description.read_only and not by_node:
+            raise ConfigurationError(f"parameter {name!r} cannot be set: it is read-only")
+        if given is None or (isinstance(given, Typed) and given.value is None):
+            raise ConfigurationError(f"parameter {name!r} cannot be unset: it is {self.value.type}")
+        value = typed(name, given, self.value.number)
+        if value.number != self.value.number:
+            raise ConfigurationError(
+                f"parameter {name!r} is {self.value.type}, it cannot be set to {value}"
+            )
+        self._check(value)
+        return value
+
+    def _check(self, value: Typed) -> None:
+        name, plain = self.description.name, value.value
+        if isinstance(plain, str | bytes | tuple) and len(plain) > MAX_VALUE_SIZE:
+            raise ConfigurationError(
+                f"parameter {name!r}: a value of length {len(plain)}: "
+                f"expected {MAX_VALUE_SIZE} at most"
+            )
+        self.description.check_range(plain)
+
+
+class _ParameterChange(NamedTuple):
+    declared: _Declared
+    old: Typed
+    new: Typed
+
+
+class RosParameters:
+    """The parameters of a node; other nodes list, get, describe and set them while it is open.
+
+    The type of a parameter is that of the value it is declared with: ``bool``, ``int``, ``float``,
+    ``str``, ``bytes``, or a list of one of the first four; an ``int`` is no ``float``.
+
+    Args:
+        node: node that has the parameters.
+        served: whether other nodes see the parameters.
+        timeout: seconds that one ``on_set`` may take, and that a set waits for those before it.
+    """
+
+    def __init__(self, node: Node, *, served: bool = True, timeout: float = SET_TIMEOUT) -> None:
+        self._node, self._timeout = node, timeout
+        self._declared: dict[str, _Declared] = {}
+        self._turn = asyncio.Lock()
+        self._setting: asyncio.Task[Any] | None = None  # whose turn it is
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self._services = ParameterServices(node, self) if served else None
+        self.declare(
+            "use_sim_time",
+            False,
+            description="Whether time is that of the topic /clock.",
+            on_set=_refuse_sim_time,
+        )
+
+    # ------------------------------------------------------------------ life
+
+    def open(self) -> None:
+        """Let other nodes see them; the node does so when it is opened."""
+        if self._services is not None:
+            self._services.open()
+
+    async def close(self) -> None:
+        """Give up sets that are under way; what is declared stays. The node does so."""
+        if self._services is not None:
+            self._services.close()
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(tuple(self._tasks))
+
+    # ------------------------------------------------------------------ what there is
+
+    def declare(
+        self,
+        name: str,
+        value: object,
+        *,
+        description: str = "",
+        read_only: bool = False,
+        minimum: float | None = None,
+        maximum: float | None = None,
+        step: float | None = None,
+        on_set: Callable[[Any], Awaitable[Any] | None] | None = None,
+        type: str = "",
+    ) -> None:
+        """Declare a parameter.
+
+        Args:
+            name: name such as ``exposure``, or ``image.width`` in a group.
+            value: first value.
+            description: explanation for people.
+            read_only: whether only :meth:`update` can change the value.
+            minimum: least value of a number.
+            maximum: greatest value of a number.
+            step: step of a number, from ``minimum`` on.
+            on_set: is called, and awaited, with a new value before it counts; a
+                :class:`~smartcam.SmartCamError` of it refuses the value, with its text.
+            type: name of the type, such as ``string_array``, for a list without elements.
+
+        Raises:
+            ConfigurationError: it is declared, or value, name, type or range cannot be.
+        """
+        if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
+            raise ConfigurationError(f"parameter {name!r:.80}: expected a name in printable text")
+        if name in self._declared:
+            raise ConfigurationError(f"parameter {name!r} of {self._node.full_name} is declared")
+        if len(self._declared) >= MAX_PARAMETERS:
+            raise ConfigurationError(f"parameter {name!r}: expected {MAX_PARAMETERS} at most")
+        if type and type not in TYPES[1:]:
+            raise ConfigurationError(
+                f"parameter {name!r}: type {type!r}: expected one of {', '.join(TYPES[1:])}"
+                f"{did_you_mean(type, TYPES)}"
+            )
+        first = typed(name, value, TYPES.index(type) if type else 0)
+        if type and first.type != type:
+            raise ConfigurationError(f"parameter {name!r}: expected {type}, got {first}")
+        bounds = range_of(name, first.number, minimum, maximum, step)
+        said = ParameterDescription(name, first.type, description, read_only, *bounds)
+        made = _Declared(said, first, on_set)
+        made.fitting(first, by_node=True)
+        self._declared[name] = made
+        self._tell(new=[name])
+
+    def undeclare(self, name: str) -> None:
+        """Have a parameter no more.
+
+        Raises:
+            ConfigurationError: there is none of this name.
+        """
+        gone = self._of(name)
+        del self._declared[name]
+        self._tell(deleted={name: gone.value})
+
+    def names(self) -> list[str]:
+        """Return the names, in the order of their declaration."""
+        return list(self._declared)
+
+    def get(self, name: str) -> Any:
+        """Return a value; arrays are tuples.
+
+        Raises:
+            ConfigurationError: there is none of this name.
+        """
+        return self._of(name).value.value
+
+    def describe(self, name: str) -> ParameterDescription:
+        """Return the description of a parameter.
+
+        Raises:
+            ConfigurationError: there is no parameter of this name.
+        """
+        return self._of(name).description
+
+    def find(self, name: str) -> Typed | None:
+        """Return a value with its type; None where there is none of this name."""
+        found = self._declared.get(name)
+        return None if found is None else found.value
+
+    def _of(self, name: str) -> _Declared:
+        found = self._declared.get(name)
+        if found is None:
+            raise ConfigurationError(
+                f"parameter {name!r:.80} of {self._node.full_name} is not declared"
+                f"{did_you_mean(name[:MAX_NAME_CHARACTERS], self._declared)}"
+            )
+        return found
+
+    # ------------------------------------------------------------------ to set them
+
+    def update(self, name: str, value: object) -> None:
+        """Change the value of a parameter without ``on_set``, even of a read-only one.
+
+        Raises:
+            ConfigurationError: there is no parameter of this name, or it cannot have the value.
+        """
+        declared = self._of(name)
+        kept = declared.fitting(value, by_node=True)
+        if kept != declared.value:
+            declared.value = kept
+            self._tell(changed=[name])
+
+    async def set(self, name: str, value: object) -> None:
+        """Set one, as other nodes do.
+
+        Raises:
+            ConfigurationError: there is none of this name, or the value cannot be.
+            RosError: its ``on_set`` failed, or sets before it took too long.
+            SmartCamError: whatever its ``on_set`` raised to refuse it.
+
+        Cancellation: leaves the value as it was; whether ``on_set`` was carried out is unknown.
+        """
+        await self.set_all({name: value})
+
+    async def set_all(self, values: Mapping[str, object]) -> None:
+        """Set several at once, or none of them: what failed half way is taken back.
+
+        Raises:
+            ConfigurationError: there is none of a name, or a value cannot be.
+            RosError: an ``on_set`` failed, or sets before it took too long.
+            SmartCamError: whatever an ``on_set`` raised to refuse it.
+
+        Cancellation: as an ``on_set`` that fails.
+        """
+        if self._setting is not None and self._setting is asyncio.current_task():
+            raise RosError(f"{', '.join(values):.80}: an on_set cannot set parameters")
+        try:
+            async with asyncio.timeout(self._timeout):
+                await self._turn.acquire()
+        except TimeoutError:
+            raise RosError(
+                f"{', '.join(values):.80}: other sets took more than {self._timeout:g} s"
+            ) from None
+        self._setting = asyncio.current_task()
+        try:
+            await self._set_now(values)
+        finally:
+            self._setting = None
+            self._turn.release()
+
+    async def carry_out(self, values: Mapping[str, object]) -> None:
+        """Set as :meth:`set_all`, to its end even if who asked for it is gone."""
+        task = asyncio.get_running_loop().create_task(self.set_all(values))
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+        await asyncio.shield(task)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled():
+            task.exception()  # whoever asked may be gone, and nobody else wants to know
+
+    async def _set_now(self, values: Mapping[str, object]) -> None:
+        changes = []
+        for name, value in values.items():
+            declared = self._of(name)
+            changes.append(_ParameterChange(declared, declared.value, declared.fitting(value)))
+        done: list[_ParameterChange] = []
+        try:
+            for change in changes:
+                await self._call(change.declared, change.new)
+                done.append(change)
+        except BaseException as exc:
+            await self._take_back(done, exc)
+            raise
+        for change in changes:
+            change.declared.value = change.new
+        self._tell(changed=[one for one in values if one in self._declared])
+
+    async def _take_back(self, done: list[_ParameterChange], why: BaseException) -> None:
+        """Undo what went well; what cannot be undone counts, and is told."""
+        for change in reversed(done):
+            name = change.declared.description.name
+            try:
+                await self._call(change.declared, change.old)
+            except SmartCamError as exc:
+                change.declared.value = change.new
+                text = f"parameter {name!r} stays {change.new}: it was not taken back: {exc}"
+                logger.error("%s ! %s", self._node.full_name, text)  # noqa: TRY400 - it is said
+                why.add_note(text)
+                self._tell(changed=[name])
+
+    async def _call(self, declared: _Declared, value: Typed) -> None:
+        """Have a hook carry a value out.
+
+        Raises:
+            RosError: it failed, or took too long.
+            SmartCamError: it refuses.
+        """
+        if declared.on_set is None:
+            return
+        name = declared.description.name
+        deadline = asyncio.timeout(self._timeout)
+        try:
+            async with deadline:
+                made = declared.on_set(value.value)
+                if inspect.isawaitable(made):
+                    await made
+        except SmartCamError:
+            raise
+        except Exception as exc:
+            if deadline.expired():
+                raise RosError(
+                    f"parameter {name!r}: no answer within {self._timeout:g} s; whether "
+                    f"{value} took effect is unknown"
+                ) from exc
+            logger.exception("%s ! on_set of parameter %r failed", self._node.full_name, name)
+            raise RosError(f"parameter {name!r}: {type(exc).__name__}: {exc!s:.200}") from exc
+
+    def _tell(self, **what: Any) -> None:
+        if self._services is not None:
+            self._services.tell(**what)
+
+
+def _refuse_sim_time(value: bool) -> None:
+    if value:
+        raise ConfigurationError(
+            "parameter 'use_sim_time': this node has the system's time only, expected false"
+        )

@@ -1,0 +1,65 @@
+"""Answer a call that is not carried out, so that its caller's wait ends.
+
+rmw_zenoh drops an error reply, so who calls by it would wait for ever. An answer that it sees is an
+ordinary one. Many types have fields for that: ``success`` and a text, or an ``error``. The lists of
+ROS' own services say nothing by being empty, as rclcpp's do where a parameter is not declared. Any
+answer of another type, such as a sum, or of one without fields, would be a lie: such a call waits
+for its turn, and where it cannot be read it gets the error reply, so that rmw_zenoh's callers wait
+as they do for a node of ROS that cannot read a request.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from smartcam.ros2._types.types import MessageType, RosTypes, ServiceType
+
+MAX_REASON_CHARACTERS: Final = 1000
+"""Characters of the reason in an answer; what is longer is cut."""
+
+FLAGS: Final = ("success", "successful")
+"""Names of fields that say whether a call was carried out."""
+
+TEXTS: Final = (
+    *("error", "error_message", "failure_reason", "message", "reason", "status_message"),
+)
+"""Names of fields that say why not."""
+
+LISTING: Final = ("composition_interfaces", "lifecycle_msgs", "rcl_interfaces")
+"""Packages in whose answers an empty list means that nothing is known."""
+
+UNKNOWN_STATE: Final = {"id": 0, "label": "unknown"}
+"""The state of a life cycle that nobody knows, as ``lifecycle_msgs/msg/State`` has it."""
+
+
+def refusal(kind: ServiceType, why: str, types: RosTypes) -> Any:
+    """Return the response that refuses a call; None where the type has none.
+
+    Args:
+        kind: type of the service.
+        why: reason, for people.
+        types: types of the messages within.
+    """
+    text = why[:MAX_REASON_CHARACTERS].replace("\0", "\ufffd").encode(errors="replace").decode()
+    fields = _refused(kind.response, text, types)
+    return None if fields is None else kind.response.new(**fields)
+
+
+def _refused(kind: MessageType, why: str, types: RosTypes) -> dict[str, Any] | None:
+    plain = {field.name: field.type for field in kind.fields if not field.shape}
+    flags = {name: False for name in FLAGS if plain.get(name) == "bool"}
+    texts = {name: why for name in TEXTS if plain.get(name) == "string"}
+    if flags or "error" in texts:
+        return flags | texts
+    if kind.name == "lifecycle_msgs/srv/GetState_Response":
+        return {"current_state": UNKNOWN_STATE}
+    if len(kind.fields) == 1 and kind.fields[0].nested:
+        field = kind.fields[0]
+        within = _refused(types.message(field.type), why, types)
+        if within:
+            return {field.name: [within] if field.shape else within}
+        if within is not None and not field.shape:
+            return {}
+    lists = bool(kind.fields) and all(field.shape == "sequence" for field in kind.fields)
+    return {} if lists and kind.name.startswith(LISTING) else None

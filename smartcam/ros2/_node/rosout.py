@@ -1,0 +1,194 @@
+"""Publish the log on the topic ``/rosout``."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import logging
+import threading
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.exceptions import RosError
+from smartcam.ros2._node.qos import QoS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.topics import RosPublisher
+
+ROSOUT: Final = QoS(latched=True, depth=1000, lifespan=10.0)
+"""Quality of ``/rosout``, as ``rcl_qos_profile_rosout_default`` (``logging_rosout.h`` of rcl)."""
+
+MAX_WAITING_RECORDS = 1000
+"""Records that wait for the event loop; the oldest makes room."""
+
+MAX_TEXT_CHARACTERS = 8000
+"""Characters of a record's text."""
+
+CLOSE_TIMEOUT = 1.0
+LOOK_AGAIN = 0.005
+
+TURN = 64
+"""Records that are published in one turn of the event loop."""
+
+DEBUG, WARN, FATAL = 10, 30, 50
+
+
+class RosOut:
+    """Publishes log records as ``rcl_interfaces/msg/Log``; from any thread, never waiting.
+
+    Args:
+        node: node that publishes, whose name stands in the messages.
+        logger: logger whose records are published, with those of the loggers below.
+        level: lowest level of :mod:`logging` that is published.
+        wanted: function that returns True for a record to publish; None: publish all.
+
+    Attributes:
+        dropped: records for which there was no room.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        logger: logging.Logger,
+        *,
+        level: int = logging.WARNING,
+        wanted: Callable[[logging.LogRecord], bool] | None = None,
+    ) -> None:
+        self.dropped: int = 0
+        self._node, self._logger = node, logger
+        self._waiting: collections.deque[dict[str, Any]] = collections.deque(
+            maxlen=MAX_WAITING_RECORDS
+        )
+        self._handed = 0  # to the publisher
+        self._lock = threading.Lock()
+        self._woken = False
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._publisher: RosPublisher | None = None
+        self._handler = _Handler(self._take, level)
+        self._name = node.full_name.strip("/").replace("/", ".")
+        if wanted is not None:
+            self._handler.addFilter(wanted)
+
+    def start(self) -> None:
+        """Publish from now on. Idempotent.
+
+        Raises:
+            RosError: the node is not open.
+        """
+        if self._publisher is None:
+            self._loop = asyncio.get_running_loop()
+            self._handed = 0
+            self._publisher = self._node.publisher("/rosout", "rcl_interfaces/msg/Log", qos=ROSOUT)
+            self._logger.addHandler(self._handler)
+
+    async def close(self) -> None:
+        """Publish what waits, within a second, and nothing more. Idempotent."""
+        self._logger.removeHandler(self._handler)
+        publisher = self._publisher
+        if publisher is None:
+            return
+        while self._waiting:
+            self._publish()
+        self._publisher = None
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT):
+                while publisher.published + publisher.dropped < self._handed:  # noqa: ASYNC110
+                    await asyncio.sleep(LOOK_AGAIN)  # a thread says them
+        except TimeoutError:
+            pass  # the network does not take them
+        finally:
+            publisher.close()
+
+    def _take(self, record: logging.LogRecord) -> None:
+        """Take a record in; in the thread that logs."""
+        said = self._said(record)
+        with self._lock:  # for no longer than this
+            self.dropped += len(self._waiting) == MAX_WAITING_RECORDS
+            self._waiting.append(said)
+        if not self._woken and self._loop is not None:
+            self._woken = True
+            with contextlib.suppress(RuntimeError):  # the loop is closed, and so is all
+                self._loop.call_soon_threadsafe(self._publish)
+
+    def _said(self, record: logging.LogRecord) -> dict[str, Any]:
+        seconds, rest = divmod(round(record.created * 1e9), 1_000_000_000)
+        below = record.name.removeprefix(self._logger.name)
+        return {
+            "stamp": {"sec": seconds, "nanosec": rest},
+            "level": min(max(record.levelno // 10 * 10, DEBUG), FATAL),
+            "name": _plain(self._name + below if below.startswith(".") else self._name),
+            "msg": _plain(_text(record)),
+            "file": _plain(record.pathname),
+            "function": _plain(record.funcName or ""),
+            "line": min(max(record.lineno, 0), 0xFFFFFFFF),
+        }
+
+    def _publish(self) -> None:
+        self._woken = False  # first: what comes now wakes again
+        publisher = self._publisher
+        if publisher is None:
+            self._waiting.clear()
+            return
+        with _inside():
+            for _ in range(min(TURN, len(self._waiting))):
+                with contextlib.suppress(RosError):  # which would be logged, and come here
+                    publisher.publish(self._waiting.popleft())
+                    self._handed += 1
+        if self._waiting and not self._woken and self._loop is not None:
+            self._woken = True
+            self._loop.call_soon(self._publish)
+
+
+class _Handler(logging.Handler):
+    """Hands records on; one that is logged while one is handed on, in the same thread, is not."""
+
+    def __init__(self, take: Callable[[logging.LogRecord], None], level: int) -> None:
+        super().__init__(level)
+        self._take = take
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Handle a record without a lock, for which threads would wait."""
+        if getattr(_here, "inside", False) or not self.filter(record):
+            return False
+        self.emit(record)
+        return True
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Hand it on."""
+        with _inside():
+            try:
+                self._take(record)
+            except Exception:  # noqa: BLE001 - as handlers of logging do
+                self.handleError(record)
+
+
+_here = threading.local()
+
+
+@contextlib.contextmanager
+def _inside() -> Iterator[None]:
+    before = getattr(_here, "inside", False)
+    _here.inside = True
+    try:
+        yield
+    finally:
+        _here.inside = before
+
+
+_formatter: Final = logging.Formatter()
+
+
+def _text(record: logging.LogRecord) -> str:
+    try:
+        return _formatter.format(record)
+    except Exception as exc:  # noqa: BLE001 - what was logged is somebody else's
+        return f"{record.msg!s} ({type(exc).__name__}: {exc})"
+
+
+def _plain(text: str) -> str:
+    """Return text as a message can have it."""
+    cut = text if len(text) <= MAX_TEXT_CHARACTERS else f"{text[:MAX_TEXT_CHARACTERS]} ..."
+    return cut.replace("\0", "\\0").encode(errors="backslashreplace").decode()

@@ -1,0 +1,368 @@
+"""The ends of services: who serves, and who calls.
+
+As ``rmw_service_data.cpp`` and ``rmw_client_data.cpp`` of rmw_zenoh: a service is a complete
+queryable, a reply repeats number and GID of its request.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import logging
+import time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam._zenoh import direct
+from smartcam.exceptions import (
+    RosError,
+    RosMessageError,
+    ServiceCallError,
+    ServiceTimeoutError,
+    SmartCamError,
+)
+from smartcam.ros2._node.attachment import Attachment
+from smartcam.ros2._node.refusals import refusal
+from smartcam.ros2._node.tokens import CLIENT, SERVICE
+from smartcam.ros2._node.topics import RosEnd, said
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam.ros2._node.context import RosContext
+    from smartcam.ros2._node.tokens import Entity
+    from smartcam.ros2._types.types import ServiceType
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+MAX_CONCURRENT_CALLS = 64
+"""Calls of a service that are carried out at the same time; one beyond is refused, or waits."""
+
+MAX_WAITING_CALLS = 256
+"""Calls that wait for their turn, of a service whose answers cannot refuse one."""
+
+MAX_REQUEST_BYTES = 1 << 24
+"""Bytes of a request."""
+
+LOOK_AGAIN = 0.02
+"""Seconds between two looks whether somebody serves."""
+
+
+class _RequestedCall(NamedTuple):
+    """A call that was asked for: the engine's query, the request's bytes, and whose it is."""
+
+    query: Any
+    data: bytes
+    attachment: Attachment
+
+
+class RosService(RosEnd):
+    """A service that a node serves; made by :meth:`Node.serve`.
+
+    Attributes:
+        type: type of requests and replies.
+        calls: calls that came.
+        failed: calls that were not carried out.
+    """
+
+    def __init__(
+        self,
+        context: RosContext,
+        entity: Entity,
+        kind: ServiceType,
+        handler: Callable[[Any], Awaitable[Any]],
+        timeout: float,
+        on_close: Callable[[RosEnd], None],
+    ) -> None:
+        super().__init__(context, entity, on_close)
+        self.type: ServiceType = kind
+        self.calls: int = 0
+        self.failed: int = 0
+        self._handler, self._timeout = handler, timeout
+        self._tasks: dict[asyncio.Task[None], bytes] = {}
+        self._waiting: collections.deque[_RequestedCall] = collections.deque()
+        zenoh = context.zenoh
+
+        def on_query(query: Any) -> None:
+            data = b"" if query.payload is None else query.payload.to_bytes()
+            extra = None if query.attachment is None else query.attachment.to_bytes()
+            zenoh.in_loop(self._take, 0, query, data, extra)
+
+        self._declare(
+            lambda session: session.declare_queryable(entity.key, direct(on_query), complete=True)
+        )
+        self._appear()
+        self._stop_listening = context.watch(self.name, CLIENT, self._on_graph)
+
+    def _take(self, query: Any, data: bytes, extra: bytes | None) -> None:
+        self.calls += 1
+        try:
+            attachment = Attachment.decode(extra)
+        except RosError as exc:
+            self._fail(query, exc)
+            return
+        call = _RequestedCall(query, data, attachment)
+        full = len(self._tasks) >= MAX_CONCURRENT_CALLS
+        if self._closed:
+            self._refuse(call, RosError("it is not served any more"))
+        elif len(data) > MAX_REQUEST_BYTES:
+            why = f"a request of {len(data)} bytes: expected {MAX_REQUEST_BYTES} at most"
+            self._refuse(call, RosMessageError(why))
+        elif full and not self._can_refuse and len(self._waiting) < MAX_WAITING_CALLS:
+            self._waiting.append(call)
+        elif full:
+            self._refuse(
+                call,
+                RosError(f"{MAX_CONCURRENT_CALLS} calls of it are under way, which is the most"),
+            )
+        else:
+            self._begin(call)
+
+    @property
+    def _can_refuse(self) -> bool:
+        return refusal(self.type, "", self._context.types) is not None
+
+    def _begin(self, call: _RequestedCall) -> None:
+        try:
+            request = self.type.request.decode(call.data)
+        except RosError as exc:
+            self._refuse(call, exc)
+            return
+        task = asyncio.get_running_loop().create_task(self._serve(call, request))
+        self._tasks[task] = call.attachment.gid
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        del self._tasks[task]
+        while self._waiting and len(self._tasks) < MAX_CONCURRENT_CALLS:
+            self._begin(self._waiting.popleft())
+
+    async def _serve(self, call: _RequestedCall, request: object) -> None:
+        try:
+            async with asyncio.timeout(self._timeout):
+                reply = await self._handler(request)
+            data = self.type.response.encode(said(reply, {}))
+        except asyncio.CancelledError:
+            self._refuse(call, RosError("the call was given up"))
+            raise
+        except TimeoutError as exc:
+            why = exc if isinstance(exc, SmartCamError) else f"no answer in {self._timeout:g} s"
+            self._refuse(call, RosError(str(why)))
+        except SmartCamError as exc:
+            self._refuse(call, exc)
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:
+            logger.exception("%s ! its handler failed", self.name)
+            self._refuse(call, RosError(f"{type(exc).__name__}: {exc}"))
+        else:
+            self._reply(call, data)
+
+    def _reply(self, call: _RequestedCall, data: bytes) -> None:
+        attachment = call.attachment._replace(time=time.time_ns()).encode()
+        self._context.zenoh.reply(call.query, [(self.entity.key, data)], attachment=attachment)
+
+    def _refuse(self, call: _RequestedCall, why: SmartCamError) -> None:
+        """Answer by a response that says why; where the type has none, by an error."""
+        answer = refusal(self.type, f"{self.name}: {why}", self._context.types)
+        if answer is None:
+            self._fail(call.query, why)
+            return
+        self.failed += 1
+        logger.warning("%s ! a call was refused: %s", self.name, why)
+        self._reply(call, self.type.response.encode(answer))
+
+    def _fail(self, query: Any, why: SmartCamError) -> None:
+        self.failed += 1
+        logger.warning("%s ! a call had no reply: %s", self.name, why)
+        self._context.zenoh.refuse(query, f"{self.name}: {why}")
+
+    def _on_graph(self, entity: Entity, present: bool) -> None:
+        """Give up what was called by who is gone."""
+        if present:
+            return
+        left = [call for call in self._waiting if call.attachment.gid != entity.gid]
+        self._waiting = collections.deque(left)
+        for task, gid in self._tasks.items():
+            if gid == entity.gid:
+                task.cancel()
+
+    def close(self) -> None:
+        """Serve no more; calls under way are given up. Idempotent."""
+        if not self._closed:
+            super().close()
+            self._stop_listening()
+            waiting, self._waiting = self._waiting, collections.deque()
+            for call in waiting:
+                self._refuse(call, RosError("it is not served any more"))
+            for task in self._tasks:
+                task.cancel()
+
+    async def wait_closed(self) -> None:
+        """Wait until the calls that were given up have ended."""
+        if self._tasks:
+            await asyncio.wait(tuple(self._tasks))
+
+
+class RosClient(RosEnd):
+    """Calls a service; made by :meth:`Node.client`.
+
+    Attributes:
+        type: type of requests and replies.
+    """
+
+    def __init__(
+        self,
+        context: RosContext,
+        entity: Entity,
+        kind: ServiceType,
+        on_close: Callable[[RosEnd], None],
+    ) -> None:
+        super().__init__(context, entity, on_close)
+        self.type: ServiceType = kind
+        self._number = 0
+        self._waiting: set[asyncio.Future[Any]] = set()
+        self._querier: Any = None
+
+        def declare(session: Any) -> Any:
+            zenoh = context.zenoh.engine
+            self._querier = session.declare_querier(
+                entity.key,
+                target=zenoh.QueryTarget.ALL_COMPLETE,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=86_400,  # ours is what counts
+                express=True,
+            )
+            return self._querier
+
+        self._declare(declare)
+        self._appear()
+
+    @property
+    def served(self) -> bool:
+        """True if somebody serves the service, as far as is known."""
+        ends = self._context.graph.ends(self.name, SERVICE)
+        return not self._closed and any(one.key == self.entity.key for one in ends)
+
+    async def wait_served(self, timeout: float = 10.0) -> None:
+        """Wait until somebody serves it.
+
+        Raises:
+            ServiceTimeoutError: nobody does within ``timeout`` seconds.
+        """
+        if self.served:
+            return
+        try:
+            async with asyncio.timeout(timeout):
+                while not self.served:
+                    self._check_open()
+                    await asyncio.sleep(LOOK_AGAIN)
+        except TimeoutError as exc:
+            others = [one.ros_type for one in self._context.graph.ends(self.name, SERVICE)]
+            what = f", but somebody serves {', '.join(others)}" if others else ""
+            raise ServiceTimeoutError(
+                f"{self.name}: nobody serves {self.type.name} {self.type.hash} there within "
+                f"{timeout:g} s{what}",
+                service=self.name,
+            ) from exc
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ServiceCallError(f"{self.name}: this client is closed", service=self.name)
+
+    async def call(self, request: object = None, /, *, timeout: float = 10.0, **fields: Any) -> Any:
+        """Call it, once somebody serves it; the first reply counts.
+
+        Args:
+            request: one of the type's own, or a mapping of its fields.
+            timeout: seconds, until somebody serves it and has replied.
+            **fields: the fields, where no request is given.
+
+        Raises:
+            RosMessageError: it is no request of the type; or the reply cannot be read.
+            ServiceTimeoutError: nobody serves it, or no reply came in time.
+            ServiceCallError: who serves it refused, or went away.
+
+        Cancellation: leaves the client usable; whether the call is carried out is unknown.
+        """
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + timeout
+        data = self.type.request.encode(said(request, fields))
+        await self.wait_served(timeout)
+        self._number += 1
+        attachment = Attachment(self._number, time.time_ns(), self.entity.gid)
+        reply: asyncio.Future[bytes] = loop.create_future()
+        self._waiting.add(reply)
+        try:
+            self._ask(data, attachment, reply)
+            async with asyncio.timeout_at(deadline):
+                found = await reply
+        except TimeoutError as exc:
+            raise ServiceTimeoutError(
+                f"{self.name}: no reply within {timeout:g} s; whether the call was carried out is "
+                "unknown",
+                service=self.name,
+            ) from exc
+        finally:
+            self._waiting.discard(reply)
+        return self.type.response.decode(found)
+
+    def _ask(self, data: bytes, attachment: Attachment, reply: asyncio.Future[bytes]) -> None:
+        zenoh = self._context.zenoh
+        refused: list[str] = []
+        came = False
+
+        def take(found: bytes) -> None:
+            if not reply.done():
+                reply.set_result(found)
+
+        def end() -> None:
+            if not reply.done():
+                why = (
+                    refused[0]
+                    if refused
+                    else ("it ended without a reply; whether the call was carried out is unknown")
+                )
+                reply.set_exception(ServiceCallError(f"{self.name}: {why}", service=self.name))
+
+        def on_reply(answer: Any) -> None:
+            nonlocal came
+            if answer.ok is None:
+                refused.append(answer.err.payload.to_bytes()[:1000].decode(errors="replace"))
+                return
+            extra = None if answer.ok.attachment is None else answer.ok.attachment.to_bytes()
+            if self._is_for(attachment, extra):
+                came = True
+                found = answer.ok.payload.to_bytes()
+                zenoh.in_loop(take, len(found), found)
+
+        def on_end() -> None:
+            if not came:  # else the loop is not woken again
+                zenoh.in_loop(end, 0)
+
+        self._querier.get(
+            zenoh.engine.handlers.Callback(on_reply, on_end, indirect=False),
+            payload=data,
+            attachment=attachment.encode(),
+        )
+
+    def _is_for(self, wanted: Attachment, extra: bytes | None) -> bool:
+        """Return True if a reply answers this call; called in a thread of the engine's."""
+        try:
+            got = Attachment.decode(extra)
+        except RosMessageError as exc:
+            logger.warning("%s ! a reply was left out: %s", self.name, exc)
+            return False
+        if (got.number, got.gid) == (wanted.number, wanted.gid):
+            return True
+        logger.warning("%s ! a reply to another call was left out: %s", self.name, got)
+        return False
+
+    def close(self) -> None:
+        """Call no more; calls under way end. Idempotent."""
+        super().close()
+        for reply in self._waiting:
+            if not reply.done():
+                reply.set_exception(
+                    ServiceCallError(f"{self.name}: this client was closed", service=self.name)
+                )

@@ -1,0 +1,145 @@
+"""Write and read rmw_zenoh's liveliness tokens, and the keys of topics and services.
+
+``rmw_zenoh_cpp/src/detail/liveliness_utils.cpp`` has their form: ``Entity::Entity`` joins the
+parts, and makes the GID of them; ``TopicInfo::TopicInfo`` has the key of a topic or a service.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from smartcam._forks import cached_property
+from smartcam._ros_names import full_name
+from smartcam.ros2._node.qos import QoS
+
+ADMIN = "@ros2_lv"
+
+Kind = Literal["NN", "MP", "MS", "SS", "SC"]
+NODE: Final = "NN"
+PUBLISHER: Final = "MP"
+SUBSCRIPTION: Final = "MS"
+SERVICE: Final = "SS"
+CLIENT: Final = "SC"
+KINDS: Final = (NODE, PUBLISHER, SUBSCRIPTION, SERVICE, CLIENT)
+
+_NODE_PARTS, _ENDPOINT_PARTS = {9}, {13, 14}  # newer ones may name backends of buffers, too
+
+
+def pattern(domain: int) -> str:
+    """Return the pattern of all tokens of a domain."""
+    return f"{ADMIN}/{domain}/**"
+
+
+@dataclass(frozen=True)
+class Entity:
+    """A node, or an end of a topic or a service.
+
+    Attributes:
+        kind: one of :data:`KINDS`.
+        domain: the number that keeps systems apart.
+        zid: id of the node's Zenoh session.
+        node_id, id: numbers within the session.
+        namespace: namespace of the node, such as ``/`` or ``/line1``.
+        node: the node's name.
+        name: name of the topic or service, absolute; empty for a node.
+        type: type as DDS writes it, such as ``std_msgs::msg::dds_::String_``.
+        hash: hash of the type.
+        qos: quality of service that was asked for.
+        enclave: enclave of security, which is not used here.
+    """
+
+    kind: Kind
+    domain: int
+    zid: str
+    node_id: int
+    id: int
+    namespace: str
+    node: str
+    name: str = ""
+    type: str = ""
+    hash: str = ""
+    qos: QoS = field(default_factory=QoS)
+    enclave: str = "/"
+
+    @cached_property
+    def token(self) -> str:
+        """Its liveliness token."""
+        parts = [ADMIN, str(self.domain), self.zid, str(self.node_id), str(self.id), self.kind]
+        parts += [_mangled(one) for one in (self.enclave, self.namespace, self.node)]
+        if self.kind != NODE:
+            parts += [_mangled(one) for one in (self.name, self.type, self.hash)]
+            parts.append(self.qos.encode())
+        return "/".join(parts)
+
+    @cached_property
+    def gid(self) -> bytes:
+        """Its 16 bytes in attachments: a hash of the token."""
+        return gid_of(self.token)
+
+    @property
+    def key(self) -> str:
+        """Key of the topic's messages, or of the service's requests."""
+        return f"{self.domain}/{self.name.strip('/')}/{self.type}/{self.hash}"
+
+    @property
+    def full_node(self) -> str:
+        """The full name of its node."""
+        return full_name(self.namespace, self.node)
+
+    @property
+    def ros_type(self) -> str:
+        """The type as ROS writes it, such as ``std_msgs/msg/String``."""
+        return self.type.replace("::dds_::", "::").removesuffix("_").replace("::", "/")
+
+    @classmethod
+    def parse(cls, token: str) -> Entity:
+        """Read a token.
+
+        Raises:
+            ValueError: it is none, with what was expected.
+        """
+        parts = token.split("/")
+        wanted = _NODE_PARTS if parts[5:6] == [NODE] else _ENDPOINT_PARTS
+        if len(parts) not in wanted or parts[0] != ADMIN or parts[5] not in KINDS:
+            raise ValueError(
+                f"token {token!r:.200}: expected {ADMIN}/DOMAIN/ZID/NODE/ID/KIND/..., KIND one of "
+                f"{' '.join(KINDS)}, of 9 parts for a node and 13 else"
+            )
+        domain, zid, node_id, number = int(parts[1]), parts[2], int(parts[3]), int(parts[4])
+        enclave, namespace, node = (_demangled(one) for one in parts[6:9])
+        made = cls(parts[5], domain, zid, node_id, number, namespace, node, enclave=enclave)  # type: ignore[arg-type]
+        if made.kind == NODE:
+            return made
+        name, kind, hashed = (_demangled(one) for one in parts[9:12])
+        return cls(
+            made.kind,
+            domain,
+            zid,
+            node_id,
+            number,
+            namespace,
+            node,
+            name,
+            kind,
+            hashed,
+            QoS.decode(parts[12]),
+            enclave,
+        )
+
+
+def gid_of(token: str) -> bytes:
+    """Return the GID of a token: XXH3 with 128 bits, the low half first."""
+    import xxhash
+
+    value = xxhash.xxh3_128_intdigest(token.encode())
+    return struct.pack("<QQ", value & 0xFFFFFFFFFFFFFFFF, value >> 64)
+
+
+def _mangled(text: str) -> str:
+    return text.replace("/", "%")
+
+
+def _demangled(text: str) -> str:
+    return text.replace("%", "/")

@@ -1,0 +1,77 @@
+"""Read the messages of a topic, which wait in a bounded queue."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from smartcam.exceptions import RosMessageError
+from smartcam.streams import Subscription
+
+if TYPE_CHECKING:
+    from typing import Self
+
+    from smartcam.models import SubscriberStatistics
+    from smartcam.ros2._types.types import MessageType
+
+Item = TypeVar("Item")
+
+
+class TopicReader(ABC, Generic[Item]):
+    """Subscription to a topic, read by ``async for``.
+
+    Messages wait in a queue; the oldest makes room for a new one. A message that cannot be read is
+    left out and counted, and the log has the first one.
+
+    Args:
+        topic: absolute name of the topic.
+        kind: type of the messages.
+        depth: number of messages that wait at most.
+        max_bytes: bytes of all messages that wait.
+
+    Attributes:
+        type: type of the messages.
+        rejected: count of what came and was no message.
+    """
+
+    _logger: ClassVar[logging.Logger] = logging.getLogger("smartcam.ros2")
+
+    def __init__(
+        self, topic: str, kind: MessageType, depth: int, max_bytes: int = sys.maxsize
+    ) -> None:
+        self.type: MessageType = kind
+        self.rejected: int = 0
+        self._topic = topic
+        self._queue = Subscription[Item](
+            topic, max_queue=depth, overflow="drop_oldest", max_queue_bytes=max_bytes
+        )
+
+    @abstractmethod
+    def _read(self, item: Item) -> Any:
+        """Return the message that an item of the queue is.
+
+        Raises:
+            RosMessageError: the item is no message of the type.
+        """
+
+    def statistics(self) -> SubscriberStatistics:
+        """Return the queue's account."""
+        return self._queue.statistics()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Any:
+        while True:
+            item = await anext(self._queue)
+            try:
+                return self._read(item)
+            except RosMessageError as exc:
+                self._reject(exc)
+
+    def _reject(self, why: RosMessageError) -> None:
+        self.rejected += 1
+        level = logging.DEBUG if self.rejected > 1 else logging.WARNING
+        self._logger.log(level, "%s ! %s; such messages are left out", self._topic, why)

@@ -1,0 +1,396 @@
+"""The ends of topics: who publishes, and who hears.
+
+As ``rmw_publisher_data.cpp`` and ``rmw_subscription_data.cpp`` of rmw_zenoh: what is latched is
+kept by an advanced publisher, and asked for by an advanced subscriber.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import concurrent.futures
+import logging
+import threading
+import time
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._zenoh import ZenohDeclared, direct, quietly
+from smartcam.exceptions import RosError, RosMessageError
+from smartcam.ros2._node.attachment import Attachment
+from smartcam.ros2._node.tokens import SUBSCRIPTION
+from smartcam.ros2._node.topic_reader import TopicReader
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from typing import Self
+
+    from smartcam.ros2._node.context import NewestSlot, RosContext
+    from smartcam.ros2._node.tokens import Entity
+    from smartcam.ros2._types.types import MessageType
+
+logger: logging.Logger = logging.getLogger("smartcam.ros2")
+
+LONG = 1 << 16
+"""Bytes beyond which a message is said by a thread, which waits until the engine has taken it."""
+
+MAX_WAITING_BYTES = 1 << 26
+"""Bytes of a topic's messages that wait to be said, or to be read."""
+
+
+def said(message: object, fields: dict[str, Any]) -> object:
+    """Return the message to send, or its fields where no message is given."""
+    if message is not None and fields:
+        raise RosMessageError("expected a message or its fields, got both")
+    return fields if message is None else message
+
+
+MAX_SHORT_MESSAGES = 10_000
+"""Short messages of a topic that wait to be said; of long ones as many as its depth says."""
+
+HEARTBEAT = 0.5
+"""Seconds between two signs of how far a latched topic is (``rmw_publisher_data.cpp``)."""
+
+
+class RosEnd:
+    """An end of a topic or a service, with its token, until it is closed.
+
+    Args:
+        context: context that the node shares with others.
+        entity: entry of this end in the graph.
+        on_close: function called with this end once it is closed.
+    """
+
+    def __init__(
+        self, context: RosContext, entity: Entity, on_close: Callable[[RosEnd], None]
+    ) -> None:
+        self.entity: Entity = entity
+        self._context, self._on_close = context, on_close
+        self._declared: list[ZenohDeclared] = []
+        self._closed = False
+
+    @property
+    def name(self) -> str:
+        """The absolute name of the topic or service."""
+        return self.entity.name
+
+    def _declare(self, how: Callable[[Any], Any], *, by_dropping: bool = False) -> ZenohDeclared:
+        declared = ZenohDeclared(self._context.zenoh, by_dropping=by_dropping).of(how)
+        self._declared.append(declared)
+        return declared
+
+    def _appear(self) -> None:
+        """Be seen in the graph, when all else is there."""
+        token = self.entity.token
+        self._declare(lambda session: session.liveliness().declare_token(token))
+        self._context.add(self.entity)
+
+    def close(self) -> None:
+        """Be gone. Idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        self._context.remove(self.entity)
+        for declared in reversed(self._declared):  # the token first
+            declared.close()
+        self._on_close(self)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()
+
+
+class RosPublisher(RosEnd):
+    """Publishes on a topic; made by :meth:`Node.publisher`.
+
+    Attributes:
+        type: type of the messages.
+        published: messages that were handed to the engine.
+        dropped: messages for which there was no room, the oldest of those that waited.
+    """
+
+    def __init__(
+        self,
+        context: RosContext,
+        entity: Entity,
+        kind: MessageType,
+        on_close: Callable[[RosEnd], None],
+    ) -> None:
+        super().__init__(context, entity, on_close)
+        self.type: MessageType = kind
+        self.published: int = 0
+        self.dropped: int = 0
+        self._number = 0
+        self._lock = threading.Lock()
+        self._waiting: collections.deque[tuple[bytes, bytes]] = collections.deque()
+        self._bytes = 0
+        self._publisher: Any = None
+        qos = entity.qos  # what must not be dropped may have to wait, which the loop cannot
+        self._direct = not qos.latched and not (qos.reliable and qos.depth is None)
+        self._patient: dict[str, Any] = {}  # by lane: what waits for room
+        self._hasty: Any = None  # leaves out to whom one is under way
+        self._slot: NewestSlot | None = None
+        self._lane = "latched" if qos.latched else "short"
+        self._outlet = ZenohDeclared(context.zenoh, by_dropping=qos.latched).of(self._make)
+        self._appear()
+
+    def _make(self, session: Any) -> Any:
+        zenoh, qos = self._context.zenoh.engine, self.entity.qos
+        drop = zenoh.CongestionControl.DROP
+        block = zenoh.CongestionControl.BLOCK
+        waits = qos.latched or (qos.depth is None and qos.reliable)
+        how: dict[str, Any] = {
+            "congestion_control": block if waits else drop,
+            "reliability": zenoh.Reliability.RELIABLE
+            if qos.reliable
+            else zenoh.Reliability.BEST_EFFORT,
+            "express": True,
+        }
+        if qos.latched:
+            import zenoh.ext as more
+
+            misses = more.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=HEARTBEAT)
+            self._publisher = more.declare_advanced_publisher(
+                session,
+                self.entity.key,
+                cache=more.CacheConfig(max_samples=qos.kept),
+                sample_miss_detection=misses if qos.reliable else None,
+                publisher_detection=True,
+                **how,
+            )
+        else:
+            self._publisher = session.declare_publisher(self.entity.key, **how)
+        return self._publisher
+
+    @property
+    def heard(self) -> bool:
+        """True if anybody hears the topic, as far as is known; a latched one counts as heard."""
+        if self._closed:
+            return False
+        return self.entity.qos.latched or bool(self._publisher.matching_status.matching)
+
+    def watch(self, call: Callable[[], None]) -> Callable[[], None]:
+        """Have ``call`` called when subscribers come and go; return what ends that.
+
+        ``heard`` may change a moment later.
+        """
+        return self._context.watch(self.name, SUBSCRIPTION, lambda _entity, _present: call())
+
+    def publish(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message; never waits.
+
+        Args:
+            message: one of the type's own, or a mapping of its fields.
+            **fields: the fields, where no message is given.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+        """
+        self.publish_encoded(self.type.encode(said(message, fields)))
+
+    def publish_encoded(self, data: bytes) -> None:
+        """Publish bytes that are a message of the type already; never waits.
+
+        Raises:
+            RosError: the publisher is closed.
+        """
+        self._check_open()
+        attachment = self._attachment()
+        waits = self._context.waits(self)
+        if len(data) > LONG and self._lane == "short" and not waits:
+            self._lane = "long"  # from now on: a short one would overtake it
+        if self._direct and self._lane == "short" and not waits and self._context.calm():
+            quietly(self._publisher.put, data, attachment=attachment)
+            self.published += 1
+            return
+        most = MAX_SHORT_MESSAGES if self._lane == "short" else self.entity.qos.kept
+        with self._lock:
+            self._waiting.append((data, attachment))
+            self._bytes += len(data)
+            while len(self._waiting) > most or self._bytes > MAX_WAITING_BYTES:
+                if len(self._waiting) == 1:
+                    break
+                self._bytes -= len(self._waiting.popleft()[0])
+                self.dropped += 1
+        self._context.say_later(self, self._say_next, self._lane)
+
+    async def publish_newest(self, message: object = None, /, **fields: Any) -> None:
+        """Publish a message; a long one except to whom one is under way already.
+
+        For pictures: nobody who is slow has them queue up, holds up the others, or is sent one
+        that is old. It returns when the engine has copied the message; a thread encodes it.
+
+        Raises:
+            RosMessageError: it is no message of the type.
+            RosError: the publisher is closed.
+
+        Cancellation: the message is published or not.
+        """
+        self._check_open()
+        what = said(message, fields)
+        if self._slot is None:
+            self._slot = self._context.slot()
+            self._lane = self._slot.lane
+        done: concurrent.futures.Future[None] = concurrent.futures.Future()
+
+        def say() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                self._say_newest(self.type.encode(what))
+            except BaseException as exc:  # noqa: BLE001 - told to who waits
+                done.set_exception(exc)
+            else:
+                done.set_result(None)
+
+        self._context.say_later(self, say, self._lane)
+        await asyncio.wrap_future(done)
+
+    def _say_newest(self, data: bytes) -> None:
+        """Say a message; in the thread for it.
+
+        A long one by a publisher of its own, whose messages the engine leaves out for each link
+        that has one of the same priority under way; so they have a little time between them.
+        """
+        slot, publisher = self._slot, self._publisher
+        if self._closed or slot is None:
+            return
+        attachment = self._attachment()
+        if len(data) > LONG:
+            if self._hasty is None:
+                zenoh = self._context.zenoh.engine
+                self._hasty = self._context.zenoh.session.declare_publisher(
+                    self.entity.key,
+                    congestion_control=zenoh.CongestionControl.BLOCK_FIRST,
+                    priority=getattr(zenoh.Priority, slot.priority),
+                )
+            publisher = self._hasty
+            slot.wait(len(data))
+        quietly(publisher.put, data, attachment=attachment)
+        self.published += 1
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise RosError(f"{self.name}: this publisher is closed")
+
+    def _attachment(self) -> bytes:
+        self._number += 1
+        return Attachment(self._number, time.time_ns(), self.entity.gid).encode()
+
+    def _say_next(self) -> None:
+        """Say the oldest that waits; in the thread for it."""
+        with self._lock:
+            if not self._waiting or self._closed:
+                return
+            data, attachment = self._waiting.popleft()
+            self._bytes -= len(data)
+        self._patiently().put(data, attachment=attachment)
+        self.published += 1
+
+    def _patiently(self) -> Any:
+        """Return the publisher that waits for room; a long message gets a lower priority there."""
+        zenoh, lane = self._context.zenoh.engine, self._lane
+        if self.entity.qos.latched:
+            return self._publisher  # which has to keep them
+        if lane not in self._patient:
+            self._patient[lane] = self._context.zenoh.session.declare_publisher(
+                self.entity.key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=zenoh.Priority.DATA if lane == "short" else zenoh.Priority.DATA_LOW,
+            )
+        return self._patient[lane]
+
+    def close(self) -> None:
+        """Be gone; what waits to be said is not said any more. Idempotent."""
+        if self._closed:
+            return
+        super().close()
+        with self._lock:
+            self.dropped += len(self._waiting)
+            self._waiting.clear()
+            self._bytes = 0
+        if self._context.waits(self):  # its thread may be at it, and does that when it is done
+            self._context.say_later(self, self._take_back, self._lane)
+        else:
+            self._take_back()
+
+    def _take_back(self) -> None:
+        for one in (*self._patient.values(), self._hasty):
+            if one is not None:
+                quietly(one.undeclare)
+        self._patient, self._hasty = {}, None
+        self._publisher = None
+        self._outlet.close()
+
+
+class _FromTopic(NamedTuple):
+    data: bytes
+    attachment: Attachment
+
+
+class RosSubscription(RosEnd, TopicReader[_FromTopic]):
+    """Subscription to a topic, made by :meth:`Node.subscribe` and read by ``async for``.
+
+    Attributes:
+        attachment: number, time and publisher of the message that was read last.
+    """
+
+    def __init__(
+        self,
+        context: RosContext,
+        entity: Entity,
+        kind: MessageType,
+        on_close: Callable[[RosEnd], None],
+    ) -> None:
+        RosEnd.__init__(self, context, entity, on_close)
+        TopicReader.__init__(self, entity.name, kind, entity.qos.kept, MAX_WAITING_BYTES)
+        self.attachment: Attachment | None = None
+        self._declare(self._make, by_dropping=entity.qos.latched)
+        self._appear()
+
+    def _make(self, session: Any) -> Any:
+        context = self._context.zenoh
+
+        def on_sample(sample: Any) -> None:
+            data = sample.payload.to_bytes()
+            if context.full(len(data)):
+                return
+            extra = None if sample.attachment is None else sample.attachment.to_bytes()
+            context.in_loop(self._take, len(data), data, extra)
+
+        qos = self.entity.qos
+        if not qos.latched:
+            return session.declare_subscriber(self.entity.key, direct(on_sample))
+        import zenoh.ext as more
+
+        recovery = more.RecoveryConfig(periodic_queries=None, heartbeat=True)
+        return more.declare_advanced_subscriber(
+            session,
+            self.entity.key,
+            direct(on_sample),
+            history=more.HistoryConfig(detect_late_publishers=True, max_samples=qos.kept),
+            recovery=recovery if qos.reliable else None,
+            subscriber_detection=True,
+        )
+
+    def _take(self, data: bytes, extra: bytes | None) -> None:
+        if self._closed:
+            return
+        try:
+            attachment = Attachment.decode(extra)
+        except RosMessageError as exc:
+            self._reject(exc)
+            return
+        self._queue.offer(_FromTopic(data, attachment), 0.0, len(data))
+
+    def _read(self, item: _FromTopic) -> Any:
+        message = self.type.decode(item.data)
+        self.attachment = item.attachment
+        return message
+
+    def close(self) -> None:
+        """Hear no more; iterating ends. Idempotent."""
+        super().close()
+        self._queue.close()

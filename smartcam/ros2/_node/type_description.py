@@ -1,0 +1,93 @@
+"""Describe a type to whoever knows its hash: the service ``~/get_type_description``.
+
+As ``node.c`` of rcl has it: only the hash counts, and only types that the node uses are described.
+Nodes have it from Iron on, which is where types have hashes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from smartcam.ros2._types.hash import description, service_of
+from smartcam.ros2._types.stores import WITHOUT_HASHES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from smartcam.ros2._node.node import Node
+    from smartcam.ros2._node.tokens import Entity
+    from smartcam.ros2._types.types import RosTypes
+
+TYPE = "type_description_interfaces/srv/GetTypeDescription"
+PARAMETER = "start_type_description_service"
+PREFIX = "RIHS01_"
+DIGITS = 64
+
+
+class TypeDescriptions:
+    """Serves descriptions of the types that a node uses.
+
+    Args:
+        node: node that uses the types.
+        entities: function that returns the node's present entries in the graph.
+    """
+
+    def __init__(self, node: Node, entities: Callable[[], Iterable[Entity]]) -> None:
+        self._node, self._entities = node, entities
+        self._said: dict[str, Any] = {}
+        if served(node.types):
+            node.parameters.declare(
+                PARAMETER,
+                True,
+                description="Whether ~/get_type_description is served.",
+                read_only=True,
+            )
+
+    def open(self) -> None:
+        """Serve, where the distribution does."""
+        if served(self._node.types):
+            self._node.serve("~/get_type_description", TYPE, self._describe)
+
+    async def _describe(self, request: Any) -> dict[str, Any]:
+        asked = request.type_hash
+        if not asked.startswith(PREFIX) or len(asked) != len(PREFIX) + DIGITS:
+            return _failed(f"{asked!r:.100} is no hash: expected RIHS01_ and {DIGITS} digits")
+        for entity in self._entities():
+            if entity.hash == asked:
+                break
+        else:
+            return _failed(f"{self._node.full_name} uses no type with the hash {asked}")
+        made = self._said.get(asked)
+        if made is None:
+            made = self._said[asked] = describe(self._node.types, entity.ros_type)
+        sources = self._sources(made) if request.include_type_sources else []
+        return {"successful": True, "type_description": made, "type_sources": sources}
+
+    def _sources(self, described: Any) -> list[dict[str, str]]:
+        """Return the texts of the files of a type and of all types within."""
+        types = (described.type_description, *described.referenced_type_descriptions)
+        return [self._source(one.type_name) for one in types]
+
+    def _source(self, name: str) -> dict[str, str]:
+        encoding, text = self._node.types.source(name)
+        return {"type_name": name, "encoding": encoding, "raw_file_contents": text}
+
+
+def served(types: RosTypes) -> bool:
+    """Return True if nodes of the distribution serve the descriptions."""
+    return types.distribution not in WITHOUT_HASHES
+
+
+def describe(types: RosTypes, name: str) -> Any:
+    """Return a ``type_description_interfaces/msg/TypeDescription`` of a message or a service.
+
+    Raises:
+        ConfigurationError: it is not known.
+    """
+    definition = service_of(name) if "/srv/" in name else types.definition(name)
+    kind = types.message("type_description_interfaces/msg/TypeDescription")
+    return kind.new(**description(definition, types.definition))
+
+
+def _failed(why: str) -> dict[str, Any]:
+    return {"successful": False, "failure_reason": why}

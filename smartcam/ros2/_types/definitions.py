@@ -1,0 +1,252 @@
+"""Turn the texts of ``.msg`` and ``.srv`` into the fields of messages and services."""
+
+from __future__ import annotations
+
+import ast
+import keyword
+import re
+import struct
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+from smartcam.exceptions import ConfigurationError
+
+INTEGERS: Final = {
+    "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "byte": "B",
+}  # fmt: skip
+"""The code of ``struct`` and numpy for each."""
+
+NUMBERS: Final = {**INTEGERS, "float32": "f", "float64": "d", "bool": "?"}
+BASES: Final = frozenset({*NUMBERS, "string"})
+OTHER_NAMES: Final = {"char": "uint8", "octet": "byte"}
+
+_PART = r"[a-z][a-z0-9]*(?:_[a-z0-9]+)*"  # one way to match only: no name takes long
+NAME: Final = re.compile(rf"({_PART})/(msg|srv)/([A-Z][A-Za-z0-9]*)")
+_FIELD: Final = re.compile(
+    r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<limit>\d+))?"
+    r"(?:\[(?P<bound><=)?(?P<size>\d*)\])?\s+"
+    r"(?P<name>[A-Za-z]\w*)\s*(?:=(?P<constant>.*)|\s(?P<default>.*))?"
+)
+_OLD_NAMES: Final = {"Header": "std_msgs/msg/Header"}
+
+
+class MessageField(NamedTuple):
+    """One field: ``shape`` is "" (one value), "array" (of ``size``) or "sequence" (up to ``size``).
+
+    Attributes:
+        type: a basic type, or a message's full name.
+        limit: the most bytes of a string; 0 is any.
+        size: 0 is any for a sequence.
+        default: what it is when nothing is said; None is zero.
+    """
+
+    name: str
+    type: str
+    shape: str = ""
+    size: int = 0
+    limit: int = 0
+    default: Any = None
+
+    @property
+    def attribute(self) -> str:
+        """Its name in Python."""
+        return f"{self.name}_" if keyword.iskeyword(self.name) else self.name
+
+    @property
+    def nested(self) -> bool:
+        """True if the field consists of messages."""
+        return self.type not in BASES
+
+    def __str__(self) -> str:
+        """Return the type of the field as a ``.msg`` has it."""
+        limit = f"<={self.limit}" if self.limit else ""
+        bound = "<=" if self.shape == "sequence" and self.size else ""
+        return (
+            self.type.replace("/msg/", "/")
+            + limit
+            + (f"[{bound}{self.size or ''}]" if self.shape else "")
+        )
+
+
+EMPTY: Final = MessageField("structure_needs_at_least_one_member", "uint8")
+"""Field that a message without fields has in its description and its bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """A message's fields and constants.
+
+    Attributes:
+        kinds: types of the constants by name.
+    """
+
+    name: str
+    fields: tuple[MessageField, ...]
+    constants: dict[str, Any]
+    kinds: dict[str, str]
+
+    def text(self, *, defaults: bool = False) -> str:
+        """Return the fields and constants as a ``.msg`` has them.
+
+        Args:
+            defaults: whether fields have their defaults behind them.
+        """
+        constants = (f"{self.kinds[name]} {name}={one}\n" for name, one in self.constants.items())
+        fields = (
+            f"{field} {field.name}{_default_text(field.default) if defaults else ''}\n"
+            for field in self.fields
+        )
+        return "".join((*constants, *fields))
+
+    def needs(self) -> set[str]:
+        """Return the names of the messages inside."""
+        return {field.type for field in self.fields if field.nested}
+
+
+def _default_text(value: Any) -> str:
+    """Return a default as it stands behind a field's name, with a blank before it."""
+    if value is None:
+        return ""
+    return f" {str(value).lower() if isinstance(value, bool) else repr(value)}"
+
+
+def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
+    """Return package, kind and name of a type.
+
+    Raises:
+        ConfigurationError: it is no name of a type, or not of this kind.
+    """
+    matched = NAME.fullmatch(name) if isinstance(name, str) else None
+    if matched is None or kind not in ("", matched[2]):
+        example = "std_srvs/srv/Trigger" if kind == "srv" else "std_msgs/msg/String"
+        raise ConfigurationError(
+            f"not a name of a ROS type: expected a name such as {example}, got {name!r:.80}"
+        )
+    return matched[1], matched[2], matched[3]
+
+
+def dds_name(name: str) -> str:
+    """Return a type's name in keys: ``std_msgs::msg::dds_::String_``."""
+    package, kind, own = name.split("/")
+    return f"{package}::{kind}::dds_::{own}_"
+
+
+def parse_message(name: str, text: str) -> Definition:
+    """Return the definition that the text of a ``.msg`` file gives.
+
+    Raises:
+        ConfigurationError: the text defines no message.
+    """
+    package = name.partition("/")[0]
+    fields: dict[str, MessageField] = {}
+    constants: dict[str, Any] = {}
+    kinds: dict[str, str] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        said = line.strip()
+        if not said or said.startswith("#"):
+            continue
+        try:
+            field, constant = _parse_line(package, said)
+            if field.name in fields or field.name in constants:
+                raise ValueError(f"there are two {field.name}")
+            if constant:
+                constants[field.name], kinds[field.name] = field.default, field.type
+            else:
+                fields[field.name] = field
+        except (ValueError, SyntaxError, MemoryError, RecursionError) as exc:
+            raise ConfigurationError(f"{name}, line {number}: {said!r:.80}: {exc}") from exc
+    return Definition(name, tuple(fields.values()), constants, kinds)
+
+
+def parse_service(name: str, text: str) -> tuple[Definition, Definition]:
+    """Return request and response of a ``.srv``.
+
+    Raises:
+        ConfigurationError: its text is no service.
+    """
+    parts = re.split(r"(?m)^---\s*$", text)
+    if len(parts) != 2:
+        raise ConfigurationError(f"{name}: expected one line --- between request and response")
+    return parse_message(f"{name}_Request", parts[0]), parse_message(f"{name}_Response", parts[1])
+
+
+def bare(said: Any) -> Any:
+    """Return the fields of a message, or of a service's two, without defaults."""
+    if isinstance(said, tuple):
+        return [bare(one) for one in said]
+    return [one._replace(default=None) for one in said.fields]
+
+
+def _parse_line(package: str, line: str) -> tuple[MessageField, bool]:
+    matched = _FIELD.fullmatch(line) or _FIELD.fullmatch(line.partition("#")[0].strip())
+    if matched is None:
+        raise ValueError("expected a type and a name")
+    kind = _full_name(package, matched["type"])
+    limit = int(matched["limit"] or 0)
+    if limit and kind != "string":
+        raise ValueError("only a string is bounded by <=")
+    size, bound = matched["size"], matched["bound"]
+    if bound and not size:
+        raise ValueError("expected a number after <=")
+    shape = "" if size is None else "array" if size and not bound else "sequence"
+    field = MessageField(matched["name"], kind, shape, int(size or 0), limit)
+    if shape == "array" and not field.size:
+        raise ValueError("an array of 0 elements")
+    value = matched["constant"] if matched["constant"] is not None else matched["default"]
+    constant = matched["constant"] is not None
+    if constant and (shape or kind not in BASES):
+        raise ValueError("a constant is of one basic value")
+    return field._replace(default=_value(field, value, whole=constant)), constant
+
+
+def _full_name(package: str, said: str) -> str:
+    said = OTHER_NAMES.get(said, said)
+    if said in ("wstring", "float128"):
+        raise ValueError(f"{said} is not supported")
+    if said in BASES:
+        return said
+    if "/" not in said:
+        said = _OLD_NAMES.get(said, f"{package}/msg/{said}")
+    elif "/msg/" not in said:
+        said = said.replace("/", "/msg/", 1)
+    if NAME.fullmatch(said) is None:
+        raise ValueError(f"{said} is no type")
+    return said
+
+
+def _value(field: MessageField, text: str | None, *, whole: bool) -> Any:
+    """Return a constant or default; a constant's text is the ``whole`` rest of its line."""
+    if text is None or not (text := text.strip()) or (not whole and text.startswith("#")):
+        return None
+    if field.type == "string" and not field.shape:
+        quoted = re.match(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"", text)
+        if quoted is None:
+            return text if whole else text.partition("#")[0].strip()
+        return _fitting(field, [ast.literal_eval(quoted[0])])[0]
+    if field.type != "string":
+        text = text.partition("#")[0].strip()
+        text = re.sub(r"(?i)\btrue\b", "True", re.sub(r"(?i)\bfalse\b", "False", text))
+    value = ast.literal_eval(text)
+    value = value if field.shape else [value]
+    one = float if field.type.startswith("float") else bool if field.type == "bool" else None
+    values = [one(x) for x in value] if one else list(value)
+    return _fitting(field, values) if field.shape else _fitting(field, values)[0]
+
+
+def _fitting(field: MessageField, values: list[Any]) -> list[Any]:
+    if field.nested:
+        raise ValueError("a message has no default")
+    most = field.size or len(values)
+    if len(values) > most or (field.shape == "array" and len(values) != most):
+        raise ValueError(f"expected {field.size} values, got {len(values)}")
+    for value in values:
+        if field.type == "string":
+            if not isinstance(value, str) or (field.limit and len(value.encode()) > field.limit):
+                raise ValueError(f"{value!r:.40} is no {field.type}")
+        else:
+            try:
+                struct.pack(f"<{NUMBERS[field.type]}", value)
+            except (struct.error, OverflowError, TypeError) as exc:
+                raise ValueError(f"{value!r:.40} is no {field.type}") from exc
+    return values

@@ -1,0 +1,92 @@
+"""RIHS01: the hash of a type's description, by which nodes know that they mean the same.
+
+It is SHA-256 of JSON of the fields' names, types and order, and of all the types within (REP-2016);
+neither constants nor defaults count.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.ros2._types.definitions import EMPTY, Definition, MessageField
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+NOT_SUPPORTED: Final = "TypeHashNotSupported"
+"""Text that stands for a hash where the distribution has none."""
+
+_NESTED: Final = 1
+_IDS: Final = {
+    "int8": 2, "uint8": 3, "int16": 4, "uint16": 5, "int32": 6, "uint32": 7, "int64": 8,
+    "uint64": 9, "float32": 10, "float64": 11, "bool": 15, "byte": 16, "string": 17,
+}  # fmt: skip
+_BOUNDED_STRING: Final = 21
+_ARRAY, _BOUNDED, _SEQUENCE = 48, 96, 144
+
+
+def _field(field: MessageField) -> dict[str, Any]:
+    number = _NESTED if field.nested else _IDS[field.type]
+    if field.limit:
+        number = _BOUNDED_STRING
+    if field.shape:
+        number += _ARRAY if field.shape == "array" else _BOUNDED if field.size else _SEQUENCE
+    return {
+        "name": field.name,
+        "type": {
+            "type_id": number,
+            "capacity": field.size,
+            "string_capacity": field.limit,
+            "nested_type_name": field.type if field.nested else "",
+        },
+    }
+
+
+def _described(definition: Definition) -> dict[str, Any]:
+    fields = [_field(field) for field in definition.fields or (EMPTY,)]
+    return {"type_name": definition.name, "fields": fields}
+
+
+def description(definition: Definition, find: Callable[[str], Definition]) -> dict[str, Any]:
+    """Return a type's description with those of all the types within."""
+    within: dict[str, Definition] = {}
+    ahead = definition.needs()
+    while ahead:
+        name = ahead.pop()
+        within[name] = find(name)
+        ahead |= within[name].needs() - within.keys()
+    return {
+        "type_description": _described(definition),
+        "referenced_type_descriptions": [
+            _described(within[name]) for name in sorted(within) if name != definition.name
+        ],
+    }
+
+
+def hash_of_description(described: dict[str, Any]) -> str:
+    """Return the hash of a message or service, ``RIHS01_`` and 64 digits."""
+    text = json.dumps(described)
+    return f"RIHS01_{hashlib.sha256(text.encode()).hexdigest()}"
+
+
+def event_of(name: str) -> Definition:
+    """Return the event of a service: what introspection publishes, and a part of its hash."""
+    return Definition(
+        f"{name}_Event",
+        (
+            MessageField("info", "service_msgs/msg/ServiceEventInfo"),
+            MessageField("request", f"{name}_Request", "sequence", 1),
+            MessageField("response", f"{name}_Response", "sequence", 1),
+        ),
+        {},
+        {},
+    )
+
+
+def service_of(name: str) -> Definition:
+    """Return a service as its hash sees it."""
+    parts = ("request", "response", "event")
+    fields = tuple(MessageField(f"{part}_message", f"{name}_{part.title()}") for part in parts)
+    return Definition(name, fields, {}, {})

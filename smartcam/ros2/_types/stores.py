@@ -1,0 +1,87 @@
+"""The distributions of ROS 2, and what each has: once in the process, made when it is asked for."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._extras import load
+from smartcam.exceptions import ConfigurationError
+from smartcam.ros2._types.definitions import EMPTY, OTHER_NAMES, Definition, MessageField
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+DISTRIBUTIONS: Final = {
+    "humble": "humble",
+    "jazzy": "jazzy",
+    "kilted": "kilted",
+    "lyrical": "lyrical",
+    "rolling": "lyrical",
+}
+"""The store of rosbags for each; rolling is as the newest."""
+
+WITHOUT_HASHES: Final = frozenset({"humble"})
+
+LACKING: Final = {
+    "humble": frozenset(
+        {
+            "rcl_interfaces/srv/GetLoggerLevels",
+            "rcl_interfaces/srv/SetLoggerLevels",
+            "type_description_interfaces/srv/GetTypeDescription",
+        }
+    )
+}
+"""Names of the texts here that a distribution does not have, by the distribution."""
+
+_DEFAULTS: Final[dict[tuple[str, str], float | str]] = {
+    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
+    ("sensor_msgs/msg/NavSatStatus", "status"): "STATUS_UNKNOWN",
+}
+"""Defaults that the stores leave out; a name is a constant's, or nothing where it has none."""
+
+_NAME, _ARRAY, _SEQUENCE = 2, 3, 4
+
+
+@functools.cache
+def stored(distribution: str) -> Mapping[str, Any]:
+    """Return the fields of a distribution's messages, as rosbags has them.
+
+    Raises:
+        ConfigurationError: there is no such distribution.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+    if distribution not in DISTRIBUTIONS:
+        raise ConfigurationError(
+            f"no distribution of ROS 2: expected {', '.join(DISTRIBUTIONS)}, got "
+            f"{distribution!r:.80}"
+        )
+    name = f"rosbags.typesys.stores.ros2_{DISTRIBUTIONS[distribution]}"
+    found: Mapping[str, Any] = load(name).FIELDDEFS
+    return found
+
+
+def read_stored(name: str, said: Any) -> Definition:
+    """Return the definition of a message that a store holds."""
+    constants = {one: value for one, _, value in said[0]}
+    fields = []
+    for one, kind in said[1]:
+        if one != EMPTY.name:
+            default = _DEFAULTS.get((name, one))
+            if isinstance(default, str):
+                default = constants.get(default)
+            fields.append(_field(one, kind)._replace(default=default))
+    kinds: dict[str, str] = {one: str(OTHER_NAMES.get(kind, kind)) for one, kind, _ in said[0]}
+    return Definition(name, tuple(fields), constants, kinds)
+
+
+def _field(name: str, said: Any) -> MessageField:
+    shape, size = "", 0
+    if said[0] in (_ARRAY, _SEQUENCE):
+        shape = "array" if said[0] == _ARRAY else "sequence"
+        said, size = said[1]
+    if said[0] == _NAME:
+        return MessageField(name, said[1], shape, size)
+    kind: str
+    kind, limit = said[1]
+    return MessageField(name, OTHER_NAMES.get(kind, kind), shape, size, limit)

@@ -1,0 +1,417 @@
+"""Messages and services of a distribution of ROS 2: their fields, bytes and hashes."""
+
+from __future__ import annotations
+
+import functools
+import struct
+import threading
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam._forks import cached_property
+from smartcam._suggestions import did_you_mean
+from smartcam.exceptions import ConfigurationError, RosMessageError
+from smartcam.ros2._types.built_in import MESSAGES, SERVICES
+from smartcam.ros2._types.codec import HEAD, MisfitError, decoder, encoder
+from smartcam.ros2._types.definitions import (
+    Definition,
+    MessageField,
+    bare,
+    dds_name,
+    parse_message,
+    parse_service,
+    split_name,
+)
+from smartcam.ros2._types.hash import (
+    NOT_SUPPORTED,
+    description,
+    event_of,
+    hash_of_description,
+    service_of,
+)
+from smartcam.ros2._types.stores import LACKING, WITHOUT_HASHES, read_stored, stored
+from smartcam.ros2._types.values import (
+    LocatedError,
+    check,
+    filled,
+    message_class,
+    rule_of,
+    zero_maker,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.ros2._types.values import RosMessage
+
+_ORDERS: Final = {b"\0\1": "<", b"\0\0": ">"}
+_MISFITS: Final = (
+    MisfitError,
+    struct.error,
+    KeyError,
+    IndexError,
+    TypeError,
+    ValueError,
+    OverflowError,
+    AttributeError,
+)
+"""Errors that encoding and decoding raise where a message or its bytes do not fit."""
+
+
+class MessageType:
+    """A type of message; made by ``RosTypes.message`` and ``RosTypes.service``.
+
+    Attributes:
+        name: name of the type, such as ``std_msgs/msg/String``.
+        dds: name of the type in keys, such as ``std_msgs::msg::dds_::String_``.
+        fields: name, type, shape, bounds and default of each field.
+        constants: constants by name; they are attributes of ``cls``, too.
+        nested: the types of the messages within by name.
+        cls: the class of its messages, made with all fields in their order and looked at when they
+            are encoded: the fastest way.
+    """
+
+    def __init__(
+        self, definition: Definition, nested: Mapping[str, MessageType], types: RosTypes
+    ) -> None:
+        self.name: str = definition.name
+        self.dds: str = dds_name(definition.name)
+        self.fields: tuple[MessageField, ...] = definition.fields
+        self.constants: dict[str, Any] = dict(definition.constants)
+        self.nested = nested
+        self.cls: type[RosMessage] = message_class(definition)
+        self._definition = definition
+        self._types = types
+
+    def __repr__(self) -> str:
+        return f"<MessageType {self.name}>"
+
+    @cached_property
+    def hash(self) -> str:
+        """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
+        return self._types.hash_of(self._definition)
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(self._definition, self._types.definition)
+
+    @cached_property
+    def text(self) -> str:
+        """Its definition and those of all messages within, as recordings have it (``ros2msg``)."""
+        within = description(self._definition, self._types.definition)
+        parts = [self._definition.text()]
+        for one in within["referenced_type_descriptions"]:
+            name: str = one["type_name"]
+            head = f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n"
+            parts.append(head + self._types.definition(name).text())
+        return "".join(parts)
+
+    @cached_property
+    def zero(self) -> Callable[[], RosMessage]:
+        """The function that makes a message of defaults and zeros."""
+        return zero_maker(self)
+
+    @cached_property
+    def rules(self) -> dict[str, tuple[MessageField, Callable[[Any], Any]]]:
+        """Each field by its name in Python, and what a value for it has to stand."""
+        return {field.attribute: (field, rule_of(self, field)) for field in self.fields}
+
+    @cached_property
+    def _encode(self) -> Callable[[Any], bytes]:
+        return encoder(self)
+
+    @cached_property
+    def _decoders(self) -> dict[str, Callable[[Any], tuple[Any, int]]]:
+        return {}
+
+    def new(self, /, **fields: Any) -> Any:
+        """Return a message of these fields; those not said have their default, or zero.
+
+        A message within may be given as a mapping of its fields.
+
+        Raises:
+            RosMessageError: there is no such field, or a value does not fit.
+        """
+        return self._filled(fields)
+
+    def encode(self, message: Any) -> bytes:
+        """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
+
+        Raises:
+            RosMessageError: it is of another type, or a field does not fit.
+        """
+        if isinstance(message, Mapping):
+            message = self._filled(message)
+        elif getattr(message, "__msgtype__", None) != self.name:
+            got = getattr(message, "__msgtype__", type(message).__name__)
+            raise RosMessageError(f"{self.name}: expected a message of this type, got {got}")
+        try:
+            return self._encode(message)
+        except _MISFITS as exc:
+            raise RosMessageError(f"{self.name}: {self._reason(message) or exc}") from exc
+
+    def _flat(self, data: object) -> memoryview:
+        """Return bytes of other kinds of buffers, one after the other."""
+        if not isinstance(data, bytearray | memoryview):
+            raise RosMessageError(f"{self.name}: expected bytes, got {type(data).__name__}")
+        view = memoryview(data)
+        return view.cast("B") if view.c_contiguous else memoryview(view.tobytes())
+
+    def _filled(self, fields: Mapping[str, Any]) -> Any:
+        try:
+            return filled(self, fields)
+        except LocatedError as exc:
+            raise RosMessageError(f"{self.name}: {exc}") from exc
+
+    def _reason(self, message: Any) -> str:
+        try:
+            check(self, message)
+        except LocatedError as exc:
+            return str(exc)
+        return ""
+
+    def decode(self, data: bytes | bytearray | memoryview, *, whole: bool = True) -> Any:
+        """Return the message of CDR, little- or big-endian.
+
+        Sequences of numbers are views of ``data``, read only where that is bytes.
+
+        Args:
+            data: bytes of the message.
+            whole: whether the message has to fill the bytes; those of ROS' own serializer may be
+                more, with anything in them.
+
+        Raises:
+            RosMessageError: the bytes are no such message, or too few, or too many.
+        """
+        if not isinstance(data, bytes):
+            data = self._flat(data)
+        order = _ORDERS.get(bytes(data[:2]))
+        if order is None or len(data) < len(HEAD):
+            raise RosMessageError(
+                f"{self.name}: expected CDR with its encapsulation 00 01 or 00 00, got "
+                f"{len(data)} bytes: {bytes(data[:4]).hex(' ') or 'none'}"
+            )
+        decode = self._decoders.get(order)
+        if decode is None:
+            decode = self._decoders[order] = decoder(self, order)
+        try:
+            message, end = decode(data)
+        except _MISFITS as exc:
+            raise RosMessageError(
+                f"{self.name}: {len(data)} bytes are no such message: {exc}"
+            ) from exc
+        left = len(data) - end
+        if whole and left and (left > 3 or len(data) % 4 or any(data[end:])):
+            raise RosMessageError(
+                f"{self.name}: expected {end} bytes, got {len(data)}: {left} follow the message"
+            )
+        return message
+
+
+class ServiceType:
+    """A type of service; made by ``RosTypes.service``.
+
+    Attributes:
+        name: name of the type, such as ``std_srvs/srv/Trigger``.
+        dds: name of the type in keys, such as ``std_srvs::srv::dds_::Trigger_``.
+        request: type of the requests.
+        response: type of the responses.
+    """
+
+    def __init__(self, name: str, types: RosTypes) -> None:
+        self.name = name
+        self.dds: str = dds_name(name)
+        self.request: MessageType = types.message_of(f"{name}_Request")
+        self.response: MessageType = types.message_of(f"{name}_Response")
+        self._types = types
+
+    def __repr__(self) -> str:
+        return f"<ServiceType {self.name}>"
+
+    @cached_property
+    def hash(self) -> str:
+        """``RIHS01_`` and 64 digits, or ``TypeHashNotSupported``."""
+        return self._types.hash_of(service_of(self.name))
+
+    @cached_property
+    def description(self) -> dict[str, Any]:
+        """The fields of ``type_description_interfaces/msg/TypeDescription``."""
+        return description(service_of(self.name), self._types.definition)
+
+    @cached_property
+    def event(self) -> MessageType:
+        """Type of the messages that introspection publishes.
+
+        Raises:
+            ConfigurationError: the distribution has no introspection.
+        """
+        return self._types.message_of(f"{self.name}_Event")
+
+
+class RosTypes:
+    """The messages and services of a distribution of ROS 2, and those that are added.
+
+    Every object of the same distribution shares the distribution's own types; types added are in
+    the object that they were added to. It may be used from any thread.
+
+    Args:
+        distribution: ``humble``, ``jazzy``, ``kilted``, ``lyrical`` or ``rolling``.
+
+    Raises:
+        ConfigurationError: there is no such distribution.
+        MissingExtraError: the extra ``ros2`` is not installed.
+    """
+
+    def __init__(self, distribution: str = "jazzy") -> None:
+        self.distribution = distribution
+        self._stored = stored(distribution)
+        self._shared = None if isinstance(self, _Shared) else _shared(distribution)
+        self._lock = threading.RLock()
+        self._definitions: dict[str, Definition] = {}
+        self._added: dict[str, str] = {}
+        self._messages: dict[str, MessageType] = {}
+        self._services: dict[str, ServiceType] = {}
+
+    def __repr__(self) -> str:
+        return f"<RosTypes {self.distribution}>"
+
+    def names(self) -> list[str]:
+        """Return the names of all messages and services, sorted."""
+        lacking = LACKING.get(self.distribution, frozenset())
+        return sorted({*self._stored, *MESSAGES, *SERVICES, *self._added} - lacking)
+
+    def message(self, name: str) -> MessageType:
+        """Return a type of message, such as ``std_msgs/msg/String``.
+
+        Raises:
+            ConfigurationError: there is none of this name, or one within it is not known.
+        """
+        if (made := self._messages.get(name)) is not None:
+            return made
+        split_name(name, "msg")
+        return self.message_of(name)
+
+    def service(self, name: str) -> ServiceType:
+        """Return a type of service, such as ``std_srvs/srv/Trigger``.
+
+        Raises:
+            ConfigurationError: there is none of this name, or a message within it is not known.
+        """
+        if (made := self._services.get(name)) is not None:
+            return made
+        split_name(name, "srv")
+        if self._shared is not None and name not in self._added:
+            return self._shared.service(name)
+        if (text := self._service_text(name)) is None:
+            raise self._unknown(name)
+        with self._lock:
+            if (made := self._services.get(name)) is None:
+                for definition in (*parse_service(name, text), event_of(name)):
+                    self._definitions[definition.name] = definition
+                made = self._services[name] = ServiceType(name, self)
+        return made
+
+    def add(self, name: str, text: str) -> None:
+        """Add a message (``pkg/msg/Name``) or service (``pkg/srv/Name``) by the text of its file.
+
+        What is there already may be added again with the same fields.
+
+        Raises:
+            ConfigurationError: the text is none of a message or service, or another type has its
+                name.
+        """
+        _, kind, _ = split_name(name)
+        parse = parse_service if kind == "srv" else parse_message
+        said = parse(name, text)
+        with self._lock:
+            if name in self.names():
+                if kind == "srv":
+                    there: Any = parse(name, self._service_text(name) or "")
+                else:
+                    there = self.definition(name)
+                if bare(there) != bare(said):
+                    raise ConfigurationError(
+                        f"{name}: {self.distribution} has it with other fields, expected the same"
+                    )
+                return
+            self._added[name] = text
+
+    def definition(self, name: str) -> Definition:
+        """Return the fields of a message.
+
+        Raises:
+            ConfigurationError: it is not known.
+        """
+        made = self._definitions.get(name)
+        if made is None:
+            if name in self._added:
+                made = parse_message(name, self._added[name])
+            elif self._shared is not None:
+                return self._shared.definition(name)
+            elif name in self._stored:
+                made = read_stored(name, self._stored[name])
+            elif name in MESSAGES:
+                made = parse_message(name, MESSAGES[name])
+            else:
+                raise self._unknown(name)
+            self._definitions[name] = made
+        return made
+
+    def message_of(self, name: str, within: tuple[str, ...] = ()) -> MessageType:
+        """Return a message's type; for this module, as what follows."""
+        if (made := self._messages.get(name)) is not None:
+            return made
+        if self._shared is not None and name not in self._added and name not in self._definitions:
+            return self._shared.message_of(name)
+        if name in within:
+            raise ConfigurationError(f"{name} has itself within: {' > '.join((*within, name))}")
+        with self._lock:
+            if (made := self._messages.get(name)) is None:
+                definition = self.definition(name)
+                nested = {
+                    one: self.message_of(one, (*within, name)) for one in sorted(definition.needs())
+                }
+                made = self._messages[name] = MessageType(definition, nested, self)
+        return made
+
+    def _service_text(self, name: str) -> str | None:
+        if name in self._added:
+            return self._added[name]
+        return None if name in LACKING.get(self.distribution, ()) else SERVICES.get(name)
+
+    def source(self, name: str) -> tuple[str, str]:
+        """Return the encoding and the text of the file that has a type.
+
+        A part of a service has no file: its encoding is ``implicit``.
+
+        Raises:
+            ConfigurationError: the type is not known.
+        """
+        if "/srv/" in name:
+            text = self._service_text(name)
+            return ("implicit", "") if text is None else ("srv", text)
+        text = self._added.get(name) or MESSAGES.get(name)
+        return "msg", text or self.definition(name).text(defaults=True)
+
+    def hash_of(self, definition: Definition) -> str:
+        """Return a type's hash."""
+        if self.distribution in WITHOUT_HASHES:
+            return NOT_SUPPORTED
+        return hash_of_description(description(definition, self.definition))
+
+    def _unknown(self, name: str) -> ConfigurationError:
+        close = did_you_mean(name, self.names())
+        return ConfigurationError(
+            f"{name}: no such type in {self.distribution}, expected a name of it or add() first"
+            f"{close}"
+        )
+
+
+class _Shared(RosTypes):
+    """The types of a distribution itself; nothing is added to them."""
+
+
+@functools.cache
+def _shared(distribution: str) -> _Shared:
+    return _Shared(distribution)

@@ -1,0 +1,280 @@
+"""Messages as objects of Python: their classes, zero values, and what may stand in a field."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+import struct
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+import numpy as np
+
+from smartcam._suggestions import did_you_mean
+from smartcam.ros2._types.codec import MisfitError, counted, packed, text_bytes
+from smartcam.ros2._types.definitions import INTEGERS, NUMBERS, Definition, MessageField
+
+if TYPE_CHECKING:
+    from smartcam.ros2._types.types import MessageType
+
+
+class RosMessage:
+    """A message: one attribute for each field, constants on its class.
+
+    Numbers in sequences and arrays are numpy arrays (or what was put there); bytes may stand for
+    ``uint8[]``.
+    """
+
+    __slots__: tuple[str, ...] = ()
+    __msgtype__: ClassVar[str] = ""
+    __hash__: ClassVar[None]  # type: ignore[assignment]  # equal ones may change
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, RosMessage) or other.__msgtype__ != self.__msgtype__:
+            return NotImplemented
+        return all(_same(getattr(self, one), getattr(other, one)) for one in self.__slots__)
+
+    def __repr__(self) -> str:
+        parts = (f"{one}={_shown(getattr(self, one))}" for one in self.__slots__)
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+_LONG = 16
+"""Elements or bytes above which a value is not shown whole."""
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        if isinstance(one, bytes | bytearray | memoryview):
+            one = np.frombuffer(one, np.uint8)
+        if isinstance(other, bytes | bytearray | memoryview):
+            other = np.frombuffer(other, np.uint8)
+        return np.array_equal(one, other)
+    return bool(one == other)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        text = ", ".join(map(str, value[:_LONG].tolist()))
+        return f"[{text}{f', ... of {len(value)}' if len(value) > _LONG else ''}]"
+    if isinstance(value, bytes | bytearray | memoryview | list | tuple) and len(value) > _LONG:
+        return f"<{type(value).__name__} of {len(value)}>"
+    return repr(value)
+
+
+def message_class(definition: Definition) -> type[RosMessage]:
+    """Return the class of a message; made with its fields in order."""
+    names = tuple(field.attribute for field in definition.fields)
+    made: type[RosMessage] = dataclasses.make_dataclass(
+        definition.name.rpartition("/")[2],
+        names,
+        bases=(RosMessage,),
+        namespace={
+            "__msgtype__": definition.name,
+            "__doc__": definition.name,
+            "__module__": __name__,
+            **{name: value for name, value in definition.constants.items() if name not in names},
+        },
+        eq=False,
+        repr=False,
+        slots=True,
+    )
+    return made
+
+
+class LocatedError(MisfitError):
+    """A field's value does not fit; ``path`` says which, from the outermost message on."""
+
+    def __init__(self, text: str, place: str) -> None:
+        super().__init__(text)
+        self.path = [place]
+
+    def __str__(self) -> str:
+        return f"{''.join(reversed(self.path)).lstrip('.')}: {self.args[0]}"
+
+
+def _located(exc: Exception, field: MessageField, value: Any, place: str = "") -> LocatedError:
+    """Return the error of a field, or of one within it, with its place."""
+    if not isinstance(exc, LocatedError):
+        return LocatedError(f"expected {field}, got {_shown(value):.80} ({exc})", place)
+    exc.path.append(place)
+    return exc
+
+
+_MISFITS: Final = (MisfitError, struct.error, KeyError, TypeError, ValueError, OverflowError)
+
+
+# -- zero values --------------------------------------------------------------------------------
+
+
+def zero_maker(kind: MessageType) -> Callable[[], RosMessage]:
+    """Return the function that makes a message of defaults and zeros."""
+    made, parts = kind.cls, [_zero(kind, field) for field in kind.fields]
+    return lambda: made(*[part() for part in parts])
+
+
+def _zero(kind: MessageType, field: MessageField) -> Callable[[], Any]:
+    """Return the function that makes what a field is when nothing is said."""
+    if field.shape:
+        return _zeros(kind, field)
+    if field.nested:
+        return zero_maker(kind.nested[field.type])
+    usual = _ZERO.get(field.type, 0) if field.default is None else field.default
+    return lambda: usual
+
+
+def _zeros(kind: MessageType, field: MessageField) -> Callable[[], Any]:
+    """Return the function that makes what a field of many is when nothing is said."""
+    count = field.size if field.shape == "array" else 0
+    if field.type in NUMBERS:
+        dtype = np.dtype(f"={NUMBERS[field.type]}")
+        usual = field.default
+        return (np.zeros(count, dtype) if usual is None else np.array(usual, dtype)).copy
+    if field.default is not None:
+        return functools.partial(list, field.default)
+    one = _zero(kind, field._replace(shape=""))
+    return lambda: [one() for _ in range(count)]
+
+
+_ZERO: Final[dict[str, Any]] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
+
+
+# -- values that are said -----------------------------------------------------------------------
+
+
+def filled(kind: MessageType, fields: Mapping[str, Any]) -> Any:
+    """Return a message of these fields, zero elsewhere.
+
+    Raises:
+        LocatedError: a field is not of the type, or does not fit.
+    """
+    message = kind.zero()
+    rules = kind.rules
+    for name, value in fields.items():
+        if name not in rules:
+            known = ", ".join(rules) or "none"
+            close = did_you_mean(str(name), rules)
+            text = f"{kind.name} has no such field, expected {known}{close}"
+            raise LocatedError(text, f".{name}")
+        field, rule = rules[name]
+        try:
+            setattr(message, name, rule(value))
+        except _MISFITS as exc:
+            raise _located(exc, field, value, f".{field.name}") from exc
+    return message
+
+
+def rule_of(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
+    """Return the function that returns a field's value as it is kept: mappings become messages.
+
+    It raises one of ``_MISFITS`` for what does not fit.
+    """
+    if not field.shape:
+        return _rule_of_one(kind, field)
+    least = field.size if field.shape == "array" else 0
+    if field.type in NUMBERS:
+        code = NUMBERS[field.type]
+
+        def numbers(value: Any) -> Any:
+            packed(value, code, least, field.size)
+            return value
+
+        return numbers
+    one = field._replace(shape="", size=0)
+    rule = _rule_of_one(kind, one)
+
+    def each(values: Any) -> list[Any]:
+        counted(values, least, field.size)
+        kept: list[Any] = []
+        for place, value in enumerate(values):
+            try:
+                kept.append(rule(value))
+            except _MISFITS as exc:
+                raise _located(exc, one, value, f"[{place}]") from exc
+        return kept
+
+    return each
+
+
+def _rule_of_one(kind: MessageType, field: MessageField) -> Callable[[Any], Any]:
+    if field.type in _RULES:
+        return _RULES[field.type]
+    if field.type == "string":
+
+        def text(value: Any) -> Any:
+            text_bytes(value, field.limit)
+            return value
+
+        return text
+    nested = kind.nested[field.type]
+
+    def message(value: Any) -> Any:
+        if type(value) is dict or isinstance(value, Mapping):
+            return filled(nested, value)
+        if getattr(value, "__msgtype__", None) != nested.name:
+            raise MisfitError(f"a {type(value).__name__}")
+        return value
+
+    return message
+
+
+def _flag(value: Any) -> bool:
+    if value not in (True, False):
+        raise MisfitError("neither True nor False")
+    return bool(value)
+
+
+def _integer(code: str) -> Callable[[Any], int]:
+    def rule(value: Any) -> int:
+        number = operator.index(value)
+        pack(number)
+        return number
+
+    pack = struct.Struct(f"<{code}").pack
+    return rule
+
+
+def _float32(value: Any) -> float:
+    struct.pack("<f", value)
+    return float(value)
+
+
+def _float64(value: Any) -> float:
+    if type(value) is not float:
+        struct.pack("<d", value)
+    return float(value)
+
+
+_RULES: Final[dict[str, Callable[[Any], Any]]] = {
+    **{name: _integer(code) for name, code in INTEGERS.items()},
+    "bool": _flag,
+    "float32": _float32,
+    "float64": _float64,
+}
+
+
+def check(kind: MessageType, message: Any) -> None:
+    """Look at every field of a message, to say what is wrong with it.
+
+    Raises:
+        LocatedError: a field is missing or does not fit.
+    """
+    for field, rule in kind.rules.values():
+        place = f".{field.name}"
+        try:
+            value = getattr(message, field.attribute)
+        except AttributeError:
+            text = f"expected {field}, got none: a {type(message).__name__} has no such field"
+            raise LocatedError(text, place) from None
+        try:
+            rule(value)
+        except _MISFITS as exc:
+            raise _located(exc, field, value, place) from exc
+        if field.nested:
+            for number, one in enumerate(value if field.shape else [value]):
+                try:
+                    check(kind.nested[field.type], one)
+                except LocatedError as exc:
+                    exc.path.append(f"{place}[{number}]" if field.shape else place)
+                    raise
