@@ -8,33 +8,49 @@ from __future__ import annotations
 
 import abc
 import asyncio
+import warnings
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, overload
 
-from smartcam._client.counters import ClientCounters
-from smartcam._client.interpretation import Interpretation
-from smartcam._client.listeners import Listeners
-from smartcam._client.triggering import TriggerRequest
+from smartcam._arguments import (
+    check_age,
+    check_application,
+    check_application_or_name,
+    check_bytes,
+    check_callable,
+    check_choice,
+    check_flag,
+    check_integer,
+    check_message_id,
+    check_moment,
+    check_number,
+    check_seconds,
+    check_seconds_or_none,
+    check_time,
+    wrong_argument,
+)
+from smartcam._client._inside import ClientCounters, Interpretation, Listeners, TriggerRequest
 from smartcam.exceptions import (
-    ConfigurationError,
     SmartCamError,
     TriggerTimeoutError,
     UnsupportedError,
 )
 from smartcam.models import CameraEvent, Capabilities, Result, Statistics, Status, ValueT
 from smartcam.observers import Observer, Observers
+from smartcam.settings import id_of
 from smartcam.streams import BatchSubscription, Queue, Subscribers, Subscription
 
 if TYPE_CHECKING:
     import contextlib
-    from collections.abc import Callable, Coroutine, Generator, Iterable
+    from collections.abc import Callable, Collection, Coroutine, Generator, Iterable
     from types import TracebackType
     from typing import NoReturn, Self
 
-    from smartcam.frames import Frame, FrameReader
-    from smartcam.interpreters._base import AnySpec, TypedSpec
+    from smartcam.fleet import FleetFrame
+    from smartcam.frames import FrameReader
+    from smartcam.interpreters._inside import AnySpec, TypedSpec
     from smartcam.models import Localization
-    from smartcam.settings import CameraSettings
+    from smartcam.settings import Address, CameraSettings
 
 
 __all__ = ["Camera"]
@@ -65,7 +81,48 @@ FRAME_TIMEOUT = 5.0
 
 FrameEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl"]
 StreamEncoding: TypeAlias = Literal["raw", "jpeg", "png", "jpegxl", "h264"]
-"""What frames may come as."""
+"""Encodings in which frames may come."""
+
+FRAME_ENCODINGS = ("raw", "jpeg", "png", "jpegxl")
+STREAM_ENCODINGS = (*FRAME_ENCODINGS, "h264")
+
+MAX_SEQUENCE_NUMBER = 0xFFFFFFFF
+"""Largest number of a run that a request has room for, 32 bits."""
+
+MAX_RESULTS_PER_TRIGGER = 10_000
+"""Results of one trigger that may be asked for: a camera has a few "send results" tools."""
+
+
+class FrameRequest(NamedTuple):
+    """The form in which frames are asked for.
+
+    Attributes:
+        encoding: name of the encoding.
+        quality: quality of JPEGs; None for that of the agent.
+    """
+
+    encoding: str
+    quality: int | None
+
+
+class StreamRequest(NamedTuple):
+    """The stream of frames that is asked for; fields as the arguments of :meth:`Camera.frames`.
+
+    Attributes:
+        encoding: name of the encoding.
+        quality: quality of JPEGs; None for that of the agent.
+        bitrate: bits a second; None for no limit.
+        latency: seconds; None for no limit.
+        decode: whether encoded frames are decoded here.
+        timeout: seconds that an iteration waits; None for no limit.
+    """
+
+    encoding: str
+    quality: int | None
+    bitrate: float | None
+    latency: float | None
+    decode: bool
+    timeout: float | None
 
 
 class Camera(abc.ABC, Generic[ValueT]):
@@ -88,7 +145,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         self._interpretations: dict[str, Interpretation] = {}  # by their text
         self._counters = ClientCounters()
         self._listeners = self._make_listeners()
-        self._default = self._interpretation(settings.interpret_as)
+        self._default_spec: object = settings.interpret_as
+        self._default = self._interpretation(self._default_spec, own=True)
 
     # ------------------------------------------------------------------ what each kind does its way
 
@@ -98,15 +156,22 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     @abc.abstractmethod
     def _deadline(self, timeout: float) -> float:
-        """Return the loop time in ``timeout`` seconds; ConfigurationError if it is no number."""
+        """Return the loop time in ``timeout`` seconds; ConfigurationError if it cannot be one."""
 
     @abc.abstractmethod
     def _listens(self, subscribers: object) -> None:
         """Somebody listens to what ``subscribers`` are offered, from now on."""
 
+    def _abandoned(self) -> bool:
+        """Have a camera that nobody has any more given back; return whether it was open.
+
+        It is called in any thread, and also where ``__init__`` has failed.
+        """
+        return False
+
     @abc.abstractmethod
     def _over(self) -> tuple[SmartCamError | None] | None:
-        """Return what ended the camera's streams, None where more may come."""
+        """Return the reason why the camera's streams ended, None where more items may come."""
 
     @abc.abstractmethod
     async def _trigger(
@@ -137,7 +202,6 @@ class Camera(abc.ABC, Generic[ValueT]):
         Cancellation: the link is dropped at once.
         """
 
-    @abc.abstractmethod
     async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
         """Wait until there is a session, and what ``restore`` asks for is done.
 
@@ -152,6 +216,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
+        await self._wait_connected(check_seconds(timeout, "timeout", self.name))
+
+    @abc.abstractmethod
+    async def _wait_connected(self, timeout: float) -> None: ...
 
     async def __aenter__(self) -> Self:
         return await self.open()
@@ -172,6 +240,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     def __exit__(self, *_: object) -> None: ...
 
+    def __del__(self) -> None:
+        if self._abandoned():
+            warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name} {self.url}>"
 
@@ -190,7 +262,19 @@ class Camera(abc.ABC, Generic[ValueT]):
     @property
     @abc.abstractmethod
     def connected(self) -> bool:
-        """Whether there is a session."""
+        """True while there is a session."""
+
+    @property
+    def trouble(self) -> SmartCamError | None:
+        """The error that a call would raise now without a session; None while there is one.
+
+        It is told without a traceback; what caused it is its ``__cause__``.
+        """
+        try:
+            self._require_session()
+        except SmartCamError as error:
+            return error.with_traceback(None)
+        return None
 
     @property
     @abc.abstractmethod
@@ -214,7 +298,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @property
     @abc.abstractmethod
     def capabilities(self) -> Capabilities:
-        """What the camera can do in the dialect that it speaks.
+        """The abilities of the camera in the dialect that it speaks.
 
         Raises:
             ConnectionClosedError: there was no session yet, so the dialect is not known.
@@ -275,6 +359,7 @@ class Camera(abc.ABC, Generic[ValueT]):
                 may be larger). One that is larger alone is kept while no other is.
             overflow: what happens beyond either.
         """
+        check_flag(batch, "batch", self.name)
         kind = BatchSubscription[Result[ValueT]] if batch else Subscription[Result[ValueT]]
         stream = kind(
             "results",
@@ -313,7 +398,6 @@ class Camera(abc.ABC, Generic[ValueT]):
         stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
         return self._subscribed(self._listeners.events, stream)
 
-    @abc.abstractmethod
     async def wait_status(
         self, predicate: Callable[[Status], bool], timeout: float = 10.0
     ) -> Status:
@@ -326,8 +410,12 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
+        check_callable(predicate, "predicate", self.name)
+        return await self._wait_status(predicate, check_seconds(timeout, "timeout", self.name))
 
     @abc.abstractmethod
+    async def _wait_status(self, predicate: Callable[[Status], bool], timeout: float) -> Status: ...
+
     async def wait_ready(self, timeout: float = 10.0) -> Status:
         """Wait until the camera is not BUSY, and Running if a start was asked for.
 
@@ -336,6 +424,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
+        return await self._wait_ready(check_seconds(timeout, "timeout", self.name))
+
+    @abc.abstractmethod
+    async def _wait_ready(self, timeout: float) -> Status: ...
 
     def next_result(
         self, *, timeout: float = DEFAULT_TRIGGER_TIMEOUT
@@ -355,6 +447,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the result still goes to the streams.
         """
+        timeout = check_seconds(timeout, "timeout", self.name)
         self._require_session()
         deadline = self._deadline(timeout)
         future = self._listeners.next_result()
@@ -366,7 +459,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: None = None,
         input: bytes | None = None,
@@ -378,7 +471,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: None = None,
         input: bytes | None = None,
@@ -390,7 +483,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: Literal["localizations"],
         input: bytes | None = None,
@@ -402,7 +495,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: Literal["localizations"],
         input: bytes | None = None,
@@ -414,7 +507,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: AnySpec,
         input: bytes | None = None,
@@ -426,7 +519,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: AnySpec,
         input: bytes | None = None,
@@ -438,7 +531,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: TypedSpec[T],
         input: bytes | None = None,
@@ -450,7 +543,7 @@ class Camera(abc.ABC, Generic[ValueT]):
     @overload
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: TypedSpec[T],
         input: bytes | None = None,
@@ -461,7 +554,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
     async def trigger(
         self,
-        application: int | None = None,
+        application: int | str | None = None,
         *,
         interpret_as: object = None,
         input: bytes | None = None,
@@ -482,7 +575,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         ``@sequence`` a late result can pass for the next one's: nothing on the wire tells.
 
         Args:
-            application: have this application running for this trigger, and go back to the present
+            application: have this application running for this trigger, by its id or its name in
+                ``application_names``, and go back to the present
                 one afterwards, also after an error or a cancellation. Each switch has
                 ``switch_timeout`` of its own.
             interpret_as: how to read this result; default as given to :func:`connect`.
@@ -494,11 +588,13 @@ class Camera(abc.ABC, Generic[ValueT]):
                 counted as ``extra_results``.
 
         Raises:
+            ConfigurationError: an argument cannot work; nothing was sent.
             NotRunningError: the application is stopped (neither BUSY nor Running), or somebody
                 else stopped it during the inspection.
             TriggerTimeoutError: no result in time; it says what the status was. An application
                 that runs free never waits for a trigger and ends here, and so does a switch to
-                ``application`` that takes too long.
+                ``application`` that takes too long. Where others had the camera for so long that
+                no time is left for a result, no trigger was sent.
             OvertriggeredError: the camera dropped a trigger meanwhile.
             CameraBusyError: with ``when_busy="refuse"``.
             CameraFaultError: the camera reports System Error.
@@ -517,13 +613,18 @@ class Camera(abc.ABC, Generic[ValueT]):
         interpretation = (
             self._default if interpret_as is None else self._interpretation(interpret_as)
         )
-        if when_busy not in {"wait", "refuse"}:
-            raise ConfigurationError(f"trigger: when_busy is 'wait' or 'refuse', not {when_busy!r}")
-        wanted = 1 if results_per_trigger is None else results_per_trigger
-        if wanted < 1:
-            raise ConfigurationError(f"trigger: results_per_trigger is 1 or more, not {wanted}")
-        data = None if input is None else bytes(input)
-        request = TriggerRequest(interpretation, data, wanted, when_busy == "wait")
+        who = self.name
+        if application is not None:
+            application = check_application(self._named(application), who=who)
+        wait = check_choice(when_busy, "when_busy", ("wait", "refuse"), who) == "wait"
+        wanted = 1
+        if results_per_trigger is not None:
+            wanted = check_integer(
+                results_per_trigger, "results_per_trigger", 1, MAX_RESULTS_PER_TRIGGER, who
+            )
+        data = None if input is None else check_bytes(input, "input", who)
+        timeout = check_seconds(timeout, "timeout", who)
+        request = TriggerRequest(interpretation, data, wanted, wait)
         called_at = datetime.now(UTC) if self._observed else None
         try:
             results = await self._trigger(application, request, timeout)
@@ -532,7 +633,6 @@ class Camera(abc.ABC, Generic[ValueT]):
             raise
         return results[0] if results_per_trigger is None else results
 
-    @abc.abstractmethod
     async def switch_application(
         self, application: int | str, *, timeout: float | None = None
     ) -> None:
@@ -543,7 +643,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         runs again, if it ran, before the error is raised.
 
         Args:
-            application: its id, or the name of its file where the camera can load by that.
+            application: id of the application, its name in ``application_names``, or the name of
+                its file where the camera can load by that.
             timeout: seconds for the whole; default ``switch_timeout``.
 
         Raises:
@@ -554,9 +655,14 @@ class Camera(abc.ABC, Generic[ValueT]):
         Cancellation: safe; the camera may be in either application, and stopped.
         Source: SC manual p. 34 (published).
         """
+        application = check_application_or_name(self._named(application, file=True), who=self.name)
+        limit = self._limit(timeout, self.settings.switch_timeout)
+        await self._switch_application(application, limit)
 
     @abc.abstractmethod
-    def application(self, application: int) -> contextlib.AbstractAsyncContextManager[Self]:
+    async def _switch_application(self, application: int | str, timeout: float) -> None: ...
+
+    def application(self, application: int | str) -> contextlib.AbstractAsyncContextManager[Self]:
         """Have an application running inside the ``async with``, then go back to the one before.
 
         Raises:
@@ -564,8 +670,26 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: going back is finished by the client's supervisor; the next call waits for it.
         """
+        return self._in_application(check_application(self._named(application), who=self.name))
+
+    def _named(self, application: object, *, file: bool = False) -> object:
+        """Return the id of an application's name; anything else as it is.
+
+        Args:
+            application: what the user gave.
+            file: a name that is not known may be a file's.
+
+        Raises:
+            ConfigurationError: there are names, and this is none of them.
+        """
+        names = self.settings.application_names
+        if not names or not isinstance(application, str) or (file and application not in names):
+            return application
+        return id_of(application, names)
 
     @abc.abstractmethod
+    def _in_application(self, application: int) -> contextlib.AbstractAsyncContextManager[Self]: ...
+
     async def start(self, *, timeout: float = 10.0) -> None:
         """Enter run mode; returns when the camera reports Running and is not BUSY.
 
@@ -575,8 +699,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the command may have been sent.
         """
+        await self._start(check_seconds(timeout, "timeout", self.name))
 
     @abc.abstractmethod
+    async def _start(self, timeout: float) -> None: ...
+
     async def stop(self, *, timeout: float = 10.0) -> None:
         """Leave run mode; returns when the camera no longer reports Running.
 
@@ -588,8 +715,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the command may have been sent.
         """
+        await self._stop(check_seconds(timeout, "timeout", self.name))
 
     @abc.abstractmethod
+    async def _stop(self, timeout: float) -> None: ...
+
     async def query_application(self, *, timeout: float | None = None) -> int:
         """Ask the camera which application is active.
 
@@ -599,8 +729,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
+        return await self._query_application(self._limit(timeout, self.settings.request_timeout))
 
     @abc.abstractmethod
+    async def _query_application(self, timeout: float) -> int: ...
+
     async def query_status(self, *, timeout: float | None = None) -> Status:
         """Ask the camera for its status.
 
@@ -610,8 +743,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
+        return await self._query_status(self._limit(timeout, self.settings.request_timeout))
 
     @abc.abstractmethod
+    async def _query_status(self, timeout: float) -> Status: ...
+
     async def reset_errors(self, *, timeout: float | None = None) -> Status:
         """Clear the error bits that stay set until then; return the status after it.
 
@@ -624,8 +760,11 @@ class Camera(abc.ABC, Generic[ValueT]):
         Cancellation: safe; the command may have been sent.
         Source: BVS ID guide p. 227 (published).
         """
+        return await self._reset_errors(self._limit(timeout, self.settings.request_timeout))
 
     @abc.abstractmethod
+    async def _reset_errors(self, timeout: float) -> Status: ...
+
     async def read_image(self, *, timeout: float | None = None) -> bytes:
         """Return the last picture, as a file's bytes.
 
@@ -636,6 +775,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
+        return await self._read_image(self._limit(timeout, self.settings.request_timeout))
+
+    @abc.abstractmethod
+    async def _read_image(self, timeout: float) -> bytes: ...
 
     def frames(
         self,
@@ -674,7 +817,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: nothing is left.
         """
-        raise self._no_frames()
+        form = self._check_form(encoding, quality, STREAM_ENCODINGS)
+        rate = self._check_rate(bitrate, latency)
+        decode = check_flag(decode, "decode", self.name)
+        timeout = check_seconds_or_none(timeout, "timeout", self.name, above=True)
+        return self._frames(StreamRequest(*form, *rate, decode, timeout))
 
     async def newest_frame(
         self,
@@ -683,13 +830,13 @@ class Camera(abc.ABC, Generic[ValueT]):
         encoding: FrameEncoding = "raw",
         quality: int | None = None,
         timeout: float = FRAME_TIMEOUT,
-    ) -> Frame:
+    ) -> FleetFrame:
         """Return the newest frame.
 
         Args:
             max_age: seconds since it was captured at most; ``inf``: any.
             encoding: as :meth:`frames` has it.
-            quality: the same.
+            quality: as :meth:`frames` has the argument.
             timeout: seconds.
 
         Raises:
@@ -700,7 +847,10 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
-        raise self._no_frames()
+        form = self._check_form(encoding, quality, FRAME_ENCODINGS)
+        max_age = check_age(max_age, "max_age", self.name)
+        timeout = check_seconds(timeout, "timeout", self.name)
+        return await self._newest_frame(max_age, form, timeout)
 
     async def frame_after(
         self,
@@ -709,7 +859,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         encoding: FrameEncoding = "raw",
         quality: int | None = None,
         timeout: float = FRAME_TIMEOUT,
-    ) -> Frame:
+    ) -> FleetFrame:
         """Return the first frame whose exposure began after a moment, or after this call.
 
         Where clocks or the source leave a doubt, it is the first one of which that is sure.
@@ -717,7 +867,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Args:
             moment: of ``time.monotonic()``; None: now.
             encoding: as :meth:`frames` has it.
-            quality: the same.
+            quality: as :meth:`frames` has the argument.
             timeout: seconds.
 
         Raises:
@@ -725,7 +875,80 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe.
         """
+        form = self._check_form(encoding, quality, FRAME_ENCODINGS)
+        if moment is not None:
+            moment = check_moment(moment, "moment", self.name)
+        timeout = check_seconds(timeout, "timeout", self.name)
+        return await self._frame_after(moment, form, timeout)
+
+    def _frames(self, wanted: StreamRequest) -> contextlib.AbstractAsyncContextManager[FrameReader]:
         raise self._no_frames()
+
+    async def _newest_frame(self, max_age: float, form: FrameRequest, timeout: float) -> FleetFrame:
+        raise self._no_frames()
+
+    async def _frame_after(
+        self, moment: float | None, form: FrameRequest, timeout: float
+    ) -> FleetFrame:
+        raise self._no_frames()
+
+    # ------------------------------------------------------------------ for oneself
+
+    def reserve(self, timeout: float = 10.0) -> contextlib.AbstractAsyncContextManager[Self]:
+        """Keep the commands of other programs out as long as the body runs.
+
+        They wait within their own timeouts, and then fail naming this program. It ends with the
+        body, or with this program: killed, or cut off, within the lease of the engine. The tasks of
+        this program use the camera as before, and may reserve it, too.
+
+        Only a camera of a fleet can be reserved: one at the wire serves one client, and the
+        newcomer wins.
+
+        Args:
+            timeout: seconds until it has to be ours. Whoever came before is waited for.
+
+        A reservation may be lost before: its agent ends or is restarted, another one takes the
+        camera over, this program was cut off or stopped for longer than the lease. Then every
+        command of this object is refused until the block has ended, and so is the block at its end,
+        unless it raises something else.
+
+        Raises:
+            UnsupportedError: the camera is none of a fleet.
+            ResponseTimeoutError: somebody else has it; says who.
+            ConnectionLostError: the agent is away, or was restarted meanwhile.
+            ReservationLostError: at the end of the body: it was lost meanwhile, or nobody knows.
+
+        Cancellation: safe; it is given back.
+        """
+        return self._reserved(check_seconds(timeout, "timeout", self.name))
+
+    def _reserved(self, timeout: float) -> contextlib.AbstractAsyncContextManager[Self]:
+        raise self._not_shared("it cannot be reserved")
+
+    async def take_back(self, *, timeout: float | None = None) -> None:
+        """Have the agent take the camera from another client, and wait for the session.
+
+        By itself an agent tries a camera that was taken again after 30 s, then ever more seldom.
+        Does nothing where it has a session.
+
+        Args:
+            timeout: seconds, ``request_timeout`` by default.
+
+        Raises:
+            UnsupportedError: the camera is none of a fleet; a new connection takes it.
+            LinkError: there is no agent.
+            ResponseTimeoutError: there was no session within ``timeout``.
+        """
+        await self._take_back(self._limit(timeout, self.settings.request_timeout))
+
+    async def _take_back(self, timeout: float) -> None:
+        raise self._not_shared("a new connection takes it back")
+
+    def _not_shared(self, then: str) -> UnsupportedError:
+        return UnsupportedError(
+            f"{self.name}: the camera is at the wire, where it serves one client, and not one of a "
+            f"fleet: {then}; smartcam serve shares it, and fleet://HOST/NAME is its address then"
+        )
 
     def _no_frames(self) -> UnsupportedError:
         return UnsupportedError(
@@ -734,7 +957,6 @@ class Camera(abc.ABC, Generic[ValueT]):
             "frames: URL"
         )
 
-    @abc.abstractmethod
     async def get_clock(self, *, timeout: float | None = None) -> datetime:
         """Return the camera's clock: a naive datetime, since it carries no time zone.
 
@@ -744,8 +966,11 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
+        return await self._get_clock(self._limit(timeout, self.settings.request_timeout))
 
     @abc.abstractmethod
+    async def _get_clock(self, timeout: float) -> datetime: ...
+
     async def set_clock(self, when: datetime) -> None:
         """Set the camera's clock to the fields of ``when``; only result codes confirm it.
 
@@ -754,16 +979,22 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Source: mvBlueGEMINI manual p. 29 (published, sibling): invalid values may be dropped.
         """
+        await self._set_clock(check_time(when, "when", self.name))
 
     @abc.abstractmethod
+    async def _set_clock(self, when: datetime) -> None: ...
+
     async def set_input(self, data: bytes) -> None:
         """Send input data for the next inspection; only result codes confirm it.
 
         ``trigger(input=...)`` binds data to its own trigger. The camera queues containers against
         inspections; the Input Container bit says when they are out of step.
         """
+        await self._set_input(check_bytes(data, "data", self.name))
 
     @abc.abstractmethod
+    async def _set_input(self, data: bytes) -> None: ...
+
     async def set_sequence_number(self, number: int) -> None:
         """Set the number of the next run (0 to 4294967295); nothing confirms it.
 
@@ -772,9 +1003,15 @@ class Camera(abc.ABC, Generic[ValueT]):
         would take this number: then leave the numbers to :meth:`trigger`.
 
         Raises:
+            ConfigurationError: the number has more than 32 bits.
             UnsupportedError: the dialect has no such request (``bid``).
-            LocalProtocolError: the number does not fit.
+            LocalProtocolError: the dialect's own field is narrower, and the number does not fit.
         """
+        number = check_integer(number, "number", 0, MAX_SEQUENCE_NUMBER, self.name)
+        await self._set_sequence_number(number)
+
+    @abc.abstractmethod
+    async def _set_sequence_number(self, number: int) -> None: ...
 
     @abc.abstractmethod
     async def reboot(self) -> None:
@@ -789,7 +1026,6 @@ class Camera(abc.ABC, Generic[ValueT]):
         Cancellation: the command may have been sent.
         """
 
-    @abc.abstractmethod
     async def request(
         self,
         message_id: int | str,
@@ -801,8 +1037,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         """Send any message; the escape hatch for what has no method here.
 
         Args:
-            message_id: its id; a command's text where the protocol has commands.
-            payload: its body.
+            message_id: id of the message; a command's text where the protocol has commands.
+            payload: body of the message.
             answered: whether to wait for an answer under the same id; by default what the message
                 table says, True for an unknown id.
             timeout: seconds for the answer.
@@ -817,19 +1053,87 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Cancellation: safe; the answer is dropped when it comes.
         """
+        message_id = check_message_id(message_id, who=self.name)
+        payload = check_bytes(payload, "payload", self.name)
+        if answered is not None:
+            answered = check_flag(answered, "answered", self.name)
+        return await self._request(
+            message_id, payload, answered, self._limit(timeout, self.settings.request_timeout)
+        )
+
+    @abc.abstractmethod
+    async def _request(
+        self, message_id: int | str, payload: bytes, answered: bool | None, timeout: float
+    ) -> bytes | None: ...
 
     # ------------------------------------------------------------------ small helpers
+
+    def _limit(self, timeout: float | None, usual: float) -> float:
+        """Return a call's seconds: those given, or the usual ones."""
+        return usual if timeout is None else check_seconds(timeout, "timeout", self.name)
+
+    def _check_form(
+        self, encoding: str, quality: int | None, encodings: Collection[str]
+    ) -> FrameRequest:
+        """Return the encoding and quality of frames; the agent checks whether they go together."""
+        if quality is not None:
+            quality = check_integer(quality, "quality", 1, 100, self.name)
+        encoding = check_choice(encoding, "encoding", STREAM_ENCODINGS, self.name)
+        if encoding not in encodings:
+            raise wrong_argument(
+                "encoding", "no video: no frame of it is a picture by itself", encoding, self.name
+            )
+        return FrameRequest(encoding, quality)
+
+    def _check_rate(
+        self, bitrate: float | None, latency: float | None
+    ) -> tuple[float | None, float | None]:
+        """Return the limits of a stream's bit rate and latency, checked."""
+        if bitrate is not None:
+            bitrate = check_number(bitrate, "bitrate", 1e3, 1e11, self.name)
+        if latency is not None:
+            latency = check_number(latency, "latency", 1e-3, 60.0, self.name)
+        return bitrate, latency
 
     def _make_listeners(self) -> Listeners:
         return Listeners(self.settings.name, self._observers)
 
-    def _interpretation(self, spec: object) -> Interpretation:
+    @property
+    def _place(self) -> Address:
+        """Address of the camera itself, as far as it is known."""
+        return self.settings.address
+
+    def _read_by(self, spec: object) -> None:
+        """Read results by ``spec`` from now on; None: as the settings say.
+
+        Whoever has this object reads so; its results are the same for all of them.
+
+        Raises:
+            ConfigurationError: ``spec`` cannot be, or not with the calibration.
+        """
+        spec = self.settings.interpret_as if spec is None else spec
+        self._default = self._interpretation(spec)
+        self._default_spec = spec
+
+    def _interpretation(self, spec: object, *, own: bool = False) -> Interpretation:
+        """Return the interpretation of results by ``spec``.
+
+        Args:
+            spec: as ``interpret_as``.
+            own: whether the settings say it, beside the calibration.
+
+        Raises:
+            ConfigurationError: ``spec`` cannot be, or not with the calibration.
+        """
+        if isinstance(spec, Interpretation):
+            return spec
         known = self._interpretations.get(spec) if isinstance(spec, str) else None
         if known is not None:
             return known
         lenient, y_down = self.settings.lenient, self.settings.y_down
+        calibration = self.settings.calibration
         made = Interpretation(
-            spec, lenient=lenient, y_down=y_down, calibration=self.settings.calibration
+            spec, lenient=lenient, y_down=y_down, calibration=calibration, own=own
         )
         if isinstance(spec, str) and len(self._interpretations) < MAX_INTERPRETATIONS:
             self._interpretations[spec] = made
@@ -854,6 +1158,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         over = self._over()
         if over is not None:
             queue.end(over[0])
+        queue.keep(self)
         subscribers.add(queue)
         self._listens(subscribers)
         return queue

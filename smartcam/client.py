@@ -24,7 +24,7 @@ from smartcam._client.status import StatusRequests, is_ready
 from smartcam._client.supervisor import Supervisor
 from smartcam._client.triggering import TriggerRequest, Triggers
 from smartcam._client.waits import Waits
-from smartcam.camera import DEFAULT_RECONNECT_TIMEOUT, Camera
+from smartcam.camera import Camera
 from smartcam.exceptions import (
     ConnectionClosedError,
     InterpretationError,
@@ -34,15 +34,15 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.models import Capabilities, Result, Status, ValueT
+from smartcam.protocols import Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Iterable
     from typing import Self
 
     from smartcam.observers import Observer
-    from smartcam.settings import CameraSettings
+    from smartcam.settings import Address, CameraSettings
 
 
 __all__ = ["SmartCamera"]
@@ -63,14 +63,12 @@ class SmartCamera(Camera[ValueT]):
         self._connection = connection = Connection(settings.name, waits)
         patience, limit = settings.request_timeout, settings.switch_timeout
         self._requests = requests = Requests(connection, waits, state, patience, limit)
-        polling = Polling(connection, state, waits, listeners, patience)
+        polling = Polling(connection, requests, state, waits, listeners, patience)
         self._status = status = StatusRequests(connection, requests, polling, state, waits)
         self._commands = commands = Commands(connection, requests, status, state)
-        self._results = results = Results(
-            settings.name, self._default, requests, state, listeners, counters
-        )
+        self._results = results = Results(settings.name, self._default, state, listeners, counters)
         self._dispatch = Dispatch(
-            settings.name, state, waits, results, listeners, requests, polling, counters
+            settings.name, state, waits, results, listeners, requests, counters
         )
         self._triggers = Triggers(
             connection, requests, status, commands, results, state, waits, polling
@@ -93,6 +91,15 @@ class SmartCamera(Camera[ValueT]):
     def _make_state(self) -> CameraState:
         return CameraState(self.settings.name, self.settings.application, self._listeners)
 
+    def _go_to(self, address: Address) -> None:
+        """Have sessions at another address than the settings say; before it is opened."""
+        self.settings: CameraSettings = self.settings.model_copy(update={"address": address})
+        self._supervisor.go_by(self.settings)
+
+    def _read_by(self, spec: object) -> None:
+        super()._read_by(spec)
+        self._results.interpretation = self._default
+
     def _require_session(self) -> None:
         self._connection.require_link()
 
@@ -101,6 +108,10 @@ class SmartCamera(Camera[ValueT]):
 
     def _listens(self, subscribers: object) -> None:
         self._status.wanted()
+
+    def _abandoned(self) -> bool:
+        supervisor: Supervisor | None = getattr(self, "_supervisor", None)
+        return supervisor is not None and supervisor.abandon()
 
     def _over(self) -> tuple[SmartCamError | None] | None:
         end = self._waits.end
@@ -124,7 +135,7 @@ class SmartCamera(Camera[ValueT]):
     async def close(self) -> None:
         await self._supervisor.close()
 
-    async def wait_connected(self, timeout: float = DEFAULT_RECONNECT_TIMEOUT) -> None:
+    async def _wait_connected(self, timeout: float) -> None:
         await self._supervisor.wait_connected(self._connection.deadline(timeout), timeout)
 
     @property
@@ -157,17 +168,15 @@ class SmartCamera(Camera[ValueT]):
             raise self._supervisor.closed_error()
         return session.dialect.capabilities
 
-    async def wait_status(
-        self, predicate: Callable[[Status], bool], timeout: float = 10.0
-    ) -> Status:
-        self._connection.require_link()
+    async def _wait_status(self, predicate: Callable[[Status], bool], timeout: float) -> Status:
         deadline = self._connection.deadline(timeout)
+        self._connection.require_link()
         await self._status.refresh(deadline)
         return await self._status.until(predicate, deadline, "the status wanted", insist=False)
 
-    async def wait_ready(self, timeout: float = 10.0) -> Status:
-        self._connection.require_link()
+    async def _wait_ready(self, timeout: float) -> Status:
         deadline = self._connection.deadline(timeout)
+        self._connection.require_link()
         await self._status.refresh(deadline)
         predicate = is_ready if self._state.wanted.running else _is_not_busy
         return await self._status.until(predicate, deadline, "the camera to be ready")
@@ -179,26 +188,24 @@ class SmartCamera(Camera[ValueT]):
         try:
             if application is not None:
                 async with lock.hold_in(application, timeout) as deadline:
-                    return await triggers.trigger(request, deadline)
+                    return await triggers.trigger(request, deadline, timeout)
             deadline = self._connection.deadline(timeout)
             await lock.turn(deadline, timeout)  # as hold() does, without an object for it
             try:
-                return await triggers.trigger(request, deadline)
+                return await triggers.trigger(request, deadline, timeout)
             finally:
                 lock.give_back()
         except ResponseTimeoutError as exc:
             raise TriggerTimeoutError(f"{exc}; no trigger was sent", waited=exc.waited) from exc
 
-    async def switch_application(
-        self, application: int | str, *, timeout: float | None = None
-    ) -> None:
-        limit = self.settings.switch_timeout if timeout is None else timeout
-        async with self._lock.hold(limit) as deadline:
+    async def _switch_application(self, application: int | str, timeout: float) -> None:
+        async with self._lock.hold(timeout) as deadline:
+            self._commands.load_request(application)
             await self._status.refresh(deadline)
             await self._commands.switch(application, deadline, start=self._commands.runs)
 
     @contextlib.asynccontextmanager
-    async def application(self, application: int) -> AsyncGenerator[Self]:
+    async def _in_application(self, application: int) -> AsyncGenerator[Self]:
         async with self._lock.hold(self.settings.switch_timeout) as deadline:
             before = await self._lock.enter(application, deadline)
         try:
@@ -208,42 +215,37 @@ class SmartCamera(Camera[ValueT]):
             raise
         await self._lock.leave_and_wait(before)
 
-    async def start(self, *, timeout: float = 10.0) -> None:
+    async def _start(self, timeout: float) -> None:
         async with self._lock.hold(timeout) as deadline:
             await self._commands.start(deadline)
 
-    async def stop(self, *, timeout: float = 10.0) -> None:
+    async def _stop(self, timeout: float) -> None:
         async with self._lock.hold(timeout) as deadline:
             await self._commands.stop(deadline)
 
-    async def query_application(self, *, timeout: float | None = None) -> int:
-        limit = self.settings.request_timeout if timeout is None else timeout
-        return await self._commands.query(self._connection.deadline(limit))
+    async def _query_application(self, timeout: float) -> int:
+        return await self._commands.query(self._connection.deadline(timeout))
 
-    async def query_status(self, *, timeout: float | None = None) -> Status:
-        limit = self.settings.request_timeout if timeout is None else timeout
+    async def _query_status(self, timeout: float) -> Status:
         self._connection.require(m.GetStatus)
-        await self._status.refresh(self._connection.deadline(limit))
+        await self._status.refresh(self._connection.deadline(timeout))
         return self._status.last
 
-    async def reset_errors(self, *, timeout: float | None = None) -> Status:
-        limit = self.settings.request_timeout if timeout is None else timeout
-        deadline = self._connection.deadline(limit)
+    async def _reset_errors(self, timeout: float) -> Status:
+        deadline = self._connection.deadline(timeout)
         await self._requests.command(m.ResetErrors(), deadline)
         await self._status.refresh(deadline)
         return self._status.last
 
-    async def read_image(self, *, timeout: float | None = None) -> bytes:
-        limit = self.settings.request_timeout if timeout is None else timeout
+    async def _read_image(self, timeout: float) -> bytes:
         self._connection.require(m.ReadImage)
-        image = await self._requests.ask(m.ReadImage(), m.Image, self._connection.deadline(limit))
+        image = await self._requests.ask(m.ReadImage(), m.Image, self._connection.deadline(timeout))
         self._requests.check(m.ReadImage, image)
         return image.data
 
-    async def get_clock(self, *, timeout: float | None = None) -> datetime:
-        limit = self.settings.request_timeout if timeout is None else timeout
+    async def _get_clock(self, timeout: float) -> datetime:
         clock = await self._requests.ask(
-            m.GetClock(), m.ClockAnswer, self._connection.deadline(limit)
+            m.GetClock(), m.ClockAnswer, self._connection.deadline(timeout)
         )
         self._requests.check(m.GetClock, clock)
         fields = (clock.year, clock.month, clock.day, clock.hour, clock.minute, clock.second)
@@ -257,7 +259,7 @@ class SmartCamera(Camera[ValueT]):
                 got=fields,
             ) from exc
 
-    async def set_clock(self, when: datetime) -> None:
+    async def _set_clock(self, when: datetime) -> None:
         await self._tell(
             m.SetClock(
                 year=when.year,
@@ -269,10 +271,10 @@ class SmartCamera(Camera[ValueT]):
             )
         )
 
-    async def set_input(self, data: bytes) -> None:
-        await self._tell(m.SetInput(data=bytes(data)))
+    async def _set_input(self, data: bytes) -> None:
+        await self._tell(m.SetInput(data=data))
 
-    async def set_sequence_number(self, number: int) -> None:
+    async def _set_sequence_number(self, number: int) -> None:
         await self._tell(m.SetSequenceNumber(number=number))
         self._triggers.give_number(number)
 
@@ -287,19 +289,12 @@ class SmartCamera(Camera[ValueT]):
         link.abort(ConnectionResetError("the camera restarts"))
         self._dispatch.fail(link.lost_error())
 
-    async def request(
-        self,
-        message_id: int | str,
-        payload: bytes = b"",
-        *,
-        answered: bool | None = None,
-        timeout: float | None = None,
+    async def _request(
+        self, message_id: int | str, payload: bytes, answered: bool | None, timeout: float
     ) -> bytes | None:
         dialect = self._connection.dialect
-        raw = dialect.raw_request(message_id, bytes(payload))
-        deadline = self._connection.deadline(
-            self.settings.request_timeout if timeout is None else timeout
-        )
+        raw = dialect.raw_request(message_id, payload)
+        deadline = self._connection.deadline(timeout)
         if raw.answered if answered is None else answered:
             return dialect.body(await self._requests.exchange(raw.message, raw.answer, deadline))
         if raw.answered and raw.known:

@@ -96,7 +96,7 @@ class Status(enum.IntFlag):
 
     @property
     def loading(self) -> bool:
-        """Whether an application is being loaded: BUSY, and not running.
+        """True while an application is being loaded: BUSY, and not running.
 
         Source: BUSY is set meanwhile, and the application is stopped for it (SC manual p. 33, 34,
         published).
@@ -176,7 +176,7 @@ class Quaternion(NamedTuple):
 
 
 class Header(NamedTuple):
-    """Where and when a pose was seen.
+    """The place and time at which a pose was seen.
 
     Attributes:
         seq: the client's count of results (:attr:`Result.number`).
@@ -217,7 +217,7 @@ class Localization(NamedTuple):
 
 
 class Calibration(Protocol):
-    """What brings localizations into a robot's frame.
+    """An object that brings localizations into a robot's frame.
 
     The option ``calibration`` takes any object with this method, such as a
     :class:`~smartcam.calibration.PlaneCalibration`. If it has an attribute ``y_down`` that is not
@@ -278,7 +278,7 @@ class Result(NamedTuple, Generic[ValueT]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capabilities:
-    """What a camera can do in the dialect that it speaks; what it cannot is an UnsupportedError.
+    """The abilities of a camera in its dialect; calling one that it lacks: UnsupportedError.
 
     Attributes:
         dialect: the dialect's name.
@@ -401,7 +401,7 @@ class SubscriberStatistics:
 
 @dataclass(frozen=True, slots=True)
 class Histogram:
-    """How often a time fell into each of a row of bins.
+    """The number of times that fell into each of a row of bins.
 
     Attributes:
         bounds: upper bounds of the bins, seconds, each included; a last bin has none.
@@ -419,7 +419,7 @@ class Histogram:
 
     @property
     def count(self) -> int:
-        """How many there were in all."""
+        """Number of all values."""
         return sum(self.counts)
 
 

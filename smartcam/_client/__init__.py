@@ -1,1 +1,1 @@
-"""How a client works: from a link's bytes to who waits for what they say. Nothing is public."""
+"""The client's inside: from a link's bytes to the tasks that wait for them. Nothing is public."""

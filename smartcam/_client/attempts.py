@@ -16,12 +16,12 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols._base import Transport
+from smartcam.protocols import Transport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from smartcam.protocols._base import Protocol
+    from smartcam.protocols import Protocol
     from smartcam.settings import Address
 
 OPENING = "opening the link"
@@ -39,14 +39,15 @@ class Try:
     """One attempt: what was tried and how far it came.
 
     Attributes:
-        dialect: that was spoken; those that begin a session alike until it is known which.
+        dialect: name of the dialect spoken; the names of all that begin a session alike until the
+            camera's is known.
         transport: ``tcp`` or ``udp``.
-        step: what was waited for at last.
-        outcome: what came of it.
-        received: bytes that came.
-        hung_up: the other side ended the link without a byte.
-        error: why there is no session, None where there is one.
-        on_step: called with each new step.
+        step: name of the last step, which was waited for.
+        outcome: text that says how the attempt ended.
+        received: number of bytes received.
+        hung_up: True if the other side ended the link without a byte.
+        error: reason why there is no session, None where there is one.
+        on_step: function that is called with each new step.
     """
 
     dialect: str
@@ -60,7 +61,7 @@ class Try:
 
     @property
     def opened(self) -> bool:
-        """Whether there was a link at all."""
+        """True if there was a link at all."""
         return self.step != OPENING
 
     def reach(self, step: str) -> None:
@@ -88,7 +89,7 @@ class Try:
             self.outcome = str(error)
 
     def failed_with(self, *numbers: int) -> bool:
-        """Whether one of these errors of the system is behind it; a name has several addresses."""
+        """Return True if one of these system errors is the cause; a name has several addresses."""
         error = self.error
         if error is not None and isinstance(error.__cause__, OSError):
             error = error.__cause__
@@ -103,7 +104,7 @@ class Try:
 
 
 class Reason(NamedTuple):
-    """Why there may be no session. Its texts are filled in by :func:`words`."""
+    """A reason for which there may be no session. Its texts are filled in by :func:`words`."""
 
     fits: Callable[[Try], bool]  # whether it is this one, by what an attempt saw
     text: str  # what is wrong
@@ -188,7 +189,7 @@ def reason_for(tries: Sequence[Try]) -> tuple[Reason, Try]:
 
 
 def words(one: Try, address: Address, protocol: Protocol) -> dict[str, str]:
-    """Return what is filled into a reason's texts."""
+    """Return the words that the placeholders in a reason's texts stand for."""
     names = [transport.value for transport in protocol.schemes.values()]
     this, others = one.transport.upper(), [name for name in names if name != one.transport]
     return {

@@ -1,11 +1,11 @@
-"""What the camera is known to be, and what was asked of it; over all sessions of a client."""
+"""Keep the camera's known state and the state asked of it, over all sessions of a client."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.models import ApplicationChanged, Status
-from smartcam.protocols.messages import SwitchAnswer
+from smartcam.protocols.messages import UNNAMED_APPLICATION, SwitchAnswer
 
 if TYPE_CHECKING:
     from collections.abc import Container
@@ -20,7 +20,7 @@ _RUNNING_OR_BUSY = int(Status.RUNNING | Status.BUSY)
 
 
 class Wanted(NamedTuple):
-    """What was asked of the camera.
+    """The application and run state that the camera was asked for.
 
     Attributes:
         application: the application that was named, None where none was.
@@ -36,20 +36,22 @@ class CameraState:
 
     Args:
         name: the camera's name.
-        application: the one that results are expected from, None for any.
-        listeners: who is told of another application.
-        shared: others use the camera, too, each of whom may expect another one.
+        application: id of the application that results are expected from, None for any.
+        listeners: listeners to which a change of the application is reported.
+        shared: True if others use the camera, too, who may expect other applications.
 
     Attributes:
-        status: the last one, None before the first; after a loss the one of before.
-        bits: the same as a plain integer, 0 before the first.
-        endian: what the last status said of the byte order.
-        active: the application that is active as far as is known.
-        wanted: what was asked of the camera.
-        expected: the application that results are to be of, whoever gets them; None for any.
-        active_in_doubt: somebody else loaded an application.
-        loads_by_others: how often somebody else did.
-        statuses_heard: how many statuses have come.
+        status: last status, also after the link is lost; None before the first.
+        bits: last status as a plain integer, 0 before the first.
+        endian: byte order in the last status.
+        active: id of the application that is active as far as is known.
+        wanted: id of the application that the camera was asked to load.
+        expected: id of the application that results must come from, whoever gets them; None for
+            any.
+        active_in_doubt: True after somebody else loaded an application.
+        loads_by_others: number of times that somebody else loaded an application.
+        statuses_heard: number of statuses received.
+        status_asked_at: loop time at which the camera was last asked for its status.
     """
 
     def __init__(
@@ -64,6 +66,8 @@ class CameraState:
         self.active_in_doubt: bool = False
         self.loads_by_others: int = 0
         self.statuses_heard: int = 0
+        self.status_asked_at: float = 0.0
+        self._statuses_due = 0  # that will have come once every question for one is answered
         self._name = name
         self._listeners = listeners
         self._told: int | None = None  # the last status of this session
@@ -72,16 +76,18 @@ class CameraState:
     def begin_session(self) -> None:
         """Forget what only the session before has told."""
         self._told, self.active_in_doubt = None, False
+        self._statuses_due = self.statuses_heard
 
     def report(self, report: StatusReport, awaited: Container[object]) -> int | None:
         """Take a status.
 
         Args:
-            report: it.
-            awaited: the kinds of answers that are awaited, one to a switch of ours among them.
+            report: report of the status.
+            awaited: kinds of the answers that are awaited; a switch of ours is known by the kind
+                of its answer.
 
         Returns:
-            The one before, None where there was none in this session.
+            The status before, None where this session had none.
         """
         status = report.status
         # int(status) costs three times as much, with each status that comes
@@ -99,6 +105,26 @@ class CameraState:
             self.active_in_doubt = True
             self.loads_by_others += 1
         return was
+
+    @property
+    def owes_status(self) -> bool:
+        """True if the camera was asked for its status, and has not answered as often."""
+        return self.statuses_heard < self._statuses_due
+
+    def status_asked(self, now: float, count: int = 1) -> None:
+        """Note that the camera was asked for its status: it owes so many more."""
+        self.status_asked_at = now
+        self._statuses_due = max(self._statuses_due, self.statuses_heard) + count
+
+    def status_lost(self) -> None:
+        """Note that what the camera owes will not come."""
+        self._statuses_due = self.statuses_heard
+
+    @property
+    def active_text(self) -> str:
+        """Name of the active application for texts; a job of a camera may have none of the ids."""
+        unnamed = self.active is None or self.active == UNNAMED_APPLICATION
+        return "the active application" if unnamed else f"application {self.active}"
 
     def set_active(self, application: int, at: datetime) -> None:
         """Note which application is active."""

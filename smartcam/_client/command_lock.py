@@ -1,4 +1,4 @@
-"""Whose turn it is: one command at a time, and going back after a temporary switch.
+"""Run one command at a time, and go back after a temporary switch.
 
 Going back to the application before is a job of the session's task group: it is finished even
 when the caller was cancelled, it is bounded, and every later command waits for it. One that a lost
@@ -17,7 +17,7 @@ from smartcam.exceptions import LinkError, ResponseTimeoutError, SmartCamError
 from smartcam.models import Status
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Coroutine
+    from collections.abc import AsyncGenerator, Callable, Coroutine
     from types import TracebackType
     from typing import Any
 
@@ -32,7 +32,7 @@ logger: logging.Logger = logging.getLogger("smartcam.client")
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """What to go back to.
+    """The state to go back to.
 
     Attributes:
         application: id of the application that was active.
@@ -84,7 +84,7 @@ class CommandLock:
 
     @contextlib.asynccontextmanager
     async def session(self, *, restore: bool) -> AsyncGenerator[asyncio.TaskGroup]:
-        """A session is there as long as the body runs; ends when its jobs have.
+        """Have a session while the body runs; end when the jobs of the session have ended.
 
         Gives the group of the session's tasks.
 
@@ -185,6 +185,7 @@ class CommandLock:
     async def enter(self, application: int, deadline: float) -> Before:
         """Have ``application`` running; the turn is held. Goes back where that fails."""
         commands = self._commands
+        commands.check_id(application)
         active = await commands.query_loaded(deadline)
         before = Before(active, commands.runs, self._state.wanted)
         try:
@@ -223,6 +224,49 @@ class CommandLock:
             await asyncio.wait({job})
             self._raise_failed()
 
+    async def load_again(self, needed: Callable[[], bool], timeout: float) -> None:
+        """Load the active application again, which empties the camera's queue of input data.
+
+        Args:
+            needed: whether it is still to be done, once the turn is there.
+            timeout: seconds to wait for it.
+
+        Raises:
+            SmartCamError: what stood in the way.
+            ResponseTimeoutError: it takes longer.
+
+        Cancellation: it is finished nevertheless, as after the timeout.
+        """
+        job = self._start_job("loading_again", self._load_again(needed))
+        if job is None:
+            return
+        done, _ = await asyncio.wait({job}, timeout=timeout)
+        if not done:
+            raise ResponseTimeoutError(
+                f"{self._connection.name}: input data of an earlier trigger may still be queued; "
+                f"loading the application again, which empties the queue, takes over {timeout:g} s",
+                waited=timeout,
+            )
+        self._raise_failed()
+
+    async def _load_again(self, needed: Callable[[], bool]) -> None:
+        """Load the active application again, and have it run if it ran; never raises."""
+        commands, wanted = self._commands, self._state.wanted
+        async with self._lock:
+            if not needed():
+                return
+            logger.info("%s: loaded again, to empty its queue of input", self._connection.name)
+            try:
+                deadline = self._connection.deadline(self._switch_timeout)
+                active = await commands.query_loaded(deadline)
+                await commands.switch(active, deadline, start=commands.runs)
+            except SmartCamError as error:
+                logger.warning("%s ! loading again failed: %s", self._connection.name, error)
+                if not self._is_loss(error):
+                    self._failed = error
+            finally:
+                self._state.want(wanted)
+
     async def settle(self) -> None:
         """Wait until every job that goes back is done.
 
@@ -239,6 +283,7 @@ class CommandLock:
 
     async def _go_back(self, before: Before) -> None:
         """Restore application and run state; never raises."""
+        await self._adopted()
         async with self._lock:
             try:
                 await self._have(before.application, before.running)
@@ -256,6 +301,7 @@ class CommandLock:
 
         Where the link is lost again the next session does it.
         """
+        await self._adopted()
         wanted = self._state.wanted
         async with self._lock:
             try:
@@ -267,8 +313,13 @@ class CommandLock:
             finally:
                 self._state.want(wanted)
 
+    async def _adopted(self) -> None:
+        """Wait until the session of a job is adopted: an eager task begins in front of that."""
+        if self._waits.end is not None:
+            await asyncio.sleep(0)
+
     def _is_loss(self, error: SmartCamError) -> bool:
-        """Whether the link is lost, an answer that did not come included: it costs the link."""
+        """Return True if the link is lost, which an answer that did not come causes, too."""
         link = self._connection.link
         return isinstance(error, LinkError) or (link is not None and link.lost)
 

@@ -1,4 +1,4 @@
-"""What the camera is told to do: start, stop, load another application.
+"""Command the camera: start, stop, load another application.
 
 Every ``deadline`` is loop time. Whose command it is (one at a time) is the command lock's business.
 """
@@ -12,8 +12,8 @@ from smartcam._client.handshake import code_text
 from smartcam._client.status import is_ready
 from smartcam.exceptions import CommandRejectedError, ConfigurationError
 from smartcam.models import Status
+from smartcam.protocols import Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,14 +43,14 @@ class Commands:
         self._halted_at: int | None = None  # loads by others when a trigger's fence stopped it
 
     def begin_session(self, link: Link) -> None:
-        """A new session: nothing is owed on it, its status is heard."""
+        """Begin a session: nothing is owed on it, its status is heard."""
         self._connection.begin_session(link)
         self._requests.begin_session()
         self._status.begin_session()
         self.unconfirmed = False
 
     def end_session(self) -> None:
-        """The session is over: nothing is asked any more."""
+        """End the session: nothing is asked any more."""
         self._status.end_session()
 
     @property
@@ -59,7 +59,7 @@ class Commands:
         return self.is_halted() or Status.RUNNING in self._status.last
 
     def is_halted(self) -> bool:
-        """Whether a trigger's fence has stopped it, and neither it nor a load has ended that."""
+        """Return True if a trigger's fence has stopped the camera, and nothing restarted it."""
         return self._halted_at == self._state.loads_by_others
 
     # ------------------------------------------------------------------ run state
@@ -146,6 +146,7 @@ class Commands:
 
     async def ensure(self, application: int, deadline: float) -> None:
         """Have an application running and ready, by the least that is needed."""
+        self.check_id(application)
         if await self.query_loaded(deadline) != application:
             await self.switch(application, deadline, start=True)
             return
@@ -159,7 +160,7 @@ class Commands:
         """Stop if need be, switch, wait until not BUSY, start if wanted.
 
         Args:
-            application: its id, or the name of its file.
+            application: id of the application, or the name of its file.
             deadline: loop time.
             start: enter run mode afterwards, where there is one.
 
@@ -167,7 +168,7 @@ class Commands:
             UnsupportedError: the dialect loads no applications, or none by name.
             CommandRejectedError: the camera refused; the old application runs again if it ran.
         """
-        request = self._load_request(application)
+        request = self.load_request(application)
         dialect = self._connection.dialect
         stops = dialect.has(m.Stop)
         was_running = self.runs and stops
@@ -216,7 +217,13 @@ class Commands:
         told = answer.application in self._connection.dialect.application_ids
         return answer.code, answer.application if told else self._state.active
 
-    def _load_request(self, application: int | str) -> m.Request:
+    def load_request(self, application: int | str) -> m.Request:
+        """Return the request that loads an application; send nothing.
+
+        Raises:
+            ConfigurationError: the dialect can have no such application.
+            UnsupportedError: it loads none, or none by name.
+        """
         name = self._connection.name
         if isinstance(application, str):
             self._connection.require(m.LoadFile)
@@ -224,12 +231,21 @@ class Commands:
                 raise ConfigurationError(f"{name}: {application!r} is no file's name")
             return m.LoadFile(name=application.encode())
         self._connection.require(m.SwitchApplication)
+        self.check_id(application)
+        return m.SwitchApplication(application=application)
+
+    def check_id(self, application: int) -> None:
+        """Check that the dialect may have an application; 0 is the camera's to refuse.
+
+        Raises:
+            ConfigurationError: it has no such id.
+        """
         ids = self._connection.dialect.application_ids
         if application != 0 and application not in ids:
             raise ConfigurationError(
-                f"{name}: application id {application} is not {ids.start} to {ids.stop - 1}"
+                f"{self._connection.name}: application id {application} is not {ids.start} to "
+                f"{ids.stop - 1}"
             )
-        return m.SwitchApplication(application=application)
 
 
 def _is_not_loading(status: Status) -> bool:

@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import ConfigurationError, ConnectionClosedError
+from smartcam._arguments import check_seconds
+from smartcam.exceptions import ConnectionClosedError
+from smartcam.protocols import Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
 
 if TYPE_CHECKING:
     from smartcam._client.link import Link
     from smartcam._client.waits import Waits
-    from smartcam.protocols._base import Dialect
+    from smartcam.protocols import Dialect
 
 
 @dataclass(slots=True)
 class Features:
-    """What the protocol of a session has, as far as it matters in every trigger.
+    """The features of a session's protocol that matter in every trigger.
 
     Attributes:
         ordered: messages come in order and none is lost (TCP).
         numbered: a trigger may be given a sequence number.
         acknowledged: a trigger is answered.
         polled: the status is told when it is asked for, not by itself.
-        fences: a Query in front of a trigger tells what is older.
-        confirms: a status behind its answer tells whether a trigger was taken.
+        fences: a Query goes out with each trigger, and what the camera says around its answer
+            shows whether it took the trigger.
+        shows_triggers: the status tells of each trigger that is taken.
+        ends_triggers: a trigger that brings nothing is ended before its deadline.
     """
 
     ordered: bool = True
@@ -35,23 +37,24 @@ class Features:
     acknowledged: bool = False
     polled: bool = False
     fences: bool = False
-    confirms: bool = False
+    shows_triggers: bool = True
+    ends_triggers: bool = False
 
     @staticmethod
     def of(link: Link) -> Features:
-        """Return those of a link's session."""
+        """Return the features of a link's session."""
         dialect = link.machine.dialect
         ordered = link.machine.transport is Transport.TCP
         polled = not dialect.capabilities.status_by_itself
         acknowledged = dialect.has(m.TriggerAnswer)
-        fences = ordered and not dialect.in_order  # who does one thing after the other needs none
         return Features(
             ordered=ordered,
             numbered=dialect.has(m.SetSequenceNumber),
             acknowledged=acknowledged,
             polled=polled,
-            fences=fences,
-            confirms=fences and acknowledged and polled,
+            fences=ordered and not dialect.in_order,  # there the answer itself is enough
+            shows_triggers=dialect.shows_triggers,
+            ends_triggers=dialect.has(m.EndTrigger),
         )
 
 
@@ -98,7 +101,7 @@ class Connection:
 
     @property
     def dialect(self) -> Dialect:
-        """What is spoken in this session.
+        """Dialect of this session.
 
         Raises:
             LinkError: there is none.
@@ -121,7 +124,5 @@ class Connection:
         Raises:
             ConfigurationError: it is no finite number of seconds, 0 or more.
         """
-        if not 0 <= timeout < math.inf:
-            raise ConfigurationError(f"{self.name}: timeout {timeout!r} is no number of seconds")
         loop = self._loop or asyncio.get_running_loop()
-        return loop.time() + timeout
+        return loop.time() + check_seconds(timeout, "timeout", self.name)

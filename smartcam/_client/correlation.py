@@ -1,22 +1,27 @@
-"""Whose result is it? The wire carries no correlation; this is what stands in for it.
+"""Decide to which trigger a result belongs, since the wire carries no correlation.
 
-A trigger has a *fence* in front of it, in the same write: a Query. The camera does one message
-after the other and says things in order (inferred), so what comes before the fence's answer is
-older than the trigger. Behind it, an inspection of the trigger's begins with Waiting for Trigger
-going away, as at each trigger that is taken (a status comes after every change: SC manual p. 29,
-published); a container that comes before that is none of its. Where the status has to be asked for
-(``bid``), one behind the answer to the trigger confirms that it was taken, before its results are
-told. So what another inspection says that began before the trigger was sent is never taken for the
-trigger's, whoever began it.
+A container is a trigger's result only where what the camera says shows that it took this trigger
+(:class:`TriggerEvidence` and the classes behind it). That nothing speaks against it is not enough.
 
-Where the layout of the trigger has an ``@sequence`` field, the number decides as well: it was set
-with Set sequence number right before the trigger, and only the container that carries it is its
-result. A wide number of our own needs neither fence nor drop; one that somebody else's run may
-carry, since it is narrow or the user's own, does.
+Where every status is told (TCP, all dialects but ``bid``), a Query goes out in front of the trigger
+and one behind it, in the same write. The camera does one message after the other and says things in
+order (inferred). Waiting for Trigger goes away whenever an inspection begins, and Overtriggered
+rises whenever a trigger is dropped (a status comes after every change: SC manual p. 29, published).
+So where exactly one inspection begins between the two answers, and Overtriggered was clear all the
+time, that inspection is the trigger's. Its results come behind its beginning and before the next
+one's. Where two begin, nobody can tell whose each is.
+
+Where the status has to be asked for (``bid``), the trigger itself is answered, which is the fence:
+what comes before that is older. The status is asked for in front of the trigger and behind it, in
+the same write: the first one has to say that the camera waits for a trigger, the second one that it
+has dropped none, which it would say until it is reset.
+
+Where the layout of the trigger has an ``@sequence`` field, the number has to be right, too: it is
+set with Set sequence number right before the trigger.
 
 A trigger that was given up leaves a *debt*; the next trigger settles it first
-(:meth:`~smartcam._client.triggering.Triggers.trigger`). Only what comes behind the fence of the
-trigger that was given up, and after its inspection began, pays it.
+(:meth:`~smartcam._client.triggering.Triggers.trigger`). Only what comes after the inspection of the
+trigger that was given up began pays it.
 """
 
 from __future__ import annotations
@@ -29,39 +34,149 @@ from smartcam.models import Status
 Debt = Literal["late", "streamed"]
 
 NUMBER_STEP = 1000
-"""Distance of the numbers of two triggers, downwards: runs that somebody else triggers in between
-count up from ours, away from the next of ours."""
+"""Step by which each trigger's number is lower than the number of the trigger before.
+
+Runs that somebody else triggers in between count up from our number, away from the next one.
+"""
 
 FEWEST_NUMBERS = 64
-"""Triggers until a narrow field's numbers begin again; its step is smaller for that."""
+"""Triggers at least before the numbers of a narrow field repeat; its step is made smaller."""
 
-WIDE = (1 << 31) - 1
-"""Largest number of a field that is wide enough: nobody else's run carries ours by chance."""
+RANGE_OF_FIRST_NUMBER = (1 << 31) - 1
+"""Count of the numbers from which a new client draws its first one at random."""
 
 MAX_OWED = 1024
 """Given-up triggers that are remembered; an older one's result counts as streamed."""
 
 
-@dataclass(slots=True, eq=False)
-class Progress:
-    """How far the camera is with a trigger, as far as is heard.
+class TriggerEvidence:
+    """Evidence that the camera took one trigger; this class is for cameras that give none.
+
+    That is so over UDP, where statuses and their order may be lost, and where commands are done
+    one after the other, so that an answer needs no proof (In-Sight).
 
     Attributes:
-        reached: the fence was answered: what came before is older than the trigger. True from the
-            beginning where there is no fence.
-        confirmed: nothing says that it was not taken, where a status behind its answer would.
-        answered: that answer has come.
-        begun: Waiting for Trigger has dropped behind the fence.
-        over: it has dropped once more, for another inspection: what has no number is that one's.
-        shown: it has to drop: the camera did not wait for a trigger at the fence.
+        began: number of inspections that were seen to begin and may belong to the trigger. Where
+            every status is reported and ``proven`` is True, the first one does.
+        reached: True if whatever comes now is not older than the trigger.
+        proven: True if the camera took this trigger, as far as can be known.
+        doubtful: True if it can no longer be known which trigger the camera took.
     """
 
-    reached: bool = True
-    confirmed: bool = True
-    answered: bool = False
-    begun: bool = False
-    over: bool = False
-    shown: bool = False
+    __slots__ = ("began", "doubtful", "proven", "reached")
+
+    def __init__(self) -> None:
+        self.began = 0
+        self.reached = self.proven = True
+        self.doubtful = False
+
+    def on_query_answer(self) -> None:
+        """Note that a Query which was written with the trigger is answered."""
+
+    def on_trigger_answer(self) -> None:
+        """Note that the trigger itself is answered: the camera has heard it."""
+
+    def on_status(self, status: int) -> None:
+        """Note a status."""
+
+    def on_beginning(self) -> bool:
+        """Note that an inspection began; return True if it may be the trigger's."""
+        self.began += 1
+        return self.began == 1
+
+
+class EvidenceByAcknowledgement(TriggerEvidence):
+    """Evidence of a camera that answers each trigger which it takes: what came before is older."""
+
+    __slots__ = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached = self.proven = False
+
+    def on_trigger_answer(self) -> None:
+        """Note that the camera has taken the trigger."""
+        self.reached = self.proven = True
+
+
+class EvidenceByFence(TriggerEvidence):
+    """Evidence without statuses: whatever comes before the Query's answer is older.
+
+    That shows nothing of what comes behind it, which is why it has to be asked for.
+    """
+
+    __slots__ = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached = False
+
+    def on_query_answer(self) -> None:
+        """Note that the camera has taken the Query in front of the trigger."""
+        self.reached = True
+
+
+class EvidenceByStatus(TriggerEvidence):
+    """Evidence by every status, in order: the inspections between two Queries are counted.
+
+    A camera that answers the second Query before it shows an inspection is believed: what it shows
+    next is the trigger's.
+    """
+
+    __slots__ = ("_answers",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached = self.proven = False
+        self._answers = 0  # to the Queries in front of the trigger and behind it
+
+    def on_query_answer(self) -> None:
+        """Note an answer; at the second one, exactly one inspection has begun, or one will."""
+        self._answers += 1
+        self.proven = self._answers == 2 and self.began > 0
+
+    def on_beginning(self) -> bool:
+        """Count the inspection; two between the answers cannot be told apart."""
+        if not self._answers:
+            return False
+        self.began += 1
+        self.reached = self.began == 1
+        if self._answers == 2:
+            self.proven = True
+        else:
+            self.doubtful = self.began > 1
+        return self.reached
+
+
+class EvidenceByAnswer(TriggerEvidence):
+    """Evidence by the trigger's answer and the statuses asked for around it (``bid`` over TCP)."""
+
+    __slots__ = ("_queried", "_waited")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached = self.proven = False
+        self._queried = False
+        self._waited: bool | None = None  # as the first status behind the Query's answer says
+
+    def on_query_answer(self) -> None:
+        """Note that the next status was asked for in front of the trigger, or is as fresh."""
+        self._queried = True
+
+    def on_trigger_answer(self) -> None:
+        """Take the trigger's answer: earlier containers are older; a busy camera leaves a doubt."""
+        self.reached = True
+        self.doubtful = not self._waited
+
+    def on_status(self, status: int) -> None:
+        """See whether the camera waited for the trigger, and that it has dropped none."""
+        if self.reached:
+            if status & _OVERTRIGGERED:
+                self.doubtful = True
+            else:
+                self.proven = True
+        elif self._queried and self._waited is None:
+            self._waited = status & (_WAITING | _OVERTRIGGERED) == _WAITING
 
 
 @dataclass(slots=True, eq=False)
@@ -71,18 +186,16 @@ class SentTrigger:
     Attributes:
         wanted: how many results it is to have.
         number: sequence number set for it, None where its layout has none.
-        certain: no run of others may carry its number.
-        progress: how far the camera is with it.
+        evidence: what the camera has said of it.
         came: how many of its results came.
-        early: containers that came before its fence was answered.
+        early: containers that came before the camera showed that it had taken it.
         given_up: what it still misses is owed.
         ended: nobody waits for it any more.
     """
 
     wanted: int
     number: int | None
-    certain: bool
-    progress: Progress
+    evidence: TriggerEvidence
     came: int = field(init=False, default=0)
     early: int = field(init=False, default=0)
     given_up: bool = field(init=False, default=False)
@@ -91,23 +204,23 @@ class SentTrigger:
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """Whose a container is.
+    """The trigger to which a container belongs, if any.
 
     Attributes:
         fate: ``triggered``: of the trigger under way; ``late`` or ``streamed``: of one that was
-            given up; ``nobody``: of none of ours; ``held``: not known yet, see
-            :meth:`Correlation.on_query_answer`.
+            given up; ``nobody``: of none of ours.
         extra: of a trigger that has all its results.
     """
 
-    fate: Literal["triggered", "late", "streamed", "nobody", "held"]
+    fate: Literal["triggered", "late", "streamed", "nobody"]
     extra: bool = False
 
 
-OURS, HELD = Match("triggered"), Match("held")
+OURS = Match("triggered")
 NOBODYS, EXTRA = Match("nobody"), Match("nobody", extra=True)
 
 _WAITING, _RUNNING = int(Status.WAITING_FOR_TRIGGER), int(Status.RUNNING)
+_OVERTRIGGERED = int(Status.OVERTRIGGERED)
 
 
 @dataclass(slots=True, eq=False)
@@ -117,7 +230,7 @@ class _Owed:
     fate: Debt
     number: int | None
     missing: int
-    progress: Progress
+    evidence: TriggerEvidence
 
 
 class Correlation:
@@ -138,14 +251,13 @@ class Correlation:
     def __init__(self, chance: float) -> None:
         self.pending: SentTrigger | None = None
         self.doubted: bool = False
-        self._ordered = False
-        self._drops_waiting: bool | None = None  # whether it shows a trigger; None: not known yet
+        self._complete = False  # every status is told, in order
         self.satisfied: bool = False
-        self._last: Progress | None = None  # of the last trigger, until it has its results
+        self._last: TriggerEvidence | None = None  # of the last trigger, until it has its results
         self.owed: list[_Owed] = []
         self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
         self._last_number: int | None = None  # of the last trigger that had its results
-        self._turn = int(chance * WIDE)
+        self._turn = int(chance * RANGE_OF_FIRST_NUMBER)
         self._given: int | None = None
 
     @property
@@ -155,62 +267,68 @@ class Correlation:
 
     # ------------------------------------------------------------------ the session
 
-    def begin_session(self, *, ordered: bool) -> None:
-        """A new link: what earlier triggers owe may still come over it."""
-        self._ordered = ordered
+    def begin_session(self, *, complete: bool) -> None:
+        """Begin on a new link: what earlier triggers owe may still come over it.
+
+        Args:
+            complete: every change of the status is told, in order.
+        """
+        self._complete = complete
         self.satisfied = self.doubted = False
         self._last = None
         for one in self.owed:  # whether it began may have been told to nobody
-            one.progress = Progress(begun=True)
+            one.evidence = TriggerEvidence()
+            one.evidence.began = 1
 
     def settled(self) -> None:
-        """Nothing of before can come: the application was stopped, and all of that was heard."""
+        """Note that no older result can come, since the application was stopped."""
         self.owed.clear()
         self.satisfied = self.doubted = False
         self._last = None
 
     def heard(self) -> None:
-        """All that the camera said before now is heard, a Query that was sent since is answered.
+        """Note that everything said before now is heard, since a later Query is answered.
 
         A trigger that would have shown by now, and has not, was not taken: nothing of it comes.
         """
         self.doubted = False
-        if self._ordered and self._drops_waiting:
-            self.owed = [one for one in self.owed if one.progress.begun]
+        if self._complete:
+            self.owed = [one for one in self.owed if one.evidence.began]
             self._last = None
 
     # ------------------------------------------------------------------ the trigger
 
-    def take_number(self, highest: int) -> tuple[int, bool]:
-        """Return the next trigger's number, and whether nobody else's run may carry it.
+    def take_number(self, highest: int) -> int:
+        """Return the next trigger's number: the one that the user has set, or ours.
 
-        It is the one that the user has set, or ours, 0 to ``highest``.
+        Args:
+            highest: largest number that the field holds.
         """
         given, self._given = self._given, None
         used = given is None or given in self._given_up or given == self._last_number
         if given is not None and given <= highest and not used:
-            return given, False
+            return given
         step = min(NUMBER_STEP, (highest + 1) // FEWEST_NUMBERS)
         self._turn -= step
-        return self._turn % (highest + 1), highest >= WIDE
+        return self._turn % (highest + 1)
 
     def give_number(self, number: int) -> None:
-        """The user has set the number of the next run."""
+        """Note that the user has set the number of the next run."""
         self._given = number
 
     def send(self, pending: SentTrigger) -> None:
-        """A trigger is sent now."""
+        """Note that a trigger is sent now."""
         self.pending, self.satisfied = pending, False
-        self._last = pending.progress
+        self._last = pending.evidence
         if pending.number is None:
             self._given = None  # its run has it
 
     def leave(self) -> None:
-        """The trigger's caller goes on."""
+        """Note that the trigger's caller goes on."""
         self.pending = None
 
     def done(self, pending: SentTrigger) -> None:
-        """The trigger has all its results."""
+        """Note that the trigger has all its results."""
         self.satisfied, self._last_number = True, pending.number
         self._last = None
 
@@ -222,12 +340,13 @@ class Correlation:
             fate: of what still comes.
             unread: containers of it that came and could not be interpreted.
         """
-        missing = pending.wanted - pending.came - unread
+        came = pending.came if pending.evidence.proven else 0  # they may be somebody else's
+        missing = pending.wanted - came - unread
         if pending.given_up or missing <= 0:
             return
         pending.given_up = True
-        self.doubted = self.doubted or not pending.progress.begun
-        self.owed.append(_Owed(fate, pending.number, missing, pending.progress))
+        self.doubted = self.doubted or not pending.evidence.began
+        self.owed.append(_Owed(fate, pending.number, missing, pending.evidence))
         del self.owed[:-MAX_OWED]
         if pending.number is not None:
             self._given_up[pending.number] = fate
@@ -236,26 +355,15 @@ class Correlation:
 
     # ------------------------------------------------------------------ what comes
 
-    def on_fence(self, status: int) -> None:
-        """The Query in front of the last trigger is answered; the status is as it is now."""
-        run = self._last
-        if run is not None:
-            run.reached, run.shown = True, self._ordered and not status & _WAITING
-
     def on_query_answer(self) -> None:
-        """A Query is answered that was sent behind the last trigger.
-
-        A camera that shows the trigger has done so by now. Of one that was never seen to, it is
-        known now that it does not, and a container that was held for that is the trigger's.
-        """
-        run = self._last
-        if run is not None and run.reached and not run.begun and self._drops_waiting is None:
-            self._drops_waiting = False
-
-    def on_answer(self) -> None:
-        """The last trigger itself is answered; a status behind that confirms it."""
+        """Note that a Query which was written with the last trigger is answered."""
         if self._last is not None:
-            self._last.answered = True
+            self._last.on_query_answer()
+
+    def on_trigger_answer(self) -> None:
+        """Note that the last trigger itself is answered, and was not refused."""
+        if self._last is not None:
+            self._last.on_trigger_answer()
 
     def on_status(self, previous: int | None, status: int) -> bool:
         """Note where an inspection begins: Waiting for Trigger drops while running.
@@ -268,56 +376,44 @@ class Correlation:
             Whether it is one that somebody else has triggered.
         """
         last = self._last
-        if last is not None and last.answered:
-            last.confirmed = True
+        if last is not None:
+            last.on_status(status)
         if status & _WAITING or not status & _RUNNING:
             return False
         if previous is not None and not previous & _WAITING:
             return False
-        if previous is not None:
-            self._drops_waiting = True
-        if last is not None and last.reached and not last.begun:
-            last.begun = True
+        if last is not None and last.on_beginning():
             self.doubted = False
             return False
-        if last is not None and last.begun:
-            last.over = self._ordered
         self.satisfied = False
         self._given = None  # that run has it
-        return self._ordered and previous is not None
+        return self._complete and previous is not None
+
+    def judge_told(self, asked: bool) -> Match:
+        """Return the same where the wire says whether a trigger of ours was answered."""
+        pending = self.pending
+        if not asked:
+            return NOBODYS
+        if pending is not None and not pending.ended:
+            return OURS if pending.came < pending.wanted else EXTRA
+        return Match(self._pay(self.owed[:1]))
 
     def judge(self, number: int | None) -> Match:
-        """Say whose a container of the right application is.
+        """Return the trigger that a container of the right application belongs to.
 
         Args:
-            number: its sequence number, None where it has none or none of ours is about.
+            number: sequence number of the container, None where the container has none or no
+                trigger of ours waits.
         """
         pending = self.pending
         if pending is not None and not pending.ended:
-            if not pending.progress.reached:
-                pending.early += 1
-            elif pending.came == pending.wanted:
-                pass  # all are there, and are still to be confirmed
-            elif pending.certain and number is not None:
-                if number == pending.number:
-                    return OURS
-            elif number is None or pending.number is None or number == pending.number:
-                run = pending.progress
-                known = number is not None and pending.number is not None
-                if (
-                    (run.begun and (known or not run.over))
-                    or not self._ordered
-                    or (self._drops_waiting is False and not run.shown)
-                ):
-                    return OURS
-                if self._drops_waiting is None and not run.shown:
-                    return HELD
+            numbered = number is not None and pending.number is not None
+            if not numbered or number == pending.number:
+                if pending.evidence.reached:
+                    return OURS if pending.came < pending.wanted else EXTRA
+                if not pending.evidence.began:
+                    pending.early += 1
         return self.judge_older(number)
-
-    def _may_pay(self, run: Progress) -> bool:
-        """Whether a container that comes now may be of a run: where it shows, it has begun."""
-        shows = self._ordered and self._drops_waiting
-        return run.begun or (run.reached and not run.shown and not shows)
 
     def judge_older(self, number: int | None) -> Match:
         """Say the same of one that is known not to be of the trigger under way."""
@@ -331,14 +427,18 @@ class Correlation:
             open_ = [
                 one
                 for one in self.owed
-                if (number is None or one.number is None) and self._may_pay(one.progress)
+                if (number is None or one.number is None) and self._may_pay(one.evidence)
             ]
             if open_:
                 return Match(self._pay(open_))
         return EXTRA if self.satisfied and number is None else NOBODYS
 
+    def _may_pay(self, run: TriggerEvidence) -> bool:
+        """Return True if a container that comes now may be from a run that has begun."""
+        return bool(run.began) or (run.reached and not self._complete)
+
     def _pay(self, owed: list[_Owed]) -> Debt:
-        """One result of the first of these has come."""
+        """Note that one result of the first of these debts has come."""
         if not owed:
             return "late"
         owed[0].missing -= 1

@@ -1,4 +1,4 @@
-"""What a client counts, over all its sessions."""
+"""The counters of a client, over all its sessions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 from typing import TYPE_CHECKING
 
 from smartcam.models import HISTOGRAM_BOUNDS, Histogram, Statistics
-from smartcam.protocols._framed.machine import Counters
+from smartcam.protocols import Counters
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -52,7 +52,7 @@ class Times:
 
 
 class ClientCounters:
-    """What one client has counted.
+    """The counters of one client.
 
     Attributes:
         fates: what became of result containers; their sum is ``received``.
@@ -113,7 +113,7 @@ class ClientCounters:
         self._open = wire
 
     def end(self) -> None:
-        """The link is over; its counters are kept."""
+        """Keep the counters of a link that is over."""
         self._wire, self._open = self._wire_total(), None
 
     def statistics(self, subscribers: Iterable[SubscriberStatistics]) -> Statistics:

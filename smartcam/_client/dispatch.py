@@ -1,4 +1,4 @@
-"""What comes from the camera, handed to who waits for it.
+"""Hand what comes from the camera to whoever waits for it.
 
 The receive task hands every chunk to :meth:`Dispatch.dispatch`, which never waits: an answer
 completes its request, a status is shown to every predicate in order, a result gets exactly one fate
@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from smartcam._client.waits import told
 from smartcam.exceptions import ConnectionClosedError
 from smartcam.models import Status, StatusChanged
+from smartcam.protocols import Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Verdict
-from smartcam.protocols._framed.machine import ResultBurst
+from smartcam.protocols._inside import ResultBurst
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -25,13 +26,13 @@ if TYPE_CHECKING:
     from smartcam._client.counters import ClientCounters
     from smartcam._client.link import Chunk
     from smartcam._client.listeners import Listeners
-    from smartcam._client.polling import Polling
     from smartcam._client.requests import Requests
     from smartcam._client.results import Results
     from smartcam._client.waits import Waits
     from smartcam.exceptions import SmartCamError
-    from smartcam.protocols._base import Dialect
-    from smartcam.protocols._framed.machine import Event
+    from smartcam.layout import Layout
+    from smartcam.protocols import Dialect
+    from smartcam.protocols._inside import Event
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -51,7 +52,6 @@ class Dispatch:
     _results: Results
     _listeners: Listeners
     _requests: Requests
-    _polling: Polling
     _counters: ClientCounters
 
     def __post_init__(self) -> None:
@@ -64,15 +64,21 @@ class Dispatch:
             m.QueryAnswer: self._on_active,
             m.SwitchAnswer: self._on_switched,
             m.TriggerAnswer: self._on_trigger_answer,
+            m.Notice: self._on_notice,
         }
 
+    @property
+    def layout(self) -> Layout | None:
+        """Layout that results are read with; None where there is none, or several."""
+        return self._results.interpretation.layout
+
     def begin_session(self, dialect: Dialect, *, ordered: bool) -> None:
-        """A new session; ``ordered`` where messages come in order and none is lost (TCP)."""
+        """Begin a session; ``ordered`` where messages come in order and none is lost (TCP)."""
         self._dialect = dialect
         self._waits.begin_session()
         self._state.begin_session()
         # where the status has to be asked for, changes of it are missed
-        complete = ordered and dialect.capabilities.status_by_itself
+        complete = ordered and dialect.capabilities.status_by_itself and dialect.shows_triggers
         self._results.begin_session(ordered=ordered, complete=complete)
 
     def dispatch_early(self, chunks: Iterable[Chunk]) -> None:
@@ -100,29 +106,29 @@ class Dispatch:
             if take is not None:  # LinkFailed and LinkEnded: the receive task ends by them
                 take(event, now, at)
             if answers and isinstance(event, m.Message):
-                self._waits.on_message(event, now)
+                self._waits.on_message(event, now, chunk.delivery)
 
     def _ask_in_doubt(self) -> None:
         if self._state.active_in_doubt:
             self._requests.ask_what_is_active()
 
     def _only_streams(self) -> bool:
-        """Whether nobody looks at statuses, and containers go to streams whatever statuses say."""
+        """Return True if nobody looks at statuses, and containers go to streams in any case."""
         waits, listeners = self._waits, self._listeners
         heard = waits.answers or waits.statuses or listeners.hears_statuses
         return not (heard or listeners.sees_events) and self._results.only_streams
 
     def fail(self, error: SmartCamError) -> None:
-        """The session is over: tell everybody who waits, and who comes before the next one.
+        """End the session: tell everybody who waits, and who comes before the next one.
 
         The first reason stays. Streams go on until :meth:`finish`.
         """
         if self._waits.fail(error):
-            self._listeners.fail(error)
-            self._results.fail(error)
+            self._listeners.fail(told(error))
+            self._results.fail(told(error))
 
     def finish(self, error: SmartCamError) -> None:
-        """Nothing more will come, because of ``error``: end the streams, quietly if we closed."""
+        """End the streams for good because of ``error``, quietly if we closed."""
         self.fail(error)
         self._waits.finish(error)
         self._results.finish()
@@ -135,9 +141,7 @@ class Dispatch:
 
     def _on_active(self, answer: m.QueryAnswer, now: float, at: datetime) -> None:
         if self._waits.take_fence():
-            self._results.on_fence()
-        else:
-            self._results.on_query_answer()
+            self._results.on_query_answer(now)
         state = self._state
         if answer.application != state.active and self._verdict(answer.code) is Verdict.DONE:
             state.set_active(answer.application, at)
@@ -152,8 +156,13 @@ class Dispatch:
             self._state.set_active(answer.application, at)
 
     def _on_trigger_answer(self, answer: m.TriggerAnswer, now: float, at: datetime) -> None:
-        if self._results.on_trigger_answer():
-            self._polling.ask()
+        if self._verdict(answer.code) is Verdict.DONE:
+            self._results.on_trigger_answer(now)
+
+    def _on_notice(self, notice: m.Notice, now: float, at: datetime) -> None:
+        level = logging.WARNING if notice.kind == "error" else logging.INFO
+        text = "%s ! the camera says: %s %d: %.200s"
+        logger.log(level, text, self._name, notice.kind, notice.code, notice.text)
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         state, waits, listeners, status = self._state, self._waits, self._listeners, report.status
@@ -211,5 +220,6 @@ def gathered(events: list[Event], endian: int) -> list[Event]:
 
 
 def _is_plain(container: m.ResultContainer) -> bool:
-    """Whether a container is nothing but its bytes, and says whose it is."""
-    return container.application >= 0 and container.cells is None and container.fault is None
+    """Return True if a container has its bytes alone, names its application, and nobody asked."""
+    named = container.application >= 0 and not container.asked
+    return named and container.cells is None and container.fault is None

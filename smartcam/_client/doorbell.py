@@ -1,17 +1,20 @@
-"""What the receive task sleeps on: a wake-up without a turn of the event loop.
+"""Wake the receive task without a turn of the event loop.
 
 A future wakes its task by way of the event loop: a handle, another turn, another system call. For
 each delivery of bytes that costs more than all that is done with them. Who rings here from a
 callback of the loop, as a transport does, has the task go on at once. It is a task nevertheless:
 what it raises ends it, and never reaches who rang.
 
-This is what the event loop's own tasks and futures agree on (``_asyncio_future_blocking``), which
-other implementations of futures rest on, too.
+:class:`Doorbell` rests on what the event loop's own tasks and futures agree on
+(``_asyncio_future_blocking``), as other implementations of futures do. :class:`PlainDoorbell` rests
+on a future alone: it takes its place where the environment variable ``SMARTCAM_DOORBELL`` is
+``plain``, should a Python or an event loop come that does not agree on this.
 """
 
 from __future__ import annotations
 
 import asyncio
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -54,21 +57,55 @@ class Doorbell:
         yield self
 
     def get_loop(self) -> asyncio.AbstractEventLoop:
-        """The loop that the task runs in."""
+        """Return the loop that the task runs in."""
         return self._loop
 
     def add_done_callback(
         self, wake: Callable[[Doorbell], None], *, context: contextvars.Context
     ) -> None:
-        """The task sleeps now; ``wake`` has it go on."""
+        """Note that the task sleeps now; ``wake`` has it go on."""
         self._wake, self._context = wake, context
 
     def cancel(self, msg: Any = None) -> bool:
-        """The task is being cancelled: it is woken, and then told."""
+        """Wake the task to be cancelled, which is told then."""
         wake, self._wake = self._wake, None
         if wake is not None:
             self._loop.call_soon(wake, self, context=self._context)
         return False
 
     def result(self) -> None:
-        """Nothing comes with the ring."""
+        """Return nothing: no value comes with the ring."""
+
+
+class PlainDoorbell:
+    """A doorbell on a future: a ring has the task go on in the loop's next turn.
+
+    Args:
+        loop: the loop of both.
+
+    Cancellation: safe.
+    """
+
+    __slots__ = ("_loop", "_ringing")
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._ringing: asyncio.Future[None] | None = None  # None: nobody waits
+
+    def ring(self) -> None:
+        """Have the task go on."""
+        if self._ringing is not None and not self._ringing.done():
+            self._ringing.set_result(None)
+
+    def __await__(self) -> Generator[Any, None, None]:
+        self._ringing = self._loop.create_future()
+        try:
+            yield from self._ringing
+        finally:
+            self._ringing = None
+
+
+def make_doorbell(loop: asyncio.AbstractEventLoop) -> Doorbell | PlainDoorbell:
+    """Return the doorbell that the environment variable ``SMARTCAM_DOORBELL`` asks for."""
+    plain = os.environ.get("SMARTCAM_DOORBELL") == "plain"
+    return PlainDoorbell(loop) if plain else Doorbell(loop)

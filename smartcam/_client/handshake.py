@@ -19,12 +19,13 @@ from smartcam._client.attempts import CONNECTING, OPENING, SessionRefusedError, 
 from smartcam._client.link import Chunk, Link, open_link
 from smartcam.exceptions import (
     CommandRejectedError,
+    ConfigurationError,
     ConnectFailedError,
     RemoteProtocolError,
     SmartCamError,
 )
-from smartcam.protocols._base import Dialect, Transport, Verdict, load_protocol
-from smartcam.protocols._framed.machine import LinkEnded, LinkFailed
+from smartcam.protocols import Dialect, LinkEnded, LinkFailed, Transport, Verdict
+from smartcam.protocols._inside import load_protocol
 from smartcam.protocols.messages import (
     Connect,
     ConnectAnswer,
@@ -41,13 +42,14 @@ from smartcam.settings import FLEET_SCHEMES
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from smartcam.layout import Layout
     from smartcam.observers import TraceEntry
     from smartcam.protocols.messages import Message
     from smartcam.settings import Address, CameraSettings
 
 logger: logging.Logger = logging.getLogger("smartcam.handshake")
 
-DETECTION_SHARE = 0.5
+DETECTION_TIMEOUT = 0.5
 """Seconds for the answer to Connect in the first round while other dialects are still untried. A
 camera answers in milliseconds, one that speaks another dialect is silent; later rounds have the
 rest of the time, for slow links."""
@@ -264,10 +266,30 @@ def tries_for(address: Address) -> list[tuple[Dialect, ...]]:
     )
 
 
-def remarks(address: Address) -> set[str]:
-    """Return what a user should know who asks for results at an address.
+def _for_layout(
+    tries: list[tuple[Dialect, ...]], layout: Layout | None
+) -> list[tuple[Dialect, ...]]:
+    """Return the attempts in which the camera can be told a layout.
 
-    Nothing where it is a fleet's: its agent was told.
+    Raises:
+        ConfigurationError: it can be told in none of them.
+    """
+    groups: list[tuple[Dialect, ...]] = []
+    refused: ConfigurationError | None = None
+    for dialects in tries:
+        try:
+            groups.append(tuple(dialect.for_layout(layout) for dialect in dialects))
+        except ConfigurationError as exc:
+            refused = refused or exc
+    if refused is not None and not groups:
+        raise refused
+    return groups
+
+
+def remarks(address: Address) -> set[str]:
+    """Return the remarks for a user who asks for results at an address.
+
+    An address of a fleet has none: its agent logged them.
     """
     if address.scheme in FLEET_SCHEMES:
         return set()
@@ -280,11 +302,19 @@ def names_of(dialects: Sequence[Dialect]) -> str:
 
 
 async def establish(
-    settings: CameraSettings, trace: Callable[[TraceEntry], None] | None = None
+    settings: CameraSettings,
+    trace: Callable[[TraceEntry], None] | None = None,
+    layout: Layout | None = None,
 ) -> Session:
     """Make a session within ``connect_timeout``, by up to ``connect_attempts`` rounds.
 
+    Args:
+        settings: where to, and how long.
+        trace: called with every frame.
+        layout: the fields of the results, for a camera that can be told.
+
     Raises:
+        ConfigurationError: the camera cannot give results of this layout.
         ConnectFailedError: why, and what to do about it; ``attempts`` tells what came each time.
 
     Cancellation: the link that was being made is dropped.
@@ -292,7 +322,7 @@ async def establish(
     address = settings.address
     protocol = load_protocol(address.protocol)
     transport = protocol.schemes[address.scheme]
-    groups = tries_for(address)
+    groups = _for_layout(tries_for(address), layout)
     loop = asyncio.get_running_loop()
     deadline = loop.time() + settings.connect_timeout
     tries: list[Try] = []
@@ -359,7 +389,7 @@ def _sharer(
         when = end
         if step == CONNECTING:
             share = (end - loop.time()) / untried
-            when = loop.time() + (min(share, DETECTION_SHARE) if hurried else share)
+            when = loop.time() + (min(share, DETECTION_TIMEOUT) if hurried else share)
         limit.reschedule(when)
 
     return on_step

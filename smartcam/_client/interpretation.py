@@ -8,28 +8,20 @@ stands no value passes that it has not turned into poses of the robot.
 from __future__ import annotations
 
 import inspect
-from asyncio import CancelledError
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+from smartcam._arguments import check_application, shown
+from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import (
     CalibrationError,
     ConfigurationError,
     InterpretationError,
     WrongApplicationError,
 )
-from smartcam.interpreters._base import (
-    Context,
-    Interpreter,
-    PlainInterpreter,
-    Reader,
-    plain,
-    resolve,
-    run,
-    run_plain,
-    run_sequence,
-)
-from smartcam.layout._texts import pack_texts
+from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
+from smartcam.interpreters._inside import plain, run_plain, run_sequence
+from smartcam.layout._inside import UNITS, pack_texts
 from smartcam.models import Localization
 from smartcam.registry import INTERPRETERS
 
@@ -37,6 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from datetime import datetime
 
+    from smartcam.camera import Camera
+    from smartcam.layout import Layout
     from smartcam.models import ByteOrder, Calibration
     from smartcam.protocols.messages import ResultContainer
 
@@ -69,7 +63,7 @@ MAX_NUMBER = (1 << 31) - 1
 
 
 class Interpreted(NamedTuple):
-    """What came of a container: value, sequence number if the layout has one, empty slots."""
+    """A container's value, its sequence number if the layout has one, and its empty slots."""
 
     value: Any
     sequence: int | None
@@ -77,7 +71,7 @@ class Interpreted(NamedTuple):
 
 
 class Numbering(NamedTuple):
-    """How a layout carries the sequence number.
+    """The form in which a layout carries the sequence number.
 
     Attributes:
         highest: the largest number that its field holds, at most 2^31 - 1.
@@ -89,13 +83,15 @@ class Numbering(NamedTuple):
 
 
 class Interpretation:
-    """How to read result containers; resolved once, used for every result.
+    """The way to read result containers; resolved once, used for every result.
 
     Args:
         spec: what ``interpret_as`` accepts.
         lenient: any non-zero byte is a true bool.
         y_down: the camera's y axis points down.
         calibration: what ``calibration`` accepts.
+        own: whether the calibration was given for results as ``spec`` reads them; else values that
+            never are localizations stay as they are.
 
     Attributes:
         by_application: each application has its own interpreter.
@@ -106,7 +102,15 @@ class Interpretation:
             the specification gives.
     """
 
-    def __init__(self, spec: Any, *, lenient: bool, y_down: bool, calibration: Any = None) -> None:
+    def __init__(
+        self,
+        spec: Any,
+        *,
+        lenient: bool,
+        y_down: bool,
+        calibration: Any = None,
+        own: bool = True,
+    ) -> None:
         self._lenient = lenient
         self._y_down = y_down
         self._plain_context = Context(y_down=y_down, lenient=lenient)
@@ -118,18 +122,33 @@ class Interpretation:
                 if not isinstance(application, int):
                     raise ConfigurationError(
                         f"interpret_as: a mapping goes from application id to a specification; "
-                        f"{application!r} is no id"
+                        f"{shown(application)} is no id"
                     )
-                self._by_application[application] = _way(resolve(one, lenient=lenient))
+                self._by_application[application] = _way(resolve(one, lenient=lenient), own)
         else:
-            self._one = _way(resolve(spec, lenient=lenient))
+            self._one = _way(resolve(spec, lenient=lenient), own)
         self._calibrations = None if calibration is None else _Calibrations(calibration, y_down)
-        if self._calibrations is not None:
+        if self._calibrations is not None and own:
             if self._one is not None:
                 self._calibrations.check(None, self._one.interpreter)
             for application, way in self._by_application.items():
                 self._calibrations.check(application, way.interpreter)
         self.by_application: bool = self._one is None
+
+    @property
+    def layout(self) -> Layout | None:
+        """Layout of every container; None where there is none, or one for each application."""
+        return None if self._one is None else self._one.interpreter.layout
+
+    @property
+    def applications(self) -> tuple[int, ...]:
+        """The applications that have interpreters of their own."""
+        return tuple(self._by_application)
+
+    def interpreter(self, application: int | None) -> Interpreter | None:
+        """Return the interpreter of an application; None for one that is not known."""
+        way = self._way(application)
+        return None if way is None else way.interpreter
 
     def numbering(self, application: int | None) -> Numbering | None:
         """Return the place of the number in this application's containers, None without one."""
@@ -187,7 +206,7 @@ class Interpretation:
         if simple is not None and not way.sequenced:
             context = self._context(container.application, endian, camera, number, at)
             value = run_plain(simple, data, context)
-            if self._calibrations is not None:
+            if self._calibrations is not None and way.calibrated:
                 value = self._calibrations.apply(value, container.application)
             read: Interpreted = new_tuple(Interpreted, (value, None, context.empty_slots))
             return read
@@ -197,7 +216,7 @@ class Interpretation:
         )
         reader = Reader(data, context, interpreter.layout)
         value = run(interpreter, reader)
-        if self._calibrations is not None:
+        if self._calibrations is not None and way.calibrated:
             value = self._calibrations.apply(value, container.application)
         sequence = run_sequence(interpreter, reader) if way.sequenced else None
         return Interpreted(value, sequence, context.empty_slots)
@@ -236,16 +255,18 @@ class Interpretation:
         try:
             values = way.simple.read_all(payloads, context)
             complete = len(values) == len(payloads)
-            if self._calibrations is not None:
+            if self._calibrations is not None and way.calibrated:
                 # each by itself, so that it has the same bits whichever way it came
                 values = [self._calibrations.apply(value, application) for value in values]
-        except (Exception, CancelledError):  # noqa: BLE001 - one by one it shows, with its place
+        except ENDS_PROGRAM:
+            raise
+        except BaseException:  # noqa: BLE001 - one by one it shows, with its place
             return None
         return (values, context.empty_slots) if complete else None
 
 
 class _Calibrations:
-    """What the values of each application go through.
+    """The calibrations that each application's values go through.
 
     Args:
         given: what ``calibration`` accepts, but None.
@@ -264,19 +285,15 @@ class _Calibrations:
             return
         self._by_application = {}
         for application, one in given.items():
-            if not isinstance(application, int):
-                raise ConfigurationError(
-                    f"calibration: a mapping goes from application id to a calibration or None; "
-                    f"{application!r} is no id"
-                )
-            self._by_application[application] = None if one is None else _calibration(one, y_down)
+            number = check_application(application, "calibration: application")
+            self._by_application[number] = None if one is None else _calibration(one, y_down)
 
     def check(self, application: int | None, interpreter: Interpreter) -> None:
         """Raise where no value of an interpreter would ever pass.
 
         Args:
-            application: whose values they are; None: of any.
-            interpreter: what gives them.
+            application: id of the application whose results are read; None: any.
+            interpreter: reader of these results.
 
         Raises:
             ConfigurationError: says what to give instead.
@@ -309,7 +326,7 @@ class _Calibrations:
         calibration = self._of(application)
         if calibration is None:
             return value
-        parts = _localizations(value)
+        parts = localizations_of(value)
         if parts is None:
             raise InterpretationError(
                 f"calibration: expected a list of localizations of application {application}, "
@@ -323,11 +340,12 @@ class _Calibrations:
             raise InterpretationError(
                 f"calibration: {exc}", expected=exc.expected, got=exc.got
             ) from exc
-        except (Exception, CancelledError) as exc:
-            raise InterpretationError(
-                f"the calibration failed with {type(exc).__name__}: {exc}", got=repr(exc)
-            ) from exc
-        made = _localizations(found)
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:
+            text = text_of(exc)
+            raise InterpretationError(f"the calibration failed with {text}", got=text) from exc
+        made = localizations_of(found)
         if made is None or len(made) != len(parts):
             got = type(found).__name__ if made is None else len(made)
             raise InterpretationError(
@@ -360,7 +378,7 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):
         raise ConfigurationError(
             "calibration: expected an object with a method to_robot(localizations) that is not "
-            f"async, such as PlaneCalibration.load(FILE) gives, got {given!r:.80}"
+            f"async, such as PlaneCalibration.load(FILE) gives, got {shown(given)}"
         )
     made: object = getattr(given, "y_down", None)
     if made is not None and made != y_down:
@@ -371,7 +389,7 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
     return cast("Calibration", given)
 
 
-def _localizations(value: object) -> list[Localization] | None:
+def localizations_of(value: object) -> list[Localization] | None:
     """Return ``value`` where it is a list of nothing but localizations, else None."""
     if not isinstance(value, list):
         return None
@@ -390,6 +408,21 @@ def without_poses(interpreter: Interpreter) -> str | None:
     return next(found, None)
 
 
+def own_interpreter(camera: Camera[Any], application: int | None) -> Interpreter | None:
+    """Return the interpreter of a camera's results; None for an application that is not known."""
+    return camera._default.interpreter(application)  # noqa: SLF001 - smartcam's own
+
+
+def in_pixels(interpreter: Interpreter | None) -> bool:
+    """Return True if an interpreter reads places as pixels, not as lengths."""
+    layout = None if interpreter is None else interpreter.layout
+    return layout is not None and any(
+        field.unit is not None and UNITS[field.unit].quantity == "pixels"
+        for field in layout.fields
+        if field.name in {"x", "y", "z"}
+    )
+
+
 def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
     """Return a container's bytes as its layout describes them, where its values are texts."""
     if container.fault is not None:
@@ -401,19 +434,21 @@ def _from_cells(container: ResultContainer, interpreter: Interpreter) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class _ApplicationReader:
-    """How the containers of one application are read.
+    """The reader of one application's containers.
 
     Attributes:
-        interpreter: what does it.
-        simple: the same where it wants nothing but the bytes, else None.
-        sequenced: whether it may tell a sequence number.
-        numbering: how the layout carries that, None without one.
+        interpreter: reader of the containers.
+        simple: the interpreter where it wants nothing but the bytes, else None.
+        sequenced: whether the interpreter may tell a sequence number.
+        numbering: how the layout carries the sequence number; None where it has none.
+        calibrated: whether values pass through the calibration, if there is one.
     """
 
     interpreter: Interpreter
     simple: PlainInterpreter | None
     sequenced: bool
     numbering: Numbering | None
+    calibrated: bool
 
 
 def _numbered(way: _ApplicationReader) -> str | None:
@@ -421,12 +456,18 @@ def _numbered(way: _ApplicationReader) -> str | None:
     return None if way.numbering is None or layout is None else layout.text
 
 
-def _way(interpreter: Interpreter) -> _ApplicationReader:
+def _way(interpreter: Interpreter, own: bool) -> _ApplicationReader:
     layout = interpreter.layout
-    own = type(interpreter).sequence is not Interpreter.sequence
+    sequenced = type(interpreter).sequence is not Interpreter.sequence
     field = layout.sequence_field if layout is not None else None
     numbering = None
     if layout is not None and field is not None and field.wire.high is not None:
         always = field in layout.head or layout.repeat is None
         numbering = Numbering(min(field.wire.high, MAX_NUMBER), always)
-    return _ApplicationReader(interpreter, plain(interpreter), own or field is not None, numbering)
+    return _ApplicationReader(
+        interpreter,
+        plain(interpreter),
+        sequenced or field is not None,
+        numbering,
+        own or without_poses(interpreter) is None,
+    )

@@ -1,7 +1,9 @@
 """Finding out that the camera is gone although nobody said so: a pulled cable, a lost supply.
 
-Any received byte is a sign of life. After half the timeout without one a Query asks for one, and
-after the whole timeout the link is given up. While an application is loaded the camera may be
+Any received byte is a sign of life. A camera that has nothing to say owes none, so after half the
+timeout without one a Query asks for it, and the camera has the whole timeout from then on: a pause
+that is shorter ends no session, and a camera that is gone is noticed one and a half timeouts
+behind its last byte, at the latest. While an application is loaded the camera may be
 silent for longer: then it is asked after ``switch_timeout`` only.
 """
 
@@ -31,7 +33,7 @@ class KeepAlive:
     _requests: Requests
     _waits: Waits
     _state: CameraState
-    _timeout: float | None  # seconds of silence after which a link is given up; None: never
+    _timeout: float | None  # seconds that a camera has for a sign of life; None: no end
     _switch_timeout: float  # seconds that loading an application may take
 
     @contextlib.contextmanager
@@ -40,7 +42,7 @@ class KeepAlive:
         if self._timeout is None:
             yield
             return
-        watch = _Watch(self, link, self._timeout / 2)
+        watch = _Watch(self, link, self._timeout)
         watch.look()
         try:
             yield
@@ -66,10 +68,11 @@ class KeepAlive:
 class _Watch:
     """One timer; set again each time it fires, never by what is received."""
 
-    def __init__(self, owner: KeepAlive, link: Link, patience: float) -> None:
+    def __init__(self, owner: KeepAlive, link: Link, timeout: float) -> None:
         self._owner = owner
         self._link = link
-        self._patience = patience  # seconds of silence before a question, and after it
+        self._timeout = timeout  # seconds that the camera has for a sign of life once it is asked
+        self._quiet = timeout / 2  # seconds of silence before it is
         self._loop = asyncio.get_running_loop()
         self._asked_at: float | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -85,18 +88,20 @@ class _Watch:
         if self._asked_at is not None and self._asked_at <= heard_at:  # a clock may be coarse
             self._asked_at = None
         if self._asked_at is None:
-            quiet = self._owner.patience(self._patience)
+            quiet = self._owner.patience(self._quiet)
             if now >= heard_at + quiet:
                 self._asked_at = now
-                self._owner.ask(now + self._patience)
-                when = now + self._patience
+                self._owner.ask(now + self._timeout)
+                when = now + self._quiet
             else:
                 # a load may begin or end meanwhile, so look at each step
-                when = min(heard_at + quiet, now + self._patience)
+                when = min(heard_at + quiet, now + self._quiet)
         else:
-            when = self._asked_at + self._patience
-            if now >= when:
+            end = self._asked_at + self._timeout
+            if now >= end:
                 silence = f"no sign of life for {now - heard_at:.1f} s"
                 self._link.give_up(TimeoutError(silence))
                 return
+            # it may answer meanwhile, so look when the next question is due
+            when = min(end, now + self._quiet)
         self._timer = self._loop.call_at(when, self.look)

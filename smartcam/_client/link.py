@@ -19,46 +19,58 @@ from datetime import UTC, datetime
 from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client.doorbell import Doorbell
+from smartcam._client.doorbell import make_doorbell
 from smartcam._datagrams import read_no_more_than_needed
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import TraceEntry
-from smartcam.protocols._base import Dialect, Role, Transport
-from smartcam.protocols._framed.machine import Event, LinkFailed, LinkMachine, ResultBurst, State
-from smartcam.protocols.messages import Disconnect, Message, Sender
+from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
+from smartcam.protocols._inside import Event, ResultBurst
+from smartcam.protocols.messages import (
+    Disconnect,
+    GetStatus,
+    Message,
+    Query,
+    Sender,
+    TriggerAnswer,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from smartcam.protocols._base import Protocol
-    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols import Frame, Protocol
 
 logger: logging.Logger = logging.getLogger("smartcam.connection")
 
 MAX_CHUNKS = 2
-"""Chunks that wait for the receive task before TCP stops reading; it does so sooner where one is
-more than the task takes in a turn. It reads on when none is left: a camera that is faster than its
-results can be told has to wait itself."""
+"""Chunks that may wait for the receive task before the link stops reading from TCP.
+
+The link stops sooner if one chunk is more than the task handles in a turn, and reads on when no
+chunk is left: a camera that sends results faster than they can be delivered has to wait.
+"""
 
 MAX_DATAGRAMS = 256
-"""Datagrams that wait for it, where one is normal; beyond this they are dropped and counted."""
+"""Datagrams that may wait for the receive task; further ones are dropped and counted."""
 
-TURN = 0.0002
-"""Seconds of the processor that the receive task takes in one turn of the event loop, about: from
-how long a chunk took follows how much the next one holds."""
+TURN_TIME = 0.0002
+"""Seconds of processor time that the receive task aims to take in one turn of the event loop.
 
-SHARED_TURN = 0.00005
-"""The same where other links have the same loop: what they do waits for a turn of each that floods,
-at each of its steps."""
+The time that one chunk took decides how many bytes the next one holds.
+"""
+
+SHARED_TURN_TIME = 0.00005
+"""Seconds in place of :data:`TURN_TIME` where other links share the event loop.
+
+Each step of another link waits for one turn of every link that is flooded.
+"""
 
 PASSES = 4
 """Times that the loop goes round before the next chunk, at most, where other links have it, too: as
 long as they, or whoever else is there, take more than a turn of it."""
 
 links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
-"""How many links are open on a loop."""
+"""Number of links that are open on each loop."""
 
-LEAST_CHUNK = 4
+MIN_FRAMES_PER_CHUNK = 4
 """Frames of a chunk that are worth to be cut."""
 
 FIRST_CHUNK = 64
@@ -79,11 +91,13 @@ class Chunk:
         received_at: loop time when it came.
         events: what it gave, in order.
         frames: in how many frames the events came; an event may be made of many (In-Sight).
+        delivery: number of the delivery on its link, from 1.
     """
 
     received_at: float
     events: list[Event]
     frames: int = 1
+    delivery: int = 1
 
 
 class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
@@ -93,12 +107,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         machine: the protocol's client side.
         name: the camera's name, for logs and errors.
         host: address of the camera.
-        port: its port.
+        port: port of the camera.
         liveness_timeout: seconds after which the system, too, gives up a peer that acknowledges
             nothing (TCP keep-alive and user timeout, where it has them); None for its own default.
 
     Attributes:
-        loop: the event loop that it is used in.
+        loop: the event loop that the link is used in.
         heard_at: loop time of the last byte received.
     """
 
@@ -123,11 +137,12 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
+        self.deliveries = 0  # of bytes that gave events, so far
         self._frames = 0  # that came until the last chunk
         self._most = FIRST_CHUNK  # frames of the next chunk
         self._busy_since: float | None = None  # with the last chunk, where it was a large one
         self._busy_with = 0
-        self._doorbell = Doorbell(self.loop)  # of the task that receives
+        self._doorbell = make_doorbell(self.loop)  # of the task that receives
         self._closed: asyncio.Future[None] = self.loop.create_future()
         self._loss: BaseException | None = None
         self._writable = asyncio.Event()
@@ -163,13 +178,19 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         if self._loss is not None:
             raise self.lost_error()
         try:
+            queried = False
             for message in messages:
-                self.machine.send(message)
+                kind = type(message)
+                if kind is Query and queried:  # a trigger stands between two
+                    self.machine.send(message, again=True)
+                else:  # a status comes by itself as well: it is owed to nobody
+                    self.machine.send(message, answered=False if kind is GetStatus else None)
+                queried = queried or kind is Query
         finally:
             self._flush()
 
     def is_writable(self) -> bool:
-        """Whether the transport takes more at once: :meth:`drain` would not wait."""
+        """Return True if the transport takes more at once, so that :meth:`drain` would not wait."""
         return self._writable.is_set()
 
     async def drain(self) -> None:
@@ -197,7 +218,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             chunk, rest = split(chunk, self._most)
             if rest.events:
                 self._chunks.appendleft(rest)
-        if chunk.frames >= LEAST_CHUNK and (self._chunks or chunk.frames > LEAST_CHUNK):
+        if chunk.frames >= MIN_FRAMES_PER_CHUNK and (
+            self._chunks or chunk.frames > MIN_FRAMES_PER_CHUNK
+        ):
             # more than the answers of a trigger
             self._busy_since, self._busy_with = thread_time(), chunk.frames
         if self._paused and not self._chunks:
@@ -255,7 +278,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     @property
     def lost(self) -> bool:
-        """Whether it is gone; chunks that came before may still wait to be taken."""
+        """True once the link is lost; chunks that came before may still wait to be taken."""
         return self._loss is not None
 
     @property
@@ -350,7 +373,8 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
             return
         received = self.machine.counters.frames_received
         frames, self._frames = received - self._frames, received
-        self._chunks.append(Chunk(self.heard_at, events, frames))
+        self.deliveries += 1
+        self._chunks.append(Chunk(self.heard_at, events, frames, self.deliveries))
         last = events[-1]
         if isinstance(last, LinkFailed):
             self._lose(last.error)
@@ -364,17 +388,17 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         for _ in range(PASSES if links[self.loop] > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)
-            if perf_counter() - left < SHARED_TURN:
+            if perf_counter() - left < SHARED_TURN_TIME:
                 break
 
     def _adapt(self, since: float) -> None:
         """Have the next chunks hold as much as one turn takes, by how long the last one took."""
         self._busy_since = None
         took = thread_time() - since
-        turn = SHARED_TURN if links[self.loop] > 1 else TURN
+        turn = SHARED_TURN_TIME if links[self.loop] > 1 else TURN_TIME
         frames = int(self._busy_with * turn / max(took, 1e-9))
         frames = max(frames, self._most // 2)  # once is no rule
-        self._most = max(LEAST_CHUNK, min(LARGEST_CHUNK, frames))
+        self._most = max(MIN_FRAMES_PER_CHUNK, min(LARGEST_CHUNK, frames))
 
     def _pause(self) -> None:
         if not (self._paused or self._datagrams):
@@ -401,11 +425,17 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
 
 def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
-    """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut."""
+    """Return a chunk of so many frames from a larger one, and its rest; a burst may be cut.
+
+    A trigger's answer and what comes behind it stay together, since one frame may be both: whoever
+    waits for the answer would else send before the result that belongs to it is judged.
+    """
     at, events = chunk.received_at, chunk.events
     if chunk.frames == len(events):  # one each
-        others = Chunk(at, events[frames:], chunk.frames - frames)
-        return Chunk(at, events[:frames], frames), others
+        while frames < len(events) and type(events[frames - 1]) is TriggerAnswer:
+            frames += 1
+        others = Chunk(at, events[frames:], chunk.frames - frames, chunk.delivery)
+        return Chunk(at, events[:frames], frames, chunk.delivery), others
     some: list[Event] = []
     left, rest = frames, collections.deque(events)
     while left > 0 and rest:
@@ -418,6 +448,8 @@ def split(chunk: Chunk, frames: int) -> tuple[Chunk, Chunk]:
         else:
             left -= 1
         some.append(event)
+    while some and rest and type(some[-1]) is TriggerAnswer:
+        some.append(rest.popleft())
     taken = frames - left
     first = replace(chunk, events=some, frames=taken)
     return first, replace(chunk, events=list(rest), frames=chunk.frames - taken)
@@ -442,9 +474,9 @@ async def open_link(
         dialects: one, or several that begin a session alike.
         transport: TCP or UDP.
         host: the camera's name or address.
-        port: its port.
-        name: of the camera, for logs.
-        max_length: largest payload accepted, bytes.
+        port: port of the camera.
+        name: name of the camera in logs.
+        max_length: bytes of the largest payload that is accepted.
         trace: called with every frame.
         liveness_timeout: see :class:`Link`.
 

@@ -1,4 +1,4 @@
-"""Who listens to a camera: streams, single waiters for the next result, observers."""
+"""Keep those who listen to a camera: streams, single waiters for the next result, observers."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ logger: logging.Logger = logging.getLogger("smartcam.client")
 
 
 class Listeners:
-    """What comes from a camera is handed to these.
+    """The subscribers and observers that get what comes from a camera.
 
     Args:
         name: the camera's name.
-        observers: who see everything.
+        observers: observers that see everything.
 
     Attributes:
         results: subscriptions to results.
         statuses: subscriptions to statuses.
         events: subscriptions to events.
-        observed: there are observers that look at results.
+        observed: True if some observer looks at results.
     """
 
     def __init__(self, name: str, observers: Observers) -> None:
@@ -58,12 +58,12 @@ class Listeners:
 
     @property
     def streams_results(self) -> bool:
-        """Whether a result would be handed to streams, and to nobody else."""
+        """True if a result would be handed to streams, and to nobody else."""
         return self._streams_hear and not (self.observed or self._awaits_next)
 
     @property
     def hears_results(self) -> bool:
-        """Whether a result would be handed to anybody but its trigger."""
+        """True if a result would be handed to anybody but its trigger."""
         return self._streams_hear or self._awaits_next
 
     @property
@@ -76,22 +76,22 @@ class Listeners:
 
     @property
     def hears_statuses(self) -> bool:
-        """Whether a status would be handed to anybody."""
+        """True if a status would be handed to anybody."""
         return bool(self.statuses.references)
 
     @property
     def watches_status(self) -> bool:
-        """Whether somebody subscribed to statuses or events."""
+        """True if somebody subscribed to statuses or events."""
         streams: list[Queue[Any]] = [*self.statuses, *self.events]
         return any(not stream.ended for stream in streams)
 
     @property
     def sees_events(self) -> bool:
-        """Whether anybody would see an event."""
+        """True if anybody would see an event."""
         return bool(self.events.references) or self.notes_events()
 
     def notes_events(self) -> bool:
-        """Return whether events are seen although nobody subscribed to them."""
+        """Return True if an observer or the log takes events, even without a subscriber."""
         return self._observers.see_states or logger.isEnabledFor(logging.DEBUG)
 
     # ------------------------------------------------------------------ what comes
@@ -116,10 +116,10 @@ class Listeners:
         """Hand a result on.
 
         Args:
-            result: it.
+            result: result to deliver.
             now: loop time.
-            current: it is not known to be an older trigger's.
-            late: it is known to be one's that was given up.
+            current: True unless the result is known to belong to an older trigger.
+            late: True if the result is known to belong to a trigger that was given up.
         """
         if self.observed:
             self._observers.result(result)
@@ -151,7 +151,7 @@ class Listeners:
             self._observers.error(self._name, error)
 
     def fail(self, error: SmartCamError) -> None:
-        """Tell who waits for the next result that there is no session; streams go on."""
+        """Raise an error in every caller that waits for the next result; streams go on."""
         for future in self._take_next_results():
             future.set_exception(error)
 

@@ -1,19 +1,18 @@
 """Asking for the status where it does not come by itself (``bid``), while somebody wants it.
 
 One timer, there as long as a wait for a status or a trigger is under way, or statuses or events are
-subscribed to. At most one question is open; one that was not answered is repeated after a while,
-since a datagram may be lost. On TCP none is: there a camera that says something and answers no
-question does not say what it should, and the link is given up.
+subscribed to. It asks while no question is open, whoever asked; one that was not answered is
+repeated after a while, since a datagram may be lost. On TCP none is: there a camera that says
+something and answers no question does not say what it should, and the link is given up.
 """
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ResponseTimeoutError, SmartCamError
-from smartcam.protocols.messages import GetStatus, SwitchAnswer, TriggerAnswer
+from smartcam.protocols.messages import SwitchAnswer, TriggerAnswer
 
 if TYPE_CHECKING:
     import asyncio
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
     from smartcam._client.listeners import Listeners
+    from smartcam._client.requests import Requests
     from smartcam._client.waits import Waits
 
 PERIOD = 0.02
@@ -38,6 +38,7 @@ class Polling:
     """Asks for the status over the link of each session in which it has to be asked for."""
 
     _connection: Connection
+    _requests: Requests
     _state: CameraState
     _waits: Waits
     _listeners: Listeners
@@ -47,14 +48,14 @@ class Polling:
         self._running = False
         self._triggered = False  # a trigger is under way
         self._timer: asyncio.TimerHandle | None = None
-        self._asked_at = 0.0
+        self._due = 0.0  # when it fires: what uvloop gives does not tell
         self._open_since = 0.0
-        self._heard = -1  # statuses that had come when the open question was asked
+        self._heard = -1  # statuses that had come when this timer looked last
 
     def begin_session(self) -> None:
         """Begin to ask, where the status does not come by itself."""
         self._running = self._connection.features.polled
-        self._asked_at = self._open_since = 0.0
+        self._open_since = 0.0
         self._heard = -1
         self.wanted()
 
@@ -64,29 +65,29 @@ class Polling:
         self._stop()
 
     def wanted(self) -> None:
-        """Somebody wants a status: begin to ask, or ask more often."""
+        """Begin to ask for the status, or ask more often, since somebody wants it."""
         if not self._running:
             return
         loop = self._connection.loop
-        if self._timer is not None and self._timer.when() - loop.time() <= PERIOD:
+        if self._timer is not None and self._due - loop.time() <= PERIOD:
             return
         self._stop()
-        self._timer = loop.call_later(0.0, self._tick)
+        self._set_timer(0.0)
 
-    def begin_trigger(self) -> None:
-        """A trigger is under way, and wants to know what becomes of it."""
+    def begin_trigger(self, questions: int) -> None:
+        """Note that a trigger is under way, which needs the status.
+
+        Args:
+            questions: how often the status was asked for together with it.
+        """
         self._triggered = True
+        if questions:
+            self._state.status_asked(self._connection.loop.time(), questions)
         self.wanted()
 
     def end_trigger(self) -> None:
-        """No trigger is under way any more."""
+        """Note that no trigger is under way any more."""
         self._triggered = False
-
-    def ask(self) -> None:
-        """Ask now, whatever is open: what was asked before may tell of what was before."""
-        if self._running:
-            with contextlib.suppress(SmartCamError):  # the link is over: the receive task tells
-                self._connection.require_link().send(GetStatus(), answered=False)
 
     def _stop(self) -> None:
         if self._timer is not None:
@@ -101,20 +102,26 @@ class Polling:
             return
         loop = self._connection.loop
         now = loop.time()
-        answered = heard != self._heard
-        if answered or self._may_be_silent:
-            self._open_since = now
+        state = self._state
+        if heard != self._heard or not state.owes_status or self._may_be_silent:
+            self._heard, self._open_since = heard, now
         elif self._connection.features.ordered and now - self._open_since >= self._patience:
             silence = f"no status within {now - self._open_since:.1f} s of being asked for"
             link.give_up(ResponseTimeoutError(f"{self._connection.name}: {silence}"))
             return
-        if answered or now - self._asked_at >= REPEAT_AFTER:
-            self._heard, self._asked_at = heard, now
+        if state.owes_status and now - state.status_asked_at >= REPEAT_AFTER:
+            state.status_lost()
+        if not state.owes_status:
             try:
-                link.send(GetStatus(), answered=False)
+                self._requests.ask_status()
             except SmartCamError:  # the link is over: the receive task tells
                 return
-        self._timer = loop.call_later(PERIOD if soon else IDLE_PERIOD, self._tick)
+        self._set_timer(PERIOD if soon else IDLE_PERIOD)
+
+    def _set_timer(self, seconds: float) -> None:
+        loop = self._connection.loop
+        self._due = loop.time() + seconds
+        self._timer = loop.call_later(seconds, self._tick)
 
     @property
     def _may_be_silent(self) -> bool:

@@ -1,4 +1,4 @@
-"""What is said to the camera: a request out, then a wait for its answer with a deadline.
+"""Send requests to the camera, and wait for each answer with a deadline.
 
 The wire has no correlation: an answer is matched by its kind, at most one request of a kind is
 open, and one that was cancelled leaves an owed answer which the next request of that kind awaits
@@ -25,8 +25,8 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
+from smartcam.protocols import Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Verdict
 
 if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
@@ -47,7 +47,7 @@ class Requests:
     _waits: Waits
     _state: CameraState
     # seconds that an answer may take, however short the deadline of who asks
-    _patience: float
+    patience: float
     _switch_patience: float  # the same of the answer to a switch
 
     def __post_init__(self) -> None:
@@ -186,9 +186,9 @@ class Requests:
 
         It may come later: it is due when an answer of its kind has had its usual time, too.
         """
-        patience = self._switch_patience if key is m.SwitchAnswer else self._patience
+        patience = self._switch_patience if key is m.SwitchAnswer else self.patience
         self._due[key] = max(deadline, asyncio.get_running_loop().time() + patience)
-        return self._waits.next_answer(key)
+        return self._waits.next_answer(key, behind=self._connection.require_link().deliveries)
 
     # ------------------------------------------------------------------ Query, and what it fences
 
@@ -197,19 +197,30 @@ class Requests:
         await self.await_owed(m.SwitchAnswer, m.Query(), deadline)
         await self.exchange(m.Query(), m.QueryAnswer, deadline)
 
-    def expect_fence(self, sent_at: float, deadline: float) -> None:
-        """Note that a Query went out in front of a trigger: its answer is owed to nobody."""
-        self._waits.expect_fence()
-        self._due[m.QueryAnswer] = max(deadline, sent_at + self._patience)
+    def expect_fences(self, count: int, sent_at: float, deadline: float) -> None:
+        """Note that Queries went out with a trigger: their answers are owed to nobody."""
+        self._waits.expect_fences(count)
+        self._due[m.QueryAnswer] = max(deadline, sent_at + self.patience)
+
+    def ask_status(self) -> None:
+        """Have the camera say its status, where it does not come by itself.
+
+        Raises:
+            ConnectionLostError: the link is gone.
+        """
+        link = self._connection.require_link()
+        link.send(m.GetStatus(), answered=False)
+        self._state.status_asked(link.loop.time())
 
     def ask_for_life(self, deadline: float) -> bool:
         """Send a Query unless one is open; its answer is awaited until ``deadline``."""
         if self._waits.owes(m.QueryAnswer):
             return False
-        link = self._connection.require_link()
-        if self._connection.features.polled:
-            link.send(m.GetStatus(), answered=False)  # so that it does not grow old
-        link.send(m.Query())
+        features = self._connection.features
+        # the status is not to grow old; over UDP an answer that is owed may have been lost
+        if features.polled and not (features.ordered and self._state.owes_status):
+            self.ask_status()
+        self._connection.require_link().send(m.Query())
         self.expect(m.QueryAnswer, deadline)
         return True
 
@@ -220,7 +231,7 @@ class Requests:
                 self._state.asked()
 
     def is_busy(self, answer: m.Acknowledgement) -> bool:
-        """Whether an answer says that the camera was too busy."""
+        """Return True if an answer says that the camera was too busy."""
         return self._connection.dialect.code(answer.code).verdict is Verdict.BUSY
 
     # ------------------------------------------------------------------ answers

@@ -1,11 +1,11 @@
-"""What becomes of each result: the trigger under way, whose each container is, who gets it."""
+"""Decide the fate of each result: the trigger under way, a stream, an account."""
 
 from __future__ import annotations
 
 import itertools
 import logging
 import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from smartcam._client.correlation import Correlation, Match, SentTrigger
@@ -31,8 +31,10 @@ if TYPE_CHECKING:
     from smartcam._client.counters import ClientCounters
     from smartcam._client.interpretation import Interpretation
     from smartcam._client.listeners import Listeners
-    from smartcam._client.requests import Requests
-    from smartcam.protocols._framed.machine import ResultBurst
+    from smartcam.protocols._inside import ResultBurst
+
+    # a container, its fate, its number, and when it came: loop time, and wall clock
+    _Unproven = tuple[m.ResultContainer, str, int | None, float, datetime]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
@@ -47,16 +49,18 @@ _CURRENT = {"triggered", "nobody"}
 
 @dataclass(slots=True, eq=False)
 class PendingTrigger(SentTrigger):
-    """The trigger under way, and who waits for it.
+    """The trigger under way, and the future of the caller that waits for it.
 
     Attributes:
-        outcome: gets the results or the error.
-        interpretation: how to read its results.
-        has_input: input data was sent with it.
-        sent_at: loop time.
-        triggered_at: wall clock, UTC.
-        application: the one that is believed to be active, None where any will do.
-        results: those that came.
+        outcome: future of the results or the error.
+        interpretation: interpretation that reads the results.
+        has_input: True if input data was sent with the trigger.
+        sent_at: loop time at which the trigger was sent.
+        triggered_at: time of the wall clock, UTC.
+        application: id of the application that is believed to be active, None where any will do.
+        results: results received so far.
+        unproven: containers that are its own if it turns out that the camera took it (whose fate is
+            ``triggered``), and what came behind them. They end with it.
     """
 
     outcome: asyncio.Future[list[Result]]
@@ -66,6 +70,7 @@ class PendingTrigger(SentTrigger):
     triggered_at: datetime
     application: int | None
     results: list[Result]
+    unproven: list[_Unproven] = field(init=False, default_factory=list)
 
     def fail(self, error: Exception) -> None:
         """Give its caller the reason why there are none."""
@@ -86,7 +91,6 @@ class Results:
 
     _name: str
     interpretation: Interpretation
-    _requests: Requests
     _state: CameraState
     _listeners: Listeners
     _counters: ClientCounters
@@ -96,14 +100,12 @@ class Results:
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
         self._numbering: Interpretation | None = None  # how to read numbers, once there are ours
-        # containers of which it is not known yet whether they are the trigger's
-        self._held: list[tuple[m.ResultContainer, float, datetime]] = []
         self._warned_extra = self._warned_others = False
         self._lossy = False  # a message may come twice, or not
         self._timer = DeadlineTimer(lambda: self.give_up(TimeoutError()))
 
     def begin_session(self, *, ordered: bool, complete: bool) -> None:
-        """A new session.
+        """Begin a session.
 
         Args:
             ordered: messages come in order and none is lost (TCP).
@@ -111,18 +113,17 @@ class Results:
         """
         self._warned_extra = self._warned_others = False
         self._lossy = not ordered
-        self.correlation.begin_session(ordered=complete)
+        self.correlation.begin_session(complete=complete)
 
     def fail(self, error: SmartCamError) -> None:
-        """The session is over: end the trigger under way.
+        """End the session, and with it the trigger under way.
 
         What it would have given may come in the next session: it is owed.
         """
         self.give_up(error)
-        self._release_held()
 
     def finish(self) -> None:
-        """There will be no session any more: leave nothing in the event loop."""
+        """End for good: leave nothing in the event loop."""
         self._timer.cancel()
 
     # ------------------------------------------------------------------ the trigger under way
@@ -130,16 +131,19 @@ class Results:
     def _awaited(self) -> PendingTrigger | None:
         """Return the trigger under way, as long as its caller waits."""
         pending = self._pending
-        if pending is None or pending.ended:
+        if pending is None:
             return None
-        if pending.outcome.cancelled():  # its caller was not woken yet
+        if pending.outcome.cancelled() and not pending.ended:  # its caller was not woken yet
             pending.ended = True
             self.correlation.give_up(pending)
-            return None
-        return pending
+        if not pending.ended:
+            return pending
+        if pending.unproven:
+            self._release(pending)
+        return None
 
     def begin_trigger(self, pending: PendingTrigger, deadline: float) -> None:
-        """A trigger is sent now; from ``deadline`` (loop time) on its results are late."""
+        """Note that a trigger is sent; from ``deadline`` (loop time) on its results are late."""
         self._pending = pending
         self._timer.set(deadline)
         if pending.number is not None:
@@ -147,12 +151,13 @@ class Results:
         self.correlation.send(pending)
 
     def end_trigger(self) -> None:
-        """Its caller goes on."""
-        self._pending = None
+        """Note that the trigger's caller goes on."""
+        pending, self._pending = self._pending, None
+        if pending is not None and pending.unproven:
+            pending.ended = True
+            self._release(pending)
         self._timer.clear()
         self.correlation.leave()
-        if self._held:
-            self._release_held()
 
     def give_up(self, error: Exception) -> None:
         """End the trigger under way with an error; its results are late from this moment on."""
@@ -160,6 +165,7 @@ class Results:
         if pending is not None:
             self.correlation.give_up(pending)
             pending.fail(error)
+            self._release(pending)
 
     def input_sent(self) -> None:
         """Input data went out with the trigger, and nothing says that it was taken."""
@@ -168,25 +174,38 @@ class Results:
     # ------------------------------------------------------------------ what comes
 
     def on_switched(self) -> None:
-        """Another application was loaded: nothing of before can come."""
+        """Forget older results: another application was loaded, so none can come."""
         self.input_in_doubt = False
         self.correlation.settled()
 
-    def on_fence(self) -> None:
-        """The Query in front of the last trigger is answered."""
-        self.correlation.on_fence(self._state.bits)
+    def on_query_answer(self, now: float) -> None:
+        """Note that a Query which was written with the last trigger is answered."""
+        self.correlation.on_query_answer()
+        self._decide(now)
 
-    def on_query_answer(self) -> None:
-        """Another Query is answered."""
-        if self._held:
-            self.correlation.on_query_answer()
-            self._release_held()
+    def on_trigger_answer(self, now: float) -> None:
+        """Note that the last trigger is answered, and was not refused."""
+        self.correlation.on_trigger_answer()
+        self._decide(now)
 
-    def on_trigger_answer(self) -> bool:
-        """A trigger is answered; return whether a status behind that is to confirm it."""
-        self.correlation.on_answer()
-        pending = self._pending
-        return pending is not None and not pending.progress.confirmed
+    def _decide(self, now: float) -> None:
+        """End the trigger under way if what the camera has said of it by now is enough for that."""
+        pending = self._awaited()
+        if pending is None:
+            return
+        if pending.evidence.doubtful:
+            self._fail(
+                pending,
+                OvertriggeredError(
+                    f"{self._name}: it cannot be told whose the result is: something else has "
+                    "triggered the camera at the same time, or an answer of it is missing"
+                ),
+            )
+        else:
+            if pending.unproven and pending.evidence.proven:
+                self._release(pending)
+            if pending.results:
+                self._complete(pending, now)
 
     def on_status(self, previous: int | None, bits: int, now: float) -> None:
         """Take a status.
@@ -201,11 +220,8 @@ class Results:
             self._fail_trigger(bits & ~was, was & ~bits)
         if self.correlation.on_status(previous, bits):
             self._note_others()
-        if self._held:
-            self._release_held()
-        pending = self._pending
-        if pending is not None and pending.results and not pending.ended:
-            self._complete(pending, now)
+        if self._pending is not None:
+            self._decide(now)
 
     def _fail_trigger(self, risen: int, fallen: int) -> None:
         """End the trigger under way where the status says that its result cannot be trusted."""
@@ -227,12 +243,31 @@ class Results:
             )
         elif fallen & Status.RUNNING:
             error = NotRunningError(
-                f"{self._name}: somebody else stopped application {self._state.active} during the "
+                f"{self._name}: somebody else stopped {self._state.active_text} during the "
                 f"inspection, which voids it; status: {self._state.status}"
             )
         if error is not None:
-            self.correlation.give_up(pending, "streamed")  # what still comes is nobody's
-            pending.fail(error)
+            self._fail(pending, error)
+
+    def _fail(self, pending: PendingTrigger, error: SmartCamError) -> None:
+        """End the trigger under way; nobody can tell whose what still comes is."""
+        self.correlation.give_up(pending, "streamed")
+        pending.fail(error)
+        self._release(pending)
+
+    def _release(self, pending: PendingTrigger) -> None:
+        """Hand on what waited for the proof: as the trigger's, or if it has ended an older's."""
+        unproven, pending.unproven = pending.unproven, []
+        if not pending.ended:
+            pending.came -= sum(fate == "triggered" for _, fate, *_ in unproven)
+        for container, fate, number, now, at in unproven:
+            if fate != "triggered":
+                self._hand_on(container, None, fate, number, now, at)
+            elif not pending.ended:  # which it has where the one before could not be read
+                self._hand_on(container, pending, fate, number, now, at)
+            else:
+                older = self.correlation.judge_older(number).fate
+                self._hand_on(container, None, older, number, now, at)
 
     def on_burst(self, burst: ResultBurst, now: float, at: datetime) -> None:
         """Count and hand on several containers at once; one by one where they may differ."""
@@ -250,7 +285,7 @@ class Results:
 
     @property
     def only_streams(self) -> bool:
-        """Whether what comes goes to streams, and to nobody else, whatever statuses come between.
+        """True if results go to streams, and to nobody else, whatever statuses come between.
 
         None of it can be a trigger's or pay a debt, nor count as an extra result.
         """
@@ -286,27 +321,13 @@ class Results:
         rows = zip(*fields, strict=False)
         return list(map(new_tuple, itertools.repeat(Result), rows))
 
-    def _release_held(self) -> None:
-        """Give the containers their fate of which it was not known whether they are the trigger's.
-
-        They are, if nothing of it was seen to begin since; what came before that is older.
-        """
-        held, self._held = self._held, []
-        pending = self._awaited()
-        older = pending is None or pending.progress.begun
-        for container, now, at in held:
-            self.on_result(container, now, at, older=older)
-
-    def on_result(
-        self, container: m.ResultContainer, now: float, at: datetime, *, older: bool = False
-    ) -> None:
+    def on_result(self, container: m.ResultContainer, now: float, at: datetime) -> None:
         """Give a container its fate.
 
         Args:
-            container: it.
-            now: loop time when it came.
-            at: the same on the wall clock.
-            older: it is known not to be of the trigger under way.
+            container: container received.
+            now: loop time at which the container came.
+            at: time of the wall clock at which the container came.
         """
         state, counters, pending = self._state, self._counters, self._awaited()
         active, expected = state.active, state.expected
@@ -327,17 +348,18 @@ class Results:
         numbering = self._numbering
         number = numbering.number(container, state.endian) if numbering is not None else None
         correlation = self.correlation
-        match = correlation.judge_older(number) if older else correlation.judge(number)
-        if match.fate == "held":
-            if pending is not None and len(self._held) < pending.wanted:
-                self._held.append((container, now, at))
-                self._requests.ask_what_is_active()
-                return
-            match = correlation.judge_older(number)
+        told = container.asked
+        match = correlation.judge(number) if told is None else correlation.judge_told(told)
         if self._lossy and match.fate == "triggered" and self._is_double(container, pending):
             match = Match("nobody", extra=True)
         if match.extra:
             self._note_extra()
+        ours = match.fate == "triggered" and pending is not None
+        if pending is not None and (pending.unproven or (ours and not pending.evidence.proven)):
+            pending.unproven.append((container, match.fate, number, now, at))
+            if ours:
+                pending.came += 1
+            return
         owner = pending if match.fate == "triggered" else None
         self._hand_on(container, owner, match.fate, number, now, at)
 
@@ -377,7 +399,7 @@ class Results:
             self._complete(owner, now)
 
     def _is_double(self, container: m.ResultContainer, pending: PendingTrigger | None) -> bool:
-        """Whether it is a datagram that came twice, as far as can be told: one like it is there."""
+        """Return True if a container equal to this one is there, as when a datagram comes twice."""
         results = pending.results if pending is not None else []
         return any(one.raw == container.data for one in results)
 
@@ -418,7 +440,7 @@ class Results:
 
     def _complete(self, owner: PendingTrigger, now: float) -> None:
         """End the trigger under way if it has all its results, and nothing speaks against it."""
-        if owner.came < owner.wanted or not owner.progress.confirmed or owner.outcome.done():
+        if owner.came < owner.wanted or not owner.evidence.proven or owner.outcome.done():
             return
         if owner.has_input:
             self.input_in_doubt = False

@@ -1,4 +1,4 @@
-"""What the camera's status is: having it told, and waiting for it."""
+"""Get the camera's status, and wait for it."""
 
 from __future__ import annotations
 
@@ -67,13 +67,14 @@ class StatusRequests:
         """Wait for a status.
 
         Args:
-            predicate: says which.
+            predicate: function that returns True for the status awaited.
             deadline: loop time.
-            what: it in words.
-            insist: have it said again where it may have been lost.
+            what: description of the status awaited, for the error.
+            insist: ask for the status again where a report of it may have been lost.
 
         Raises:
-            ResponseTimeoutError: says what was waited for and what the status is.
+            ResponseTimeoutError: the status did not come in time; the text names it and the last
+                one.
         """
         begin = asyncio.get_running_loop().time()
         try:
@@ -126,7 +127,7 @@ class StatusRequests:
         """
         link = self._connection.require_link()
         if self._connection.features.polled:
-            link.send(m.GetStatus(), answered=False)
+            self._requests.ask_status()
             return
         try:
             await self._requests.fence(deadline)
@@ -147,7 +148,7 @@ class StatusRequests:
             return
         heard = self._state.statuses_heard
         while True:  # a datagram may be lost
-            connection.require_link().send(m.GetStatus(), answered=False)
+            self._requests.ask_status()
             await self._requests.fence(deadline)
             if self._state.statuses_heard != heard:
                 return

@@ -3,30 +3,37 @@
 One task per client, its only bare ``create_task``. It makes a session, has the receive
 task read its link to the end, tells everybody that it is over, and by the
 :class:`~smartcam.Backoff` makes the next. When the camera was lost again soon after a
-reconnect another client has it: then it stops.
+reconnect another client has it: then it stops or, at an agent, tries again slowly. What has to
+follow its end is done by a callback, since a task that is cancelled before its first step runs no
+``finally``.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from smartcam._client.handshake import Session, establish
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import (
     ConnectionClosedError,
     ConnectionLostError,
     ConnectionTakenError,
+    LinkError,
     ResponseTimeoutError,
     SmartCamError,
 )
 from smartcam.models import Connected, Disconnected, Reconnected
-from smartcam.protocols._base import Transport
+from smartcam.protocols import Transport
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam._client.command_lock import CommandLock
     from smartcam._client.commands import Commands
     from smartcam._client.connection import Connection
@@ -46,12 +53,20 @@ TAKEN_WITHIN = 10.0
 client (a decision of this library; the camera does not say so)."""
 
 
+FIRST_RETRY_DELAY_OF_TAKEN = 30.0
+MAX_RETRY_DELAY_OF_TAKEN = 600.0
+"""Seconds until a camera that was taken is tried again, where it is: twice as long each time that
+it is taken again. Each try costs the other client its session for a moment."""
+
+
 @dataclass(eq=False)
 class Supervisor:
     """Makes sessions and reads them.
 
     Attributes:
         session: the last session that was made, None before the first.
+        on_taken: is called when the camera was taken, and has it tried again slowly; None: a camera
+            that was taken is the end.
     """
 
     _settings: CameraSettings
@@ -68,12 +83,15 @@ class Supervisor:
     def __post_init__(self) -> None:
         self.session: Session | None = None
         self._name = self._settings.name
-        self._task: asyncio.Task[None] | None = None
+        self._task: asyncio.Task[SmartCamError] | None = None
         self._opened: asyncio.Future[SmartCamError | None] | None = None
         self._changed = asyncio.Event()
         self._closing = False
         self._ended_by: SmartCamError | None = None  # why there is no more session, if not by us
         self._reading = False  # a link, whose end it notices by itself
+        self.on_taken: Callable[[], None] | None = None
+        self._times_taken = 0  # in a row
+        self._take_back = asyncio.Event()
         self._short_lived = 0  # sessions in a row that were lost soon
         self._excused = False  # an early loss of this session is no other client's doing
         self._restarting: Link | None = None  # the camera was told to restart over this link
@@ -82,12 +100,12 @@ class Supervisor:
 
     @property
     def started(self) -> bool:
-        """Whether it was ever started."""
+        """True if the supervisor was ever started."""
         return self._task is not None
 
     @property
     def over(self) -> bool:
-        """Whether there will be no session any more."""
+        """True if there will be no session any more."""
         return self._closing or self._ended_by is not None
 
     @property
@@ -97,9 +115,13 @@ class Supervisor:
 
     @property
     def connected(self) -> bool:
-        """Whether there is a session."""
+        """True while there is a session."""
         session = self.session
         return session is not None and not session.link.lost and self._waits.end is None
+
+    def go_by(self, settings: CameraSettings) -> None:
+        """Make sessions by other settings; before it is started."""
+        self._settings = settings
 
     async def open(self) -> None:
         """Start, and wait for the first session.
@@ -111,6 +133,7 @@ class Supervisor:
         self._task = asyncio.create_task(
             self._run(), name=f"smartcam[{self._settings.address.host}].supervisor"
         )
+        self._task.add_done_callback(self._end)
         await asyncio.wait({self._opened})
         error = self._opened.result()
         if error is not None:
@@ -134,14 +157,32 @@ class Supervisor:
                 await session.link.close(self._settings.close_timeout)
         finally:
             self._dispatch.fail(self.closed_error())
-            if session is not None:
-                session.link.give_up(ConnectionAbortedError("closed by this side"))
+            self._drop()
             if task is not None:
-                if not self._reading:
-                    task.cancel()
                 await asyncio.wait({task})
             self._dispatch.finish(self._ended_by or self.closed_error())
             self._commands.end_session()
+
+    def abandon(self) -> bool:
+        """Drop the link and end the task soon, from any thread: nobody has the client any more.
+
+        Returns:
+            Whether there was anything to end.
+        """
+        task = self._task
+        if task is None or task.done():
+            return False
+        self._closing = True
+        with contextlib.suppress(RuntimeError):  # the loop is closed, and its links with it
+            task.get_loop().call_soon_threadsafe(self._drop)
+        return True
+
+    def _drop(self) -> None:
+        """Drop the link at once, Disconnect said, and have the task end."""
+        if self.session is not None:
+            self.session.link.give_up(ConnectionAbortedError("closed by this side"))
+        if self._task is not None and not self._reading:
+            self._task.cancel()
 
     async def wait_connected(self, deadline: float, timeout: float) -> None:
         """Wait until there is a session, and what had to be restored in it is.
@@ -168,8 +209,18 @@ class Supervisor:
                 waited=timeout,
             ) from exc
 
+    @property
+    def taken(self) -> bool:
+        """True if another client has the camera."""
+        return isinstance(self._waits.end, ConnectionTakenError)
+
+    def take_back(self) -> None:
+        """Have a camera that was taken tried again now."""
+        if self.taken:
+            self._take_back.set()
+
     def restarts(self, link: Link) -> None:
-        """The camera was told to restart over this link: it ends, and that is no fault."""
+        """Note that the camera was told to restart: the link ends, and that is no fault."""
         self._restarting = link
 
     def closed_error(self) -> ConnectionClosedError:
@@ -182,36 +233,54 @@ class Supervisor:
 
     # ------------------------------------------------------------------ the task
 
-    async def _run(self) -> None:
-        """Make sessions until one ends for good; then tell everybody."""
-        error: SmartCamError = self.closed_error()
-        try:
-            error = await self._live()
-        except SmartCamError as exc:
-            error = exc
-        except Exception as exc:  # nobody must wait for a dead supervisor
-            logger.exception("%s ! the supervisor failed", self._name)
-            cause = exc.exceptions[0] if isinstance(exc, ExceptionGroup) else exc
-            error = ConnectionLostError(f"{self._name}: {cause!r} in the client")
-            error.__cause__ = cause
-        finally:
-            self._dispatch.fail(error)
+    def _end(self, task: asyncio.Task[SmartCamError]) -> None:
+        """Tell everybody that there will be no session any more: the task is over."""
+        error = self._reason(task)
+        self._dispatch.fail(error)
+        if self._closing:
+            error = self.closed_error()  # whatever it was before
+        else:
+            self._ended_by = error
+        if self.session is not None:
+            self.session.link.abort()
+        self._counters.end()
+        self._dispatch.finish(error)
+        self._commands.end_session()
+        self._tell()
+        if self._opened is not None and not self._opened.done():
+            self._opened.set_result(error)
+
+    def _reason(self, task: asyncio.Task[SmartCamError]) -> SmartCamError:
+        """Return why a task that is over made its last session."""
+        if task.cancelled():
             if self._closing:
-                error = self.closed_error()  # whatever it was before
-            else:
-                self._ended_by = error
-            if self.session is not None:
-                self.session.link.abort()
-            self._counters.end()
-            self._dispatch.finish(error)
-            self._commands.end_session()
-            self._tell()
-            if self._opened is not None and not self._opened.done():
-                self._opened.set_result(error)
+                return self.closed_error()
+            return self._failed(asyncio.CancelledError("the client's own task was cancelled"))
+        cause = task.exception()
+        if cause is None:
+            return task.result()
+        if isinstance(cause, SmartCamError):
+            return cause
+        if isinstance(cause, BaseExceptionGroup):
+            cause = cause.exceptions[0]
+        logger.error("%s ! the supervisor failed", self._name, exc_info=cause)
+        return self._failed(cause)
+
+    def _failed(self, cause: BaseException) -> ConnectionLostError:
+        error = ConnectionLostError(f"{self._name}: {cause!r} in the client")
+        error.__cause__ = cause
+        return error
+
+    async def _run(self) -> SmartCamError:
+        try:
+            return await self._live()
+        except ENDS_PROGRAM as exc:
+            # the receive task has raised it out of the event loop, which is to clean up in peace
+            return self._failed(exc)
 
     async def _live(self) -> SmartCamError:
         """Have sessions; return why there will be no more."""
-        session = await establish(self._settings, self._observers.trace)
+        session = await establish(self._settings, self._observers.trace, self._dispatch.layout)
         while True:
             again = self.session is not None
             error = await self._have(session)
@@ -219,12 +288,20 @@ class Supervisor:
             restarting, self._restarting = self._restarting is session.link, None
             if self._closing or self._settings.reconnect is None:
                 return error
-            silence = _silence(error, self._settings.liveness_timeout)
-            short = asyncio.get_running_loop().time() - silence - made_at < TAKEN_WITHIN
             ordered = session.link.machine.transport is Transport.TCP
+            # over UDP only silence tells that it is another's, which it was before that began
+            now = asyncio.get_running_loop().time()
+            short = (now if ordered else session.link.heard_at) - made_at < TAKEN_WITHIN
             takes = session.dialect.exclusive and _may_be_taken(error, ordered=ordered)
             if again and short and not self._excused and takes:
-                return self._taken(error)
+                taken = self._taken(error)
+                if self.on_taken is None:
+                    return taken
+                await self._lock.vacated()
+                session = await self._retry_taken(taken, self.on_taken)
+                continue
+            if not short:
+                self._times_taken = 0
             self._short_lived = self._short_lived + 1 if again and short else 0
             self._excused = restarting
             await self._lock.vacated()
@@ -266,7 +343,7 @@ class Supervisor:
         self._tell()
 
     async def _receive(self, link: Link) -> ConnectionLostError:
-        """The receive task: have each chunk dispatched until the link ends; return why it did."""
+        """Have each chunk dispatched until the link ends; return the reason for its end."""
         while True:
             try:
                 chunk = await link.receive()
@@ -291,8 +368,25 @@ class Supervisor:
         )
         self._tell()
 
-    async def _reconnect(self, loss: ConnectionLostError) -> Session:
-        """Make a new session, as often as the policy says.
+    async def _retry_taken(self, taken: ConnectionTakenError, tell: Callable[[], None]) -> Session:
+        """Make a new session after a long pause, or as soon as somebody takes the camera back.
+
+        Raises:
+            SmartCamError: it was given up.
+        """
+        pause = self._pause_of_taken
+        self._waits.end = taken
+        self._times_taken += 1
+        self._take_back.clear()
+        tell()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(pause):
+                await self._take_back.wait()
+        # a camera that does not answer is nobody's: from then on it is awaited like any other
+        return await self._reconnect(taken, at_once=True)
+
+    async def _reconnect(self, loss: LinkError, *, at_once: bool = False) -> Session:
+        """Make a new session, as often as the policy says; ``at_once``: without a first pause.
 
         Raises:
             SmartCamError: it was given up.
@@ -301,10 +395,11 @@ class Supervisor:
         settings = self._settings.model_copy(update={"address": self.address})
         failed: SmartCamError = loss
         if policy is not None:
-            for tried, delay in enumerate(policy.delays(short_lived=self._short_lived), 1):
+            delays = policy.delays(short_lived=self._short_lived)
+            for tried, delay in enumerate(itertools.chain([0.0] * at_once, delays), 1):
                 await asyncio.sleep(delay)
                 try:
-                    return await establish(settings, self._observers.trace)
+                    return await establish(settings, self._observers.trace, self._dispatch.layout)
                 except SmartCamError as exc:
                     failed = exc
                 level = logging.WARNING if tried == 1 else logging.DEBUG
@@ -321,9 +416,12 @@ class Supervisor:
 
     def _taken(self, error: ConnectionLostError) -> ConnectionTakenError:
         address = self.address
+        what = f"stopped, so as not to fight for it ({error})"
+        if self.on_taken is not None:
+            what = f"it is tried again in {self._pause_of_taken:.0f} s ({error})"
         taken = ConnectionTakenError(
             f"{self._name}: lost again right after a reconnect: another client has the "
-            f"camera, which serves one; stopped, so as not to fight for it ({error})",
+            f"camera, which serves one; {what}",
             host=address.host,
             port=address.port,
         )
@@ -333,24 +431,26 @@ class Supervisor:
         self._observers.error(self._name, taken)
         return taken
 
+    @property
+    def _pause_of_taken(self) -> float:
+        """Seconds until a camera that was taken is tried again."""
+        doubled = min(self._times_taken, 16)  # of what is far beyond the longest pause
+        return min(FIRST_RETRY_DELAY_OF_TAKEN * 2.0**doubled, MAX_RETRY_DELAY_OF_TAKEN)
+
     def _tell(self) -> None:
         """Wake who waits for a change of the connection."""
         self._changed.set()
         self._changed = asyncio.Event()
 
 
-def _silence(error: ConnectionLostError, liveness_timeout: float | None) -> float:
-    """Return the seconds since a link was lost when it is noticed: only silence may tell."""
-    cause = error.__cause__
-    if isinstance(cause, ResponseTimeoutError) or not isinstance(cause, TimeoutError):
-        return 0.0
-    return liveness_timeout or 0.0
-
-
 def _may_be_taken(error: ConnectionLostError, *, ordered: bool) -> bool:
-    """Whether it may be another client's doing.
+    """Return True if the loss may be another client's doing.
 
-    A broken frame and a fault of ours are not, nor, on TCP, is an answer that came too late for us.
+    On TCP the camera closes the connection of the client that it serves no more, so nothing but
+    that counts. Over UDP it only falls silent. A broken frame, a fault of this program, and a
+    network or a port that is gone never count.
     """
     cause = error.__cause__
-    return isinstance(cause, OSError) and not (ordered and isinstance(cause, ResponseTimeoutError))
+    if isinstance(cause, ConnectionRefusedError):
+        return False
+    return isinstance(cause, ConnectionError if ordered else (ConnectionError, TimeoutError))

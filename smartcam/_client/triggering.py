@@ -8,11 +8,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from smartcam._client.correlation import Progress
+from smartcam._client.correlation import (
+    EvidenceByAcknowledgement,
+    EvidenceByAnswer,
+    EvidenceByFence,
+    EvidenceByStatus,
+    TriggerEvidence,
+)
 from smartcam._client.results import PendingTrigger
 from smartcam._client.status import is_ready
 from smartcam.exceptions import (
@@ -21,6 +28,7 @@ from smartcam.exceptions import (
     CommandRejectedError,
     InputContainerError,
     NotRunningError,
+    OvertriggeredError,
     ResponseTimeoutError,
     SmartCamError,
     TriggerTimeoutError,
@@ -36,7 +44,7 @@ if TYPE_CHECKING:
 
     from smartcam._client.camera_state import CameraState
     from smartcam._client.commands import Commands
-    from smartcam._client.connection import Connection
+    from smartcam._client.connection import Connection, Features
     from smartcam._client.interpretation import Interpretation
     from smartcam._client.link import Link
     from smartcam._client.polling import Polling
@@ -59,17 +67,29 @@ late, and stopping and starting an application costs more."""
 
 OVERTRIGGERED_GRACE = 1.0
 """Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set it
-cannot tell that ours was dropped; a camera on which it stays set must not stop the line."""
+cannot tell that ours was dropped, so no trigger is sent."""
+
+WAITED_SHARE = 0.5
+"""Share of a trigger's timeout below which what is left shows that the trigger had to wait."""
+
+MIN_TIMEOUT_SHARE = 0.01
+"""Share of its timeout that a trigger which had to wait needs at least."""
+
+READING_SHARE = 0.8
+"""Share of the time until its deadline after which a trigger is ended on a camera that goes on
+until it is told to end. The rest is for its answer."""
 
 _WHY_READY = "; it does not while it inspects, and an application that runs free never does"
 
 
-_FENCE, _TRIGGER = m.Query(), m.Trigger()
+_HINT = "; where it never shows that, shows_triggers=no in its URL lets results do without"
+
+_QUERY, _TRIGGER, _GET_STATUS = m.Query(), m.Trigger(), m.GetStatus()
 
 
 @dataclass(slots=True)
 class TriggerRequest:
-    """What a trigger is to do.
+    """The arguments of a trigger, checked.
 
     Attributes:
         interpretation: how to read its results.
@@ -92,7 +112,7 @@ def is_stopped(status: Status) -> bool:
 
 
 def takes_trigger(status: Status) -> bool:
-    """The camera waits for a trigger and is not BUSY."""
+    """Return True if the camera waits for a trigger and is not BUSY."""
     return Status.WAITING_FOR_TRIGGER in status and Status.BUSY not in status
 
 
@@ -113,31 +133,69 @@ class Triggers:
         self._name = self._connection.name
         self._correlation = self._results.correlation
         self._doubtful: Link | None = None  # over UDP: a status may have been lost on it
+        self._quickest = 0.0
+        self._quickest_of: int | None = None  # the application
 
     def give_number(self, number: int) -> None:
         """Note that the user has set the number of the next run."""
         self._correlation.give_number(number)
 
+    def _check_time(self, deadline: float, timeout: float) -> None:
+        """See that a trigger which has waited has the time that a result takes.
+
+        One that is sent all the same ends without its result, which then comes late, and the next
+        trigger has to settle that first.
+
+        Raises:
+            ResponseTimeoutError: less time is left than the quickest result of this application
+                took, or than a hundredth of the timeout.
+        """
+        left = deadline - asyncio.get_running_loop().time()
+        if left >= WAITED_SHARE * timeout:
+            return
+        quickest = self._quickest if self._quickest_of == self._state.active else 0.0
+        needed = max(quickest, MIN_TIMEOUT_SHARE * timeout)
+        if left < needed:
+            waited = timeout - left
+            raise ResponseTimeoutError(
+                f"{self._name}: the camera took the trigger after {waited:.3g} s of {timeout:g} s "
+                f"only, and a result takes {needed:.3g} s at least",
+                waited=waited,
+            )
+
+    def _note_time(self, pending: PendingTrigger) -> None:
+        """Remember how long the quickest trigger of the active application took."""
+        took = asyncio.get_running_loop().time() - pending.sent_at
+        if self._quickest_of != self._state.active or took < self._quickest:
+            self._quickest, self._quickest_of = took, self._state.active
+
     def trigger(
-        self, request: TriggerRequest, deadline: float
+        self, request: TriggerRequest, deadline: float, timeout: float
     ) -> Coroutine[Any, Any, list[Result]]:
         """Wait until the camera takes a trigger, send it, return its results.
+
+        Args:
+            request: what to do.
+            deadline: loop time at which the trigger ends.
+            timeout: seconds that were given to it.
 
         Raises:
             SmartCamError: one of the outcomes of :meth:`Camera.trigger`.
         """
         if self._connection.features.acknowledged:
-            return self._trigger_until_taken(request, deadline)
-        return self._trigger_once(request, deadline)
+            return self._trigger_until_taken(request, deadline, timeout)
+        return self._trigger_once(request, deadline, timeout)
 
-    async def _trigger_until_taken(self, request: TriggerRequest, deadline: float) -> list[Result]:
+    async def _trigger_until_taken(
+        self, request: TriggerRequest, deadline: float, timeout: float
+    ) -> list[Result]:
         """Trigger again where the camera says that it was too busy for it."""
         busy: CameraBusyError | None = None
         while True:
             try:
                 if busy is not None:
                     await self._status.pause(deadline, "the camera to take a trigger")
-                return await self._trigger_once(request, deadline)
+                return await self._trigger_once(request, deadline, timeout)
             except CameraBusyError as exc:
                 if not request.wait:
                     raise
@@ -147,7 +205,9 @@ class Triggers:
                     raise
                 raise TriggerTimeoutError(f"{exc}; {busy}", waited=exc.waited) from busy
 
-    async def _trigger_once(self, request: TriggerRequest, deadline: float) -> list[Result]:
+    async def _trigger_once(
+        self, request: TriggerRequest, deadline: float, timeout: float
+    ) -> list[Result]:
         """Send one trigger as soon as the camera takes it, return its results.
 
         Raises:
@@ -160,7 +220,6 @@ class Triggers:
             correlation.heard()
         if state.bits & _SYSTEM_ERROR:
             raise self._fault()
-        cleared = False
         if request.input_data is not None and self._results.input_in_doubt:
             raise InputContainerError(
                 f"{self._name}: input data of an earlier trigger, which had no result, may still "
@@ -188,23 +247,19 @@ class Triggers:
             status = state.bits
             if status & _SPEAKS_AGAINST != _WAITING:
                 await self._wait_for_trigger(deadline, wait=request.wait)
-            elif status & _OVERTRIGGERED and not cleared:
-                cleared = True
+            elif status & _OVERTRIGGERED:
                 await self._clear_overtriggered(deadline)
             elif features.fences and self._waits.owes(m.QueryAnswer):  # one can be open
                 await self._requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
             else:
                 break
-        number, certain = None, False
-        if numbering is not None:
-            number, certain = correlation.take_number(numbering.highest)
-        fenced = features.fences and not (certain and decided)
+        self._check_time(deadline, timeout)
+        number = None if numbering is None else correlation.take_number(numbering.highest)
         link = connection.require_link()
         pending = PendingTrigger(
             request.results,
             number,
-            certain,
-            Progress(not fenced, not features.confirms),
+            _evidence(features),
             link.loop.create_future(),
             interpretation,
             request.input_data is not None,
@@ -220,58 +275,83 @@ class Triggers:
         self, pending: PendingTrigger, link: Link, input_data: bytes | None, deadline: float
     ) -> list[Result]:
         requests, features, outcome = self._requests, self._connection.features, pending.outcome
-        fenced = not pending.progress.reached
-        words: list[m.Message] = [_FENCE] if fenced else []
+        asked = features.fences and features.polled and features.shows_triggers
+        words: list[m.Message] = [_QUERY] if features.fences else []
+        if asked:
+            words.append(_GET_STATUS)
         if pending.number is not None:
             words.append(m.SetSequenceNumber(number=pending.number))
         if features.acknowledged:
             await requests.await_owed(m.TriggerAnswer, m.Trigger(), deadline)
         if input_data is not None and link.machine.dialect.answers(m.SetInput):
             await requests.command(m.SetInput(data=input_data), deadline)
-            if fenced and self._waits.owes(m.QueryAnswer):
-                await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
         elif input_data is not None:
             words.append(m.SetInput(data=input_data))
         words.append(_TRIGGER)
+        if features.fences and features.shows_triggers:
+            words.append(_GET_STATUS if asked else _QUERY)
+        while True:  # another task may have asked whenever this one has waited
+            if features.acknowledged and self._waits.owes(m.TriggerAnswer):
+                await requests.await_owed(m.TriggerAnswer, _TRIGGER, deadline)
+            elif features.fences and self._waits.owes(m.QueryAnswer):
+                await requests.await_owed(m.QueryAnswer, _TRIGGER, deadline)
+            else:
+                break
         self._results.begin_trigger(pending, deadline)
+        ending: asyncio.TimerHandle | None = None
         try:
             link.send_all(words)
-            if fenced:
-                requests.expect_fence(pending.sent_at, deadline)
+            if features.ends_triggers:
+                end = pending.sent_at + READING_SHARE * (deadline - pending.sent_at)
+                ending = link.loop.call_at(end, self._end_reading, link)
+            if features.fences:
+                requests.expect_fences(words.count(_QUERY), pending.sent_at, deadline)
             if features.acknowledged:
                 self._expect_acknowledgement(pending, deadline)
             elif input_data is not None:
                 self._results.input_sent()
             if features.polled:
-                self._polling.begin_trigger()
+                self._polling.begin_trigger(words.count(_GET_STATUS))
             if not link.is_writable():
                 with contextlib.suppress(TimeoutError):  # at which the outcome is one, too
                     async with asyncio.timeout_at(deadline):
                         await link.drain()
-            return await outcome  # TimeoutError: the timer of Results, at the deadline
+            results = await outcome  # TimeoutError: the timer of Results, at the deadline
         except TimeoutError as exc:
             self._correlation.give_up(pending)
             # it may have been stopped: then Waiting did not drop for this trigger
-            certain = features.ordered or pending.progress.begun
+            certain = features.ordered or pending.evidence.began
             self._doubtful = None if certain else link
             waited = max(0.0, deadline - pending.sent_at)
             came = f"{len(pending.results)} of {pending.wanted} results"
             raise TriggerTimeoutError(
                 f"{self._name}: {came if pending.results else 'no result'} within "
                 f"{round(waited, 2):g} s of the trigger; status: {self._status.last}"
-                f"{_told_of_fence(pending)}",
+                f"{_what_is_missing(pending)}",
                 waited=waited,
             ) from exc
         except asyncio.CancelledError:
             if not outcome.done() or outcome.cancelled():
                 self._correlation.give_up(pending)
+                if ending is not None and not ending.cancelled():
+                    self._end_reading(link)
             else:
                 outcome.exception()  # nobody will look at it
             raise
+        else:
+            self._note_time(pending)
+            return results
         finally:
+            if ending is not None:
+                ending.cancel()
             if features.polled:
                 self._polling.end_trigger()
             self._results.end_trigger()
+
+    def _end_reading(self, link: Link) -> None:
+        """Have the camera end the trigger under way, which it would not do by itself."""
+        with contextlib.suppress(SmartCamError):  # the link is over, and the trigger with it
+            link.send(m.EndTrigger(), answered=False)
 
     def _expect_acknowledgement(self, pending: PendingTrigger, deadline: float) -> None:
         """Have the trigger end at once where the camera says that it took none."""
@@ -311,6 +391,9 @@ class Triggers:
     async def _wait_for_trigger(self, deadline: float, *, wait: bool) -> None:
         """Wait until the camera takes a trigger, or say why it never will."""
         begin = asyncio.get_running_loop().time()
+        ends_at = math.inf  # when a trigger that is not ours is ended
+        if self._connection.features.ends_triggers:
+            ends_at = begin + min(self._requests.patience, 0.5 * (deadline - begin))
         while True:
             if self._state.bits & _SYSTEM_ERROR:
                 raise self._fault()
@@ -319,16 +402,20 @@ class Triggers:
                 return
             if is_stopped(status):
                 raise NotRunningError(
-                    f"{self._name}: application {self._state.active} is stopped: start it, or name "
-                    f"it so that it is started; status: {status}"
+                    f"{self._name}: {self._state.active_text} is stopped: start it, or name it so "
+                    f"that it is started; status: {status}"
                 )
             if not wait:
                 raise CameraBusyError(
                     f"{self._name}: the camera does not wait for a trigger: {status}"
                 )
             try:
-                await self._status.insist(_is_decided, deadline)
+                await self._status.insist(_is_decided, min(deadline, ends_at))
             except TimeoutError as exc:
+                if asyncio.get_running_loop().time() < deadline:
+                    ends_at = math.inf
+                    await self._end_stranger(deadline)
+                    continue
                 free = _WHY_READY if is_ready(status) else ""
                 waited = max(0.0, deadline - begin)
                 raise TriggerTimeoutError(
@@ -336,6 +423,13 @@ class Triggers:
                     f"{round(waited, 2):g} s; status: {self._status.last}{free}",
                     waited=waited,
                 ) from exc
+
+    async def _end_stranger(self, deadline: float) -> None:
+        """End a trigger that is not ours, such as one whose link broke: the camera never would."""
+        ours = self._waits.owes(m.TriggerAnswer)
+        if Status.BUSY in self._status.last and not ours:
+            self._end_reading(self._connection.require_link())
+            await self._requests.fence(deadline)  # a line that comes of it is not the next one's
 
     def _fault(self) -> CameraFaultError:
         return CameraFaultError(f"{self._name}: the camera reports System Error")
@@ -370,35 +464,54 @@ class Triggers:
         correlation.settled()
 
     async def _clear_overtriggered(self, deadline: float) -> None:
-        """Reset Overtriggered, or wait a moment for it to fall: only then can it rise for ours.
+        """Reset Overtriggered, or wait until it has fallen: only then can it rise for ours.
 
         Source: it falls by itself (SC manual p. 30, published), when is unknown; on BVS ID it stays
         until it is reset (BVS ID guide p. 227, published).
+
+        Raises:
+            OvertriggeredError: it stays set; no trigger was sent.
         """
+        now = asyncio.get_running_loop().time()
+        grace = min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
         if self._connection.dialect.has(m.ResetErrors):
             await self._requests.command(m.ResetErrors(), deadline)
             await self._status.refresh(deadline)
-            return
-        now = asyncio.get_running_loop().time()
-        grace = now + min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))
         with contextlib.suppress(TimeoutError):
-            await self._status.wait(_is_not_overtriggered, grace)
+            await self._status.insist(_is_not_overtriggered, now + grace)
+            return
+        raise OvertriggeredError(
+            f"{self._connection.name}: Overtriggered has stayed set for {round(grace, 2):g} s. As "
+            "long as it is, the camera cannot show that it drops a trigger, so none was sent. It "
+            "may fall when the application is stopped and started"
+        )
 
 
 def _is_not_overtriggered(status: Status) -> bool:
     return Status.OVERTRIGGERED not in status
 
 
-def _told_of_fence(pending: PendingTrigger) -> str:
-    """Return the part of an error text on the fence, and on containers that came before it."""
-    if not pending.progress.reached:
-        return "; the question in front of the trigger was not answered"
-    if not pending.progress.confirmed:
-        return "; no status came that tells whether the trigger was taken"
+def _evidence(features: Features) -> TriggerEvidence:
+    """Return the evidence that a trigger needs before results are taken for its own."""
+    if not features.fences:
+        told = features.acknowledged and features.ordered  # else an answer may be lost, or late
+        return EvidenceByAcknowledgement() if told else TriggerEvidence()
+    if not features.shows_triggers:
+        return EvidenceByFence()
+    return EvidenceByAnswer() if features.polled else EvidenceByStatus()
+
+
+def _what_is_missing(pending: PendingTrigger) -> str:
+    """Return the part of an error text on what the camera has not said of the trigger."""
+    evidence, early = pending.evidence, ""
     if pending.early:
-        what = "result came" if pending.early == 1 else "results came"
-        return f"; {pending.early} {what} before the trigger had reached the camera, from before it"
-    return ""
+        what = "1 result" if pending.early == 1 else f"{pending.early} results"
+        early = f"; {what} came before the camera had shown that it took the trigger"
+    if not evidence.reached:
+        return f"; the camera has not shown that it took the trigger{early}{_HINT if early else ''}"
+    if not evidence.proven:
+        return f"; the camera has not answered the question that was sent with the trigger{early}"
+    return early
 
 
 def _is_decided(status: Status) -> bool:

@@ -1,11 +1,13 @@
-"""Who waits for an answer or a status, and why there is no session to wait in."""
+"""Keep those who wait for an answer or a status, and the reason why there is no session."""
 
 from __future__ import annotations
 
 import asyncio
+import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.exceptions import SmartCamError
 from smartcam.protocols import messages as m
 
@@ -16,26 +18,48 @@ if TYPE_CHECKING:
     from smartcam.models import Status
 
 Answer = m.Message | SmartCamError
-"""What a request gets: the answer, or why there is none."""
+"""The outcome of a request: the answer, or the error that says why there is none."""
 
 
-@dataclass(slots=True)
+ErrorT = TypeVar("ErrorT", bound=SmartCamError)
+
+
+def told(error: ErrorT) -> ErrorT:
+    """Return an error to raise where another one is kept.
+
+    What is raised refers to the frames of who is told, and by them to the client: kept by the
+    client's own task, it would keep a client alive that nobody has any more.
+    """
+    made = copy.copy(error)
+    made.__cause__ = error.__cause__
+    return made
+
+
+@dataclass(slots=True, eq=False)
 class StatusWaiter:
+    """A caller that waits for a status.
+
+    Attributes:
+        predicate: says which one.
+        outcome: gets it, or what the predicate raised: as a value, for a future takes not every
+            error.
+    """
+
     predicate: Callable[[Status], bool]
-    outcome: asyncio.Future[Status]
+    outcome: asyncio.Future[Status | BaseException]
 
 
 class Waits:
-    """What is awaited of the camera: answers by their kind, and statuses.
+    """The answers and statuses that callers await from the camera.
 
     Args:
-        counters: where round trips are counted.
+        counters: counters of the round trips.
 
     Attributes:
-        end: why there is no session, None while there is one.
-        answers: who waits for an answer, by its type; by id for a message that the dialect does not
-            know.
-        statuses: who waits for a status.
+        end: reason why there is no session, None while there is one.
+        answers: waiters for answers, by the type of the answer; by id for a message that the
+            dialect does not know.
+        statuses: waiters for statuses.
     """
 
     def __init__(self, counters: ClientCounters) -> None:
@@ -43,31 +67,33 @@ class Waits:
         self._counters = counters
         self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
         self._asked_at: dict[object, float] = {}
-        self._fence_open = False  # the Query in front of the last trigger is not answered
-        self.statuses: list[StatusWaiter] = []
+        self._behind: dict[object, int] = {}  # deliveries that came before the request was sent
+        self._fences_open = 0  # Queries that went out with the last trigger and are not answered
+        self.statuses: dict[StatusWaiter, None] = {}  # in order; each leaves in one step
 
     def begin_session(self) -> None:
-        """A session is there, nothing is asked in it yet."""
+        """Begin a session, in which nothing is asked yet."""
         self.end = None
-        self._fence_open = False
+        self._fences_open = 0
 
     def fail(self, error: SmartCamError) -> bool:
-        """Tell everybody who waits that the session is over, and who comes before the next one.
+        """End every wait, also one that begins before the next session, with the reason.
 
         Returns:
             Whether that is news: the first reason stays.
         """
         if self.end is not None:
             return False
-        self.end = error
+        self.end, error = error, told(error)
         for answer in self.answers.values():
             answer.set_result(error)
         self.answers.clear()
         self._asked_at.clear()
-        self._fence_open = False
+        self._behind.clear()
+        self._fences_open = 0
         for waiter in self.statuses:
             if not waiter.outcome.done():
-                waiter.outcome.set_exception(error)
+                waiter.outcome.set_result(error)
         self.statuses.clear()
         return True
 
@@ -82,15 +108,20 @@ class Waits:
             LinkError: it.
         """
         if self.end is not None:
-            raise self.end.with_traceback(None)  # raised many times, it would grow each time
+            raise told(self.end)
 
     # ------------------------------------------------------------------ answers
 
-    def next_answer(self, key: type[m.Message] | int) -> asyncio.Future[Answer]:
-        """Register for the next answer of this kind; errors come as a result, never raised."""
+    def next_answer(self, key: type[m.Message] | int, *, behind: int = 0) -> asyncio.Future[Answer]:
+        """Register for the next answer of this kind; errors come as a result, never raised.
+
+        What came in the delivery ``behind`` of the link, or in an earlier one, is no answer: it was
+        there before the request was sent, and waits to be handed on.
+        """
         loop = asyncio.get_running_loop()
         future: asyncio.Future[Answer] = loop.create_future()
         self.answers[key] = future
+        self._behind[key] = behind
         if key is not m.SwitchAnswer:  # it takes its time, which is no round trip
             self._asked_at[key] = loop.time()
         return future
@@ -100,21 +131,25 @@ class Waits:
         return self.answers.get(key) or self.next_answer(key)
 
     def owes(self, key: type[m.Message] | int) -> bool:
-        """Whether an answer of this kind is open."""
-        return key in self.answers or (key is m.QueryAnswer and self._fence_open)
+        """Return True if an answer of this kind is open."""
+        return key in self.answers or (key is m.QueryAnswer and self._fences_open > 0)
 
-    def expect_fence(self) -> None:
-        """Note that a Query went out in front of a trigger, for whose answer nobody waits."""
-        self._fence_open = True
+    def expect_fences(self, count: int) -> None:
+        """Note that Queries went out with a trigger, for whose answers nobody waits."""
+        self._fences_open = count
 
     def take_fence(self) -> bool:
-        """Close the fence; return whether it was open, so that an answer to Query is its own."""
-        was, self._fence_open = self._fence_open, False
-        return was
+        """Return True if nobody waits for an answer to Query; count that answer off."""
+        if not self._fences_open:
+            return False
+        self._fences_open -= 1
+        return True
 
-    def on_message(self, message: m.Message, now: float) -> None:
+    def on_message(self, message: m.Message, now: float, delivery: int) -> None:
         """Complete the request that a message answers, if one is open."""
         key = message.message_id if isinstance(message, m.UnknownMessage) else type(message)
+        if delivery <= self._behind.get(key, 0):
+            return
         future = self.answers.pop(key, None)
         if future is not None:
             asked_at = self._asked_at.pop(key, None)
@@ -134,13 +169,17 @@ class Waits:
             LinkError: the session ended.
         """
         waiter = StatusWaiter(predicate, asyncio.get_running_loop().create_future())
-        self.statuses.append(waiter)
+        self.statuses[waiter] = None
         try:
             async with asyncio.timeout_at(deadline):
-                return await waiter.outcome
+                outcome = await waiter.outcome
         finally:
-            if waiter in self.statuses:
-                self.statuses.remove(waiter)
+            self.statuses.pop(waiter, None)
+        if isinstance(outcome, SmartCamError):
+            raise outcome.with_traceback(None)  # raised for all who wait, it would grow each time
+        if isinstance(outcome, BaseException):
+            raise outcome
+        return outcome
 
     def show(self, status: Status) -> None:
         """Show a status to everybody who waits for one."""
@@ -150,5 +189,7 @@ class Waits:
             try:
                 if waiter.predicate(status):
                     waiter.outcome.set_result(status)
-            except (Exception, asyncio.CancelledError) as exc:  # noqa: BLE001 - the user's own
-                waiter.outcome.set_exception(exc)
+            except ENDS_PROGRAM:
+                raise
+            except BaseException as exc:  # noqa: BLE001 - the user's own
+                waiter.outcome.set_result(exc)

@@ -22,17 +22,26 @@ if TYPE_CHECKING:
     )
     from smartcam.protocols._bvs import BVS
     from smartcam.protocols._framed.dialect import FramedDialect, MessageRow, StatusBits, WireQuirk
-    from smartcam.protocols._framed.framing import Frame, HeaderLayout
-    from smartcam.protocols._framed.machine import (
+    from smartcam.protocols._framed.framing import HeaderLayout
+    from smartcam.protocols._framed.machine import Machine
+    from smartcam.protocols._insight.dialect import INSIGHT
+    from smartcam.protocols._lines import (
+        LineCommand,
+        LineDialect,
+        LineMachine,
+        LineReply,
+        LineRow,
+        unread,
+    )
+    from smartcam.protocols._machine import (
         Counters,
+        Frame,
         LinkEnded,
         LinkFailed,
         LinkMachine,
-        Machine,
         State,
     )
-    from smartcam.protocols._insight.dialect import INSIGHT
-    from smartcam.protocols._lines import LineDialect, LineMachine, LineRow
+    from smartcam.protocols._ticketed import TicketedDialect
 
 __all__ = [
     "BVS",
@@ -43,8 +52,10 @@ __all__ = [
     "Frame",
     "FramedDialect",
     "HeaderLayout",
+    "LineCommand",
     "LineDialect",
     "LineMachine",
+    "LineReply",
     "LineRow",
     "LinkEnded",
     "LinkFailed",
@@ -57,9 +68,11 @@ __all__ = [
     "Spelled",
     "State",
     "StatusBits",
+    "TicketedDialect",
     "Transport",
     "Verdict",
     "WireQuirk",
+    "unread",
 ]
 
 if not TYPE_CHECKING:
@@ -69,9 +82,11 @@ if not TYPE_CHECKING:
             "_base": "CodeMeaning Dialect Protocol RawRequest Role Spelled Transport Verdict",
             "_bvs": "BVS",
             "_framed.dialect": "FramedDialect MessageRow StatusBits WireQuirk",
-            "_framed.framing": "Frame HeaderLayout",
-            "_framed.machine": "Counters LinkEnded LinkFailed LinkMachine Machine State",
+            "_framed.framing": "HeaderLayout",
+            "_framed.machine": "Machine",
             "_insight.dialect": "INSIGHT",
-            "_lines": "LineDialect LineMachine LineRow",
+            "_lines": "LineCommand LineDialect LineMachine LineReply LineRow unread",
+            "_machine": "Counters Frame LinkEnded LinkFailed LinkMachine State",
+            "_ticketed": "TicketedDialect",
         },
     )

@@ -1,4 +1,4 @@
-"""What a protocol is made of: dialects, roles with their policies, the entry point.
+"""The parts of a protocol: dialects, roles with their policies, the entry point.
 
 A :class:`Dialect` is one wire variant as the client knows it, whatever its frames look like;
 ``framed/dialect.py`` has the one of binary frames. Who may do what with broken input is a
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
     from smartcam.exceptions import RemoteProtocolError
+    from smartcam.layout import Layout
     from smartcam.models import Capabilities
-    from smartcam.protocols._framed.framing import Frame
-    from smartcam.protocols._framed.machine import LinkMachine
+    from smartcam.protocols._machine import Frame, LinkMachine
 
     MachineFactory = Callable[..., LinkMachine]
 
 
 class Role(enum.Enum):
-    """Which side of the wire a machine plays."""
+    """The side of the wire for which a machine speaks."""
 
     CLIENT = "client"
     CAMERA = "camera"
@@ -44,7 +44,7 @@ class Role(enum.Enum):
 
 
 class Transport(enum.Enum):
-    """What carries the frames: a stream of bytes, or a datagram each."""
+    """The transport of frames: a stream of bytes, or a datagram for each."""
 
     TCP = "tcp"
     UDP = "udp"
@@ -52,17 +52,17 @@ class Transport(enum.Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Policy:
-    """What one role does with broken input.
+    """The way in which one role handles broken input.
 
     Attributes:
-        fatal: which errors end the link: :exc:`~smartcam.FrameError` for bytes that
-            make no frame, :exc:`~smartcam.MessageError` for a short body or a message
-            at the wrong time. Others are dropped and counted.
-        exact_length: a known message must have exactly its documented length; otherwise a longer
-            body is accepted and counted.
-        tells: a known message of the wrong length is an event instead of being dropped.
-        bounded: a frame is broken that announces more than its message may have, or that does not
-            become whole in time.
+        fatal: errors that end the link: :exc:`~smartcam.FrameError` for bytes that make no frame,
+            :exc:`~smartcam.MessageError` for a short body or a message at the wrong time. The
+            input that causes any other error is dropped and counted.
+        exact_length: True if a known message must have exactly its documented length; otherwise a
+            longer body is accepted and counted.
+        tells: True if a known message of the wrong length is an event instead of being dropped.
+        bounded: True if a frame counts as broken when it announces more bytes than its message may
+            have, or does not become whole in time.
     """
 
     fatal: tuple[type[RemoteProtocolError], ...]
@@ -83,7 +83,7 @@ POLICIES: Mapping[tuple[Role, Transport], Policy] = {
 
 
 class Verdict(enum.Enum):
-    """What a result code says of a request."""
+    """The verdict of a result code on a request."""
 
     DONE = "done"
     BUSY = "busy"
@@ -94,14 +94,14 @@ class Verdict(enum.Enum):
 
 
 class CodeMeaning(NamedTuple):
-    """What a result code means: in words, and what it says of the request."""
+    """The meaning of a result code: a text, and the verdict on the request."""
 
     text: str
     verdict: Verdict
 
 
 UNDOCUMENTED = CodeMeaning("not documented", Verdict.REFUSED)
-"""What a result code means that no document has."""
+"""Meaning of a result code that no document has."""
 
 
 class Spelled(NamedTuple):
@@ -110,7 +110,7 @@ class Spelled(NamedTuple):
     Attributes:
         message_id: id on the wire, None where the dialect has no such ids.
         message: the message's name.
-        fields: its decoded body, None where it cannot be decoded.
+        fields: the frame's decoded body, None where the body cannot be decoded.
         data: the whole frame's bytes.
     """
 
@@ -145,20 +145,23 @@ class Dialect(ABC):
         about: one line for people.
         source: where it is described, with its grade.
         quirks: names of the deviations from the dialect that this one has, as in ``?quirks=``.
+        shows_triggers: the status tells of each trigger that is taken: Waiting for Trigger drops.
     """
 
     name: str
     about: str
     source: str
     quirks: tuple[str, ...] = ()
+    shows_triggers: bool = True
 
     in_order: ClassVar[bool] = False
-    """Whether the camera does one thing after the other: when a request is answered, all that was
-    asked for before it is over, its result included."""
+    """True if the camera does one thing after the other: when a request is answered, all that was
+    asked for before it is over, its result included. Or if its results say which trigger they
+    answer, so that no order is needed."""
     exclusive: ClassVar[bool] = True
-    """Whether the camera serves one client, and a newcomer takes it."""
+    """True if the camera serves one client, and a newcomer takes it."""
     has_login: ClassVar[bool] = False
-    """Whether a session that is refused is refused for good: a wrong password stays wrong."""
+    """True if a session that is refused is refused for good: a wrong password stays wrong."""
 
     @property
     def label(self) -> str:
@@ -167,13 +170,13 @@ class Dialect(ABC):
 
     @property
     def remark(self) -> str:
-        """What a user should know who asks for results in this dialect, "" for nothing."""
+        """Text for a user who asks for results in this dialect, "" for nothing."""
         return ""
 
     @property
     @abstractmethod
     def capabilities(self) -> Capabilities:
-        """What a camera can do in it."""
+        """Abilities of a camera in this dialect."""
 
     @property
     @abstractmethod
@@ -186,7 +189,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def has(self, message_type: type[Message]) -> bool:
-        """Return whether there is such a message."""
+        """Return True if the dialect has a message of this type."""
 
     @abstractmethod
     def message_id(self, message: Message | type[Message]) -> int:
@@ -201,7 +204,7 @@ class Dialect(ABC):
         return f"{type(message).__name__} ({self.message_id(message):#04x})"
 
     def answers(self, request: type[Request]) -> bool:
-        """Return whether the camera answers such a request."""
+        """Return True if the camera answers a request of this type."""
         return request.answer is not None and self.has(request.answer)
 
     def fields(self, message_type: type[Message]) -> tuple[str, ...]:
@@ -250,6 +253,19 @@ class Dialect(ABC):
             raise ConfigurationError(f"dialect {self.name} has no quirk {name!r}; it has none")
         return self
 
+    def for_layout(self, layout: Layout | None) -> Dialect:
+        """Return the dialect for a session whose results are read with a layout.
+
+        Overridden where the camera can be told what its results are to hold.
+
+        Args:
+            layout: the fields; None for results that are taken as they come.
+
+        Raises:
+            ConfigurationError: the camera cannot give such results.
+        """
+        return self
+
     def with_parameters(self, parameters: Mapping[str, str]) -> Dialect:
         """Return the dialect with what a URL says for it; overridden where there is anything.
 
@@ -264,11 +280,11 @@ class Protocol:
     """A family of dialects under one name: what an entry point ``smartcam.protocols`` gives.
 
     Attributes:
-        name: its name.
-        schemes: URL scheme to transport.
+        name: name of the protocol.
+        schemes: the transport of each URL scheme.
         default_port: port where a URL names none.
         models: camera models that speak it.
-        dialects: its dialects by name.
+        dialects: the protocol's dialects by name.
         machine: makes the client's machine of a link; of the dialects given, which begin a session
             alike, it finds out which one the camera speaks.
         parameters: what else a URL may say, and what it is; ``user`` and ``password`` stand before
@@ -306,7 +322,7 @@ class Protocol:
         Args:
             transport: what carries them.
             dialect: the one that is pinned; its quirks are found out where none is pinned.
-            quirks: those that are pinned.
+            quirks: names of the quirks that are pinned.
             parameters: what else the URL says.
 
         Raises:

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import CodeMeaning, Protocol, Transport, Verdict
-from smartcam.protocols._framed.dialect import FramedDialect, MessageRow, StatusBits, WireQuirk
+from smartcam.protocols._framed.dialect import (
+    SHOWS_TRIGGERS,
+    FramedDialect,
+    MessageRow,
+    StatusBits,
+    WireQuirk,
+)
 from smartcam.protocols._framed.framing import HeaderLayout
 from smartcam.protocols._framed.machine import Machine
 
@@ -206,7 +212,7 @@ CODES: Mapping[int, CodeMeaning] = {
         "NOK Inspection Error: program change failed", Verdict.REFUSED
     ),
 }
-"""What BVS ID's result codes mean (BVS ID guide p. 52, published)."""
+"""Meanings of BVS ID's result codes (BVS ID guide p. 52, published)."""
 
 _16_BIT = HeaderLayout(code="H", order="id, length")
 _CODE_GUESS = "BVS ID's answers carried over to BVS SC, inferred"
@@ -355,13 +361,19 @@ class _Bvs(Protocol):
 # while it is open which of the last two it is, frames are shown as those of bid, which is published
 _16_BIT_KIN = (B16, BID, B16.with_quirks(["code"]))
 
-BVS = _Bvs(
+BVS: _Bvs = _Bvs(
     name="bvs",
     schemes={"bvs": Transport.TCP, "bvs+udp": Transport.UDP},
     default_port=DEFAULT_PORT,
     models=("BVS002C",),
     dialects={dialect.name: dialect for dialect in (HANDBOOK, THESIS, B16, BID)},
     machine=Machine,
+    parameters={
+        SHOWS_TRIGGERS: (
+            "`no`: the camera's status does not tell of each trigger that it takes. Then a result "
+            "needs no proof that it is of this trigger, and a late or a stranger's one may be taken"
+        ),
+    },
     detection={
         # The manuals show the dialects with a magic number over UDP only, and for TCP nothing but
         # 16 bits. Of the two framings with a magic number three documents and a published vector
@@ -372,4 +384,4 @@ BVS = _Bvs(
     emulator="smartcam.emulator._camera:EmulatedCamera",
     greeting=b"",  # before Connect neither results nor status (SC manual p. 28: published)
 )
-"""What the entry point ``bvs`` gives."""
+"""The protocol that the entry point ``bvs`` gives."""

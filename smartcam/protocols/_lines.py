@@ -1,16 +1,19 @@
-"""Cameras that speak in lines of text: each request is a line, and so is its answer, in order.
+"""Cameras that speak in lines of text: each request is a line, and so is its answer.
 
-What a camera says stands in a table of :class:`LineRow`; dialect and machine are made of it.
+What a camera says stands in a table of :class:`LineRow`; dialect and machine are made of it. The
+shapes that answers have: one line, in order; several lines; an echo and then a result; known by a
+word or a ticket that the request carried, in any order.
 """
 
 from __future__ import annotations
 
-import collections
+import itertools
 import re
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from smartcam.exceptions import (
+    CommandRejectedError,
     ConfigurationError,
     FrameError,
     LocalProtocolError,
@@ -20,6 +23,7 @@ from smartcam.exceptions import (
 from smartcam.models import Capabilities
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import (
+    UNDOCUMENTED,
     CodeMeaning,
     Dialect,
     RawRequest,
@@ -28,14 +32,19 @@ from smartcam.protocols._base import (
     Transport,
     Verdict,
 )
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import Counters, LinkEnded, LinkFailed, State
 from smartcam.protocols._line_reader import LineReader
+from smartcam.protocols._machine import Counters, Frame, LinkEnded, LinkFailed, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Generator, Mapping, Sequence
 
-    from smartcam.protocols._framed.machine import Event
+    from smartcam.protocols._machine import Event
+
+    Told = m.Message | tuple[m.Message, ...]
+    """One message, or several, that an answer becomes."""
+
+    Script = Generator[str, str, Told]
+    """Yields lines, is sent the answer to each, and returns what it found out."""
 
 READ_SIZE = 1 << 15
 """Bytes that one read takes at most."""
@@ -55,6 +64,8 @@ _ABILITIES: Mapping[type[m.Message], str] = {
     m.ReadImage: "read_image",
 }
 
+_FIRST_WORD = re.compile(r"\w*")
+
 
 class LineRow(NamedTuple):
     """A request, and what answers it; or what the camera says by itself.
@@ -62,14 +73,54 @@ class LineRow(NamedTuple):
     Attributes:
         request: what the client asks for; None for a line that the camera says unasked.
         line: how it asks, with the message's fields in braces: ``"PROGRAM {application}"``.
-        answer: what the answer is.
-        read: makes it of the answer's line; a ValueError or LookupError says that it is none.
+        answer: what the answer is; None for a request that is not answered.
+        read: makes it of the answer's line, or several messages of it; a ValueError or LookupError
+            says that it is none.
+        word: what its answer is known by, in a dialect that splits answers: by default, and always
+            behind the first line of a script, the first word of the line; "" for an answer without
+            a word of its own. A dialect with tickets needs none, but for what is said unasked.
+        echo: line that comes in front of the answer.
+        until: first words that end an answer of several lines, which ``read`` gets joined by line
+            feeds.
+        also: what else its answer may be told as, beside ``answer``.
+        script: where a request takes several lines: is given the dialect and the message, yields
+            lines and is sent what answers each. ``line`` is then the one that people know it by.
     """
 
     request: type[m.Request] | None
     line: str
-    answer: type[m.Report]
-    read: Callable[[str], m.Message]
+    answer: type[m.Report] | None
+    read: Callable[[str], Told]
+    word: str | None = None
+    echo: str = ""
+    until: tuple[str, ...] = ()
+    also: tuple[type[m.Report], ...] = ()
+    script: Callable[[Any, Any], Script] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineReply(m.Acknowledgement):
+    """The answer to a :class:`LineCommand`: its code, and its bytes."""
+
+    data: bytes = b""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LineCommand(m.Request):
+    """A line of the user's own; a dialect has it where a row says how it is answered."""
+
+    answer: ClassVar[type[m.Message] | None] = LineReply
+
+    line: str
+
+
+def unread(line: str) -> m.Message:
+    """Refuse every line: what a row without an answer, or with a script, reads with.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError(line)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,6 +134,13 @@ class LineDialect(Dialect):
         line_end: ends each line, one or two bytes.
         max_line: bytes of a line, its end not counted; a longer one breaks the protocol.
         encoding: of its characters.
+        split: splits an answer into what it is known by, "" for nothing, and the text that is read;
+            None where answers come in order and say nothing of their request.
+        tickets: numbers that requests carry, each the next one; ``{ticket}`` in a row's line, or
+            what :meth:`pack` makes of it. Empty where they carry none.
+        at_once: requests are said without waiting for earlier answers; needs ``split``.
+        codes: the meaning of each result code of the answers; without any all are done.
+        make: name of the maker or make, for errors.
     """
 
     rows: tuple[LineRow, ...]
@@ -90,6 +148,11 @@ class LineDialect(Dialect):
     line_end: bytes = b"\n"
     max_line: int = 4096
     encoding: str = "utf-8"
+    split: Callable[[str], tuple[str, str]] | None = None
+    tickets: range = range(0)
+    at_once: bool = False
+    codes: Mapping[int, CodeMeaning] = field(default_factory=dict[int, CodeMeaning])
+    make: str = ""
 
     in_order: ClassVar[bool] = True
     exclusive: ClassVar[bool] = False
@@ -101,12 +164,14 @@ class LineDialect(Dialect):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a camera can do in it, which the rows say."""
+        """Abilities of a camera in this dialect, as the rows say."""
         able = {name: True for kind, name in _ABILITIES.items() if self.row(kind) is not None}
         unasked = {row.answer for row in self.rows if row.request is None}
         return Capabilities(
             dialect=self.name,
             start_stop=self.row(m.Start) is not None and self.row(m.Stop) is not None,
+            result_codes=bool(self.codes),
+            status_by_itself=self.row(m.GetStatus) is None,
             unasked_results=m.ResultContainer in unasked,
             **able,
         )
@@ -116,13 +181,14 @@ class LineDialect(Dialect):
         return next((row for row in self.rows if row.request is request), None)
 
     def code(self, code: int, request: type[m.Message] | None = None) -> CodeMeaning:
-        """Return that it is done: lines carry no codes unless a dialect says so."""
-        return DONE
+        """Return the meaning of a code; all are done in a dialect without codes."""
+        return self.codes.get(code, UNDOCUMENTED) if self.codes else DONE
 
     def has(self, message_type: type[m.Message]) -> bool:
-        """Return whether there is such a message."""
-        known = {m.Disconnect, *(row.request for row in self.rows), *(r.answer for r in self.rows)}
-        return message_type in known
+        """Return True if the dialect has a message of this type."""
+        if message_type is m.Disconnect:
+            return True
+        return any(message_type in {row.request, row.answer, *row.also} for row in self.rows)
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
         """Return 0: lines have no numbers; UnsupportedError: it has no such message."""
@@ -136,11 +202,16 @@ class LineDialect(Dialect):
         row = self.row(type(message))
         return f"{type(message).__name__} ({'' if row is None else row.line[:32]})"
 
+    def unsupported(self, message_type: type[m.Message]) -> UnsupportedError:
+        """Return the error of who asks for a message that it does not have; it names the make."""
+        plain = super().unsupported(message_type)
+        return UnsupportedError(f"{self.make}: {plain}") if self.make else plain
+
     def line(self, message: m.Message) -> str:
         """Return the line of a request.
 
         Raises:
-            ConfigurationError: a field of it cannot stand in a line.
+            UnsupportedError: no row has the request.
         """
         row = self.row(type(message))
         if row is None:
@@ -150,16 +221,33 @@ class LineDialect(Dialect):
             key: value.decode(self.encoding, "replace") if isinstance(value, bytes) else value
             for key, value in values.items()
         }
-        line = row.line.format_map(texts)
-        data = line.encode(self.encoding, "replace")
+        return row.line.format_map({"ticket": "{ticket}", **texts})
+
+    def script(self, row: LineRow, message: m.Message) -> Script:
+        """Return the lines of a request, one after the other, and what their answers become."""
+        if row.script is not None:
+            return row.script(self, message)
+        return _one_line(row, self.line(message))
+
+    def pack(self, line: str, ticket: str) -> bytes:
+        """Return the bytes of a line.
+
+        Raises:
+            ConfigurationError: it cannot stand in a line.
+        """
+        data = line.replace("{ticket}", ticket).encode(self.encoding, "replace")
         if len(data) > self.max_line or any(byte in self.line_end for byte in data):
             raise ConfigurationError(
-                f"{type(message).__name__}: {line[:64]!r} is no line of {self.max_line} bytes"
+                f"dialect {self.name}: {line[:64]!r} is no line of {self.max_line} bytes"
             )
-        return line
+        return data + self.line_end
 
-    def reader(self) -> LineReader:
-        """Return what cuts lines from a stream."""
+    def reader(self, max_length: int = 0) -> LineReader:
+        """Return a new reader that cuts a stream into lines.
+
+        Args:
+            max_length: bytes of an answer at most, where its dialect has another bound than lines.
+        """
         ends = re.compile(re.escape(self.line_end))
         return LineReader(ends, max_line=self.max_line, encoding=self.encoding)
 
@@ -168,35 +256,97 @@ class LineDialect(Dialect):
         text = frame.payload.decode(self.encoding, "replace")
         return Spelled(None, "line", {"text": text}, frame.payload + self.line_end)
 
+    def command(self, line: str) -> str:
+        """Return a line of the user's own, checked; a dialect with such lines may refuse some.
+
+        Raises:
+            ConfigurationError: it is no line that can be sent.
+        """
+        return line
+
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Raise UnsupportedError: how another line is answered is not known."""
-        raise UnsupportedError(f"dialect {self.name}: there are no other requests")
+        """Return a line of the user's own; the payload stands behind it.
+
+        Raises:
+            UnsupportedError: how another line is answered is not known.
+            ConfigurationError: it is no line that can be sent.
+        """
+        if self.row(LineCommand) is None or not isinstance(message_id, str):
+            raise UnsupportedError(f"dialect {self.name}: there are no other requests")
+        line = self.command(message_id + payload.decode(self.encoding, "replace"))
+        self.pack(line, "")
+        return RawRequest(LineCommand(line=line), LineReply, answered=True, known=True)
 
     def body(self, answer: m.Message) -> bytes:
-        """Raise LocalProtocolError: there are no raw requests."""
-        raise LocalProtocolError(f"dialect {self.name}: there are no other requests")
+        """Return the bytes of the answer to a line of the user's own.
+
+        Raises:
+            UnsupportedError: the camera says that it does not know the line.
+            CommandRejectedError: the camera says that it did not do it.
+        """
+        if not isinstance(answer, LineReply):
+            raise LocalProtocolError(f"{type(answer).__name__} is no answer to a line")
+        meaning = self.code(answer.code)
+        if meaning.verdict is Verdict.DONE:
+            return answer.data
+        said = f"the camera answered {answer.data[:64]!r} ({meaning.text})"
+        if meaning.verdict is Verdict.UNKNOWN:
+            raise UnsupportedError(said)
+        raise CommandRejectedError(said, code=answer.code)
 
 
-class _AskedLine(NamedTuple):
-    """A request, and how it is said."""
+def _first_word(line: str) -> str:
+    found = _FIRST_WORD.match(line)
+    return "" if found is None else found[0]
+
+
+def _one_line(row: LineRow, line: str) -> Script:
+    return row.read((yield line))
+
+
+@dataclass(slots=True, eq=False)
+class _OpenRequest:
+    """A request that is not answered yet.
+
+    Attributes:
+        row: row of the request.
+        script: what is left to be said and heard for it.
+        line: what is said now.
+        known_by: what the next answer is known by once ``line`` is said; None: by its first word.
+        word: what the next answer is known by.
+        said: whether ``line`` is said.
+        echoed: whether the echo in front of the answer has come.
+        lines: what came of an answer of several lines.
+        size: characters of these.
+    """
 
     row: LineRow
+    script: Script
     line: str
+    known_by: str | None
+    word: str = ""
+    said: bool = False
+    echoed: bool = False
+    lines: list[str] = field(default_factory=list[str])
+    size: int = 0
 
 
 class LineMachine:
     """One connection's lines, in the client's role; what a link needs.
 
-    See :class:`~smartcam.protocols.LinkMachine`. A request is said when the one before it is
-    answered: nothing in a line says what it answers, so one that is lost must not make the answers
-    of later ones its own. A line is the answer to it, unless a row says that the camera says such a
-    line unasked.
+    See :class:`~smartcam.protocols.LinkMachine`. Where nothing in a line says what it answers, a
+    request is said when the one before it is answered, so that one that is lost does not make the
+    answers of later ones its own; a line is the answer to it, unless a row says that the camera
+    says such a line unasked. Where answers say what they answer, they may come in any order.
+
+    A container that answers a Trigger is marked as asked for, and one that comes unasked as not;
+    so no client takes one for the other.
 
     Args:
         dialect: what is spoken.
         role: the client's.
         transport: TCP.
-        max_length: unused: a line is bounded by the dialect.
+        max_length: bytes of an answer of several lines at most; one line is bounded by the dialect.
         trace: called with each line in both directions, and with what broke the protocol.
         kin: unused, there is one dialect.
 
@@ -223,11 +373,14 @@ class LineMachine:
         self.counters: Counters = Counters()
         self.state: State = State.IDLE
         self._trace = trace
-        self._reader = dialect.reader()
+        self._max_length = max_length
+        self._reader = dialect.reader(max_length)
         self._store = memoryview(bytearray(READ_SIZE))
-        # under way is the first one; at most one of a kind
-        self._asked: collections.deque[_AskedLine] = collections.deque()
+        self._asked: list[_OpenRequest] = []  # in order; at most one of a kind
+        self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
+        trigger = dialect.row(m.Trigger)
+        self._marks = trigger is not None and trigger.answer is m.ResultContainer
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
 
@@ -260,7 +413,7 @@ class LineMachine:
             while (line := self._reader.next_line()) is not None:
                 self.counters.frames_received += 1
                 self._tell(m.Sender.CAMERA, line)
-                self._events.append(self._read(line))
+                self._read(line)
         except RemoteProtocolError as error:
             if self._trace is not None:
                 self._trace(m.Sender.CAMERA, error)
@@ -278,41 +431,115 @@ class LineMachine:
         events, self._events = self._events, []
         return events
 
-    def _read(self, line: str) -> m.Message:
-        """Return what a line says; FrameError: nothing that is known."""
-        for row in self._unasked:
+    def _read(self, line: str) -> None:
+        """Take a line; FrameError where it is neither an answer nor said unasked."""
+        split = self.dialect.split
+        if split is None:
+            asked = self._asked[0] if self._asked else None
+            begun = asked is not None and (asked.echoed or asked.lines)
+            if not begun and self._say_unasked("", line):
+                return
+            word, text = "", line
+        else:
             try:
-                return row.read(line)
+                word, text = split(line)
+            except (ValueError, LookupError) as exc:
+                raise FrameError(f"{line[:64]!r} came, no answer of this dialect") from exc
+            asked = self._known_by(word) if word else None
+            if asked is None and self._say_unasked(word, text, by_word=True):
+                return
+            asked = asked or self._known_by("")
+            if asked is None and self._say_unasked(word, text):
+                return
+        if asked is None:
+            raise FrameError(f"{line[:64]!r} came, nothing was asked")
+        self._take(asked, text)
+
+    def _known_by(self, word: str) -> _OpenRequest | None:
+        """Return the request whose answer is known by a word."""
+        return next((one for one in self._asked if one.said and one.word == word), None)
+
+    def _say_unasked(self, word: str, text: str, *, by_word: bool = False) -> bool:
+        """Tell a line that the camera says by itself; return False where no row has such a line.
+
+        Args:
+            word: what the line is known by.
+            text: the rest.
+            by_word: ask the rows that name this word, not those that name none.
+        """
+        for row in self._unasked:
+            if by_word != bool(row.word) or (by_word and row.word != word):
+                continue
+            try:
+                told = row.read(text)
             except (ValueError, LookupError):
                 continue
-        if not self._asked:
-            raise FrameError(f"{line[:64]!r} came, nothing was asked")
-        row = self._asked.popleft().row
+            self._add(told, asked=False)
+            return True
+        return False
+
+    def _take(self, asked: _OpenRequest, text: str) -> None:
+        """Take a line of an answer; where it is whole, say what follows from it."""
+        row = asked.row
+        if row.echo and not asked.echoed and text == row.echo:
+            asked.echoed, asked.word = True, ""
+            return
+        if row.until:
+            asked.lines.append(text)
+            asked.size += len(text) + 1
+            if asked.size > self._max_length:
+                raise FrameError(f"an answer of more than {self._max_length} bytes came")
+            if _first_word(text) not in row.until:
+                return
+            text = "\n".join(asked.lines)
+        elif row.echo and not asked.echoed and self.dialect.split is None:
+            raise FrameError(f"{text[:64]!r} came, the echo {row.echo!r} was expected")
         try:
-            message = row.read(line)
+            asked.line = asked.script.send(text)
+        except StopIteration as done:
+            told: Told = done.value
         except (ValueError, LookupError) as exc:
+            name = row.answer.__name__ if row.answer is not None else "nothing"
             raise FrameError(
-                f"{line[:64]!r} came, {row.answer.__name__} to {row.line[:32]!r} was expected"
+                f"{text[:64]!r} came, {name} to {row.line[:32]!r} was expected"
             ) from exc
+        else:
+            asked.said = asked.echoed = False
+            asked.known_by = None
+            asked.lines, asked.size = [], 0
+            if self.state in {State.CONNECTING, State.CONNECTED}:
+                self._say(asked)
+            else:
+                self._asked.remove(asked)  # Disconnect was the last word
+            return
+        self._asked.remove(asked)
         if row.request is m.Connect and self.state is State.CONNECTING:
             self.state = State.CONNECTED
-        if self._asked and self.state is State.CONNECTED:
-            self._write(self._asked[0].line)
-        return message
+        self._add(told, asked=row.request is m.Trigger)
+        if self._asked and not self._asked[0].said and self.state is State.CONNECTED:
+            self._say(self._asked[0])
+
+    def _add(self, told: Told, *, asked: bool) -> None:
+        """Tell messages; containers with whether a Trigger has asked for them, if that is known."""
+        for one in told if isinstance(told, tuple) else (told,):
+            marked = self._marks and isinstance(one, m.ResultContainer)
+            self._events.append(replace(one, asked=asked) if marked else one)  # type: ignore[call-arg]
 
     def _end(self, state: State) -> None:
         """Say and read nothing more."""
         self.state = state
         self._asked.clear()
-        self._reader = self.dialect.reader()
+        self._reader = self.dialect.reader(0)
 
     # ------------------------------------------------------------------ messages out
 
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
-        """Put a request in line; write :meth:`data_to_send` next.
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
+        """Say a request, or put it in line; write :meth:`data_to_send` next.
 
         A Get status whose answer is owed is not repeated: it is new enough. Disconnect has no
-        words, the connection's end is that.
+        words, the connection's end is that. A request without an answer goes out at once.
 
         Raises:
             LocalProtocolError: not in this state, or an answer of the same kind is still owed.
@@ -334,19 +561,35 @@ class LineMachine:
             if kind is m.GetStatus:
                 return
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
-        line = self.dialect.line(message)
+        script = self.dialect.script(row, message)
+        asked = _OpenRequest(row, script, next(script), row.word)
+        ready = self.dialect.at_once or not self._asked
+        if row.answer is None or ready:
+            self._say(asked)
+        else:
+            self.dialect.pack(asked.line, "")  # where it cannot be said, nothing has changed
         if kind is m.Connect:
             self.state = State.CONNECTING
-        self._asked.append(_AskedLine(row, line))
-        if len(self._asked) == 1:
-            self._write(line)
+        if row.answer is not None:
+            self._asked.append(asked)
 
-    def _write(self, line: str) -> None:
-        data = line.encode(self.dialect.encoding, "replace") + self.dialect.line_end
+    def _say(self, asked: _OpenRequest) -> None:
+        """Say the line of a request; its answer is known by its ticket, or by its word."""
+        ticket = self._next_ticket() if self.dialect.tickets else ""
+        data = self.dialect.pack(asked.line, ticket)
+        word = asked.known_by
+        asked.word = ticket or (_first_word(asked.line) if word is None else word)
+        asked.said = True
         self._outbox.append(data)
         self.counters.frames_sent += 1
         self.counters.bytes_sent += len(data)
-        self._tell(m.Sender.CLIENT, line)
+        if self._trace is not None:
+            self._trace(m.Sender.CLIENT, Frame(0, data.removesuffix(self.dialect.line_end)))
+
+    def _next_ticket(self) -> str:
+        """Return a ticket that no request which waits for its answer has."""
+        used = {one.word for one in self._asked}
+        return next(ticket for ticket in self._tickets if ticket not in used)
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""

@@ -11,7 +11,7 @@ session there.
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, NamedTuple, get_type_hints
 
 from smartcam.models import Status
@@ -25,12 +25,14 @@ __all__ = [
     "Data",
     "Disconnect",
     "DisconnectAnswer",
+    "EndTrigger",
     "GetClock",
     "GetStatus",
     "Image",
     "LoadFile",
     "MalformedMessage",
     "Message",
+    "Notice",
     "Query",
     "QueryAnswer",
     "ReadImage",
@@ -62,14 +64,14 @@ __all__ = [
 
 
 class Sender(enum.Enum):
-    """Who sends a message."""
+    """The side that sends a message."""
 
     CLIENT = "client"
     CAMERA = "camera"
 
 
 class Wire(enum.Enum):
-    """What a field is on the wire."""
+    """The form of a field on the wire."""
 
     WORD = "word"
     """An unsigned integer of the dialect's word size: UINT32 or UINT16."""
@@ -93,7 +95,7 @@ class Message:
     one takes as long as importing a module.
 
     Attributes:
-        sender: who may send it.
+        sender: side of the link that may send the message.
     """
 
     sender: ClassVar[Sender]
@@ -171,20 +173,39 @@ class CellValue(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultContainer(Report):
-    """What an inspection sent: the id of its application and bytes without types or names.
+    """The result of an inspection: its application's id, and bytes without types or names.
 
     Attributes:
-        application: its id.
-        data: the bytes.
-        cells: the values that ``data`` was put together from, where the protocol has them as texts:
-            a layout's fields are these, in order.
-        fault: why the values cannot be one inspection's, None where nothing speaks against it.
+        application: id of the application.
+        data: bytes of the values.
+        cells: the values that ``data`` was put together from, where the protocol has them as
+            texts. The fields of a layout are these values, in order.
+        fault: reason why the values cannot come from one inspection, None where nothing speaks
+            against it.
+        asked: whether the wire says that it answers a trigger of this client, the one that is under
+            way or was given up last, or that it answers none; None where the wire does not say so.
     """
 
     application: Word = UNNAMED_APPLICATION
     data: Data
     cells: tuple[CellValue, ...] | None = None
     fault: str | None = None
+    asked: bool | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Notice(Report):
+    """A remark of the camera's own that is neither a status nor a result.
+
+    Attributes:
+        kind: ``"error"``, ``"notification"`` or ``"debug"``.
+        code: the camera's number of it, 0 where it has none.
+        text: what the camera says.
+    """
+
+    kind: str = "error"
+    code: int = 0
+    text: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -360,6 +381,12 @@ class Trigger(Request):
 
     __slots__ = ()
     answer: ClassVar[type[Message] | None] = TriggerAnswer
+
+
+class EndTrigger(Request):
+    """End the trigger under way now: what the camera has by then is its result."""
+
+    __slots__ = ()
 
 
 class Start(Request):

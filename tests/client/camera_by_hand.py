@@ -317,6 +317,20 @@ class HandmadeCamera(PortByHand):
         peer = Peer(self.last.transport)
         return [self.frame(*frame) for frame in peer.take(self.wire, data)]
 
+    # ------------------------------------------------------------------ what a trigger does
+
+    def takes(self, _: bytes = b"") -> bytes:
+        """Show that a trigger is taken; the test says the rest (:meth:`over`)."""
+        return self.status_frame(RUNNING)
+
+    def over(self, *containers: bytes) -> bytes:
+        """Return results of the inspection under way, and that the camera waits again."""
+        return b"".join(map(self.result_frame, containers)) + self.status_frame(READY)
+
+    def inspects(self, *containers: bytes) -> bytes:
+        """Return all that an inspection says."""
+        return self.takes() + self.over(*containers)
+
     # ------------------------------------------------------------------ the first script
 
     def _switch(self, payload: bytes) -> bytes:
@@ -327,9 +341,7 @@ class HandmadeCamera(PortByHand):
         return self.status_frame(BUSY) + self.status_frame(0) + self.switched_frame(wanted)
 
     def _trigger(self, _: bytes) -> bytes:
-        if not self.status & WAITING:
-            return b""
-        return self.status_frame(RUNNING) + self.result_frame() + self.status_frame(READY)
+        return self.inspects(self.container) if self.status & WAITING else b""
 
     # ------------------------------------------------------------------ the port
 

@@ -11,16 +11,19 @@ from typing import Any, cast
 import pytest
 
 import smartcam
+from tests import loops
 from tests.client.kinds import AT_THE_WIRE, IN_TIME_OF_THEIR_OWN, MODULES, OVER_TCP_ON_A_BUS
 from tests.fleet.kinds import connect
-from tests.timed_loop import TimedLoop
 
 LOOPS: Mapping[str, Callable[[], asyncio.AbstractEventLoop]] = {
-    "wire": functools.partial(TimedLoop),
-    "in_process": functools.partial(TimedLoop),
-    "zenoh": functools.partial(asyncio.SelectorEventLoop),  # its threads want real time
+    "wire": functools.partial(loops.timed),
+    "in_process": functools.partial(loops.timed),
+    "zenoh": functools.partial(loops.real),  # its threads want real time
 }
 """Kinds of cameras, and the event loops that they are tried on."""
+
+IN_REAL_TIME = loops.LOOP == "uvloop"
+"""Whether all tests run in real time: only those that do so over Zenoh, too, at the wire."""
 
 _LEFT_OUT = {
     "wire": frozenset[str](),
@@ -52,6 +55,12 @@ def _counts_steps(item: pytest.Item) -> bool:
     return any(word in source for word in ("steps(", "sleep(0)", "SHORT", "timeout=0"))
 
 
+def _needs_its_own_time(item: pytest.Item) -> bool:
+    """Whether a test cannot run in real time, or would take long."""
+    name = item.name.partition("[")[0]
+    return name in _LEFT_OUT["zenoh"] or _counts_steps(item)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out what does not hold for a kind; those over Zenoh are long, and sweeps on a bus."""
@@ -59,6 +68,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out: list[pytest.Item] = []
     for item in items:
         kind = _kind(item)
+        if IN_REAL_TIME and (kind != "wire" or _needs_its_own_time(item)):
+            left_out.append(item)
+            continue
         if kind is not None:
             name, _, parameters = item.name.partition("[")
             others = "-".join(one for one in parameters.rstrip("]").split("-") if one != kind)

@@ -3,31 +3,48 @@
 from __future__ import annotations
 
 from smartcam import Status
-from smartcam._client.correlation import Correlation, Debt, Match, Progress, SentTrigger
+from smartcam._client.correlation import (
+    Correlation,
+    Debt,
+    EvidenceByAnswer,
+    EvidenceByFence,
+    EvidenceByStatus,
+    Match,
+    SentTrigger,
+    TriggerEvidence,
+)
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 WORKING = Status.RUNNING
+
+_FAILING = Status.OVERTRIGGERED
+"""Whose rise ends a trigger; so does the fall of Running."""
 
 
 class Line:
     """A correlation with what the rest of the client does around it.
 
     Args:
-        ordered: every status comes, and in order.
-        fences: a trigger has a Query in front of it; default where it is ordered.
+        complete: every status comes, and in order.
+        polled: statuses are asked for, triggers are answered (``bid`` over TCP).
+        fenced: a Query goes out in front of a trigger, which nothing shows (``shows_triggers=no``).
     """
 
-    def __init__(self, *, ordered: bool = True, fences: bool | None = None) -> None:
-        self.is_ordered = ordered
-        self.fences = ordered if fences is None else fences
+    def __init__(
+        self, *, complete: bool = True, polled: bool = False, fenced: bool = False
+    ) -> None:
+        self.is_complete = complete
+        self.is_polled = polled
+        self.is_fenced = fenced
         self.at = Correlation(chance=0.5)
-        self.at.begin_session(ordered=ordered)
+        self.at.begin_session(complete=complete)
         self.status: Status | None = None
-        self.fence_open = False
+        self.fences_open = 0  # Queries that were written with the trigger and are not answered
         self.numbered = False  # a trigger had a number: a container's is read
-        self.wants_query = False  # a container is held: have a Query answered
         self.cancelled = False  # the trigger's caller, who was not woken yet
-        self.held: list[tuple[int | None, object]] = []
+        self.doubts = 0  # triggers that ended since nobody can tell which one the camera took
+        self.results: list[object] = []  # the containers of the trigger under way
+        self.returned: list[object] = []  # those of the last trigger that had all of them
         self.judged: list[tuple[object, Match]] = []  # each container's fate, in order
         self.others = 0  # inspections that somebody else has triggered
 
@@ -37,26 +54,31 @@ class Line:
 
     # -- what the client does
 
-    def send(
-        self,
-        number: int | None = None,
-        wanted: int = 1,
-        *,
-        fenced: bool | None = None,
-        certain: bool = False,
-        confirms: bool = False,
-    ) -> SentTrigger:
-        """Send a trigger; the fence in front of it is not answered yet."""
-        self.fence_open = self.fences if fenced is None else fenced
-        run = Progress(reached=not self.fence_open, confirmed=not confirms)
-        pending = SentTrigger(wanted, number, certain, run)
+    def send(self, number: int | None = None, wanted: int = 1) -> SentTrigger:
+        """Send a trigger; the Queries in front of it and behind it are not answered yet."""
+        evidence = TriggerEvidence()
+        if self.is_polled:
+            evidence, self.fences_open = EvidenceByAnswer(), 1
+        elif self.is_complete:
+            evidence, self.fences_open = EvidenceByStatus(), 2
+        elif self.is_fenced:
+            evidence, self.fences_open = EvidenceByFence(), 1
+        pending = SentTrigger(wanted, number, evidence)
         self.numbered = self.numbered or number is not None
+        self.results = []
         self.at.send(pending)
         return pending
 
     def trigger(self, number: int | None = None, wanted: int = 1) -> SentTrigger:
-        """Send a trigger whose fence is answered at once."""
+        """Send a trigger; the Query in front of it is answered at once."""
         pending = self.send(number, wanted)
+        self.answer()
+        return pending
+
+    def begin(self, number: int | None = None, wanted: int = 1) -> SentTrigger:
+        """Send a trigger that the camera takes: Waiting drops between the two answers."""
+        pending = self.trigger(number, wanted)
+        self.hear(WORKING)
         self.answer()
         return pending
 
@@ -65,7 +87,6 @@ class Line:
         self.look()
         self.at.leave()
         self.cancelled = False
-        self.release()
 
     def cancel(self) -> None:
         """The trigger's caller is cancelled, which shows when it, or the client, looks."""
@@ -74,8 +95,13 @@ class Line:
     def look(self) -> None:
         """The client looks at the trigger."""
         if self.cancelled and self.pending is not None and not self.pending.ended:
-            self.pending.ended = True
-            self.at.give_up(self.pending)
+            self.fail("late")
+
+    def fail(self, debt: Debt) -> None:
+        """The trigger ends without its results; its caller was not woken yet."""
+        assert self.pending is not None
+        self.at.give_up(self.pending, debt)
+        self.pending.ended = True
 
     def give_up(self, debt: Debt = "late") -> None:
         assert self.pending is not None
@@ -84,85 +110,84 @@ class Line:
 
     def reconnect(self) -> None:
         self.look()
-        pending, self.fence_open = self.pending, False
-        if pending is not None and not pending.ended:
-            self.at.give_up(pending)
-            pending.ended = True
-        self.release()
+        if self.pending is not None and not self.pending.ended:
+            self.fail("late")
+        self.fences_open = 0
         self.leave()
-        self.at.begin_session(ordered=self.is_ordered)
+        self.at.begin_session(complete=self.is_complete)
         self.status = None
 
     # -- what comes
 
     def answer(self) -> None:
-        """A Query is answered: the fence, or another one."""
-        if self.fence_open:
-            self.fence_open = False
-            self.at.on_fence(int(self.status or 0))
-        elif self.held:
-            self.at.on_query_answer()
-            self.release()
+        """A Query that was written with the trigger is answered."""
+        self.fences_open -= 1
+        self.at.on_query_answer()
+        self.decide()
+
+    def trigger_answer(self) -> None:
+        """The trigger itself is answered: it was heard."""
+        self.at.on_trigger_answer()
+        self.decide()
 
     def hear(self, *statuses: Status) -> None:
         for status in statuses:
             before, self.status = self.status, status
+            was = before or Status(0)
+            if (status & ~was) & _FAILING or (was & ~status) & Status.RUNNING:
+                self.look()
+                if self.pending is not None and not self.pending.ended:
+                    self.fail("streamed")
             self.others += self.at.on_status(None if before is None else int(before), int(status))
-            if self.held:
-                self.release()
-            self._complete()
+            self.decide()
 
-    def release(self) -> None:
+    def result(self, number: int | None = None, container: object = None) -> Match:
+        """A container comes."""
         self.look()
-        held, self.held = self.held, []
-        pending = self.pending
-        older = pending is None or pending.ended or pending.progress.begun
-        for number, container in held:
-            self.result(number, container, older=older)
-
-    def result(
-        self, number: int | None = None, container: object = None, *, older: bool = False
-    ) -> Match:
-        """A container comes; what is held gets its fate later."""
-        self.look()
-        pending = self.pending
-        match = self.at.judge_older(number) if older else self.at.judge(number)
-        if match.fate == "held":
-            assert pending is not None
-            if len(self.held) < pending.wanted:
-                self.held.append((number, container))
-                self.wants_query = True
-                return match
-            match = self.at.judge_older(number)
+        match = self.at.judge(number)
         self.judged.append((container, match))
         if match.fate == "triggered":
-            assert pending is not None
-            pending.came += 1
+            assert self.pending is not None
+            self.pending.came += 1
+            self.results.append(container)
             self._complete()
         return match
 
-    def _complete(self) -> None:
+    def decide(self) -> None:
+        """End the trigger where what was said of it is enough for that."""
         self.look()
-        pending = self.pending
-        if pending is None or pending.ended or not pending.progress.confirmed:
+        if self.pending is None or self.pending.ended:
             return
-        if pending.came == pending.wanted:
+        if self.pending.evidence.doubtful:
+            self.doubts += 1
+            self.fail("streamed")
+        else:
+            self._complete()
+
+    def _complete(self) -> None:
+        pending = self.pending
+        assert pending is not None
+        if pending.evidence.proven and pending.came == pending.wanted:
             self.at.done(pending)
             pending.ended = True
+            self.returned = self.results
 
 
-def ready(*, ordered: bool = True) -> Line:
-    """A camera that waits for a trigger; whether it shows one is not known."""
-    line = Line(ordered=ordered)
+def ready(*, complete: bool = True) -> Line:
+    """A camera that waits for a trigger."""
+    line = Line(complete=complete)
     line.hear(READY)
     return line
 
 
-def shown(*, ordered: bool = True) -> Line:
-    """A camera that was seen to drop Waiting for SentTrigger at a trigger, and waits again."""
-    line = ready(ordered=ordered)
-    line.trigger()
-    line.hear(WORKING)
+def after_one(*, complete: bool = True) -> Line:
+    """A camera that waits again behind a trigger that had its result."""
+    line = ready(complete=complete)
+    line.send()
+    if complete:
+        line.answer()
+        line.hear(WORKING)
+        line.answer()
     line.result()
     line.leave()
     line.hear(READY)

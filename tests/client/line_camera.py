@@ -171,6 +171,10 @@ def _nothing_more(_: int, __: int | None) -> None:
     """What happens around a trigger where nobody says otherwise."""
 
 
+def _never() -> bool:
+    return False
+
+
 def _always_once(_: int) -> Sequence[float]:
     return (0.0,)
 
@@ -198,6 +202,11 @@ class LineCamera(PortByHand):
         # likewise, behind what came in front of number, input and Trigger in that write: the camera
         # takes one message after the other, and a sensor may come between
         self.between: Callable[[int, int | None], None] = _nothing_more
+        # likewise, with a Trigger's count and which message of that write is taken next, from 0
+        self.at_word: Callable[[int, int], None] = _nothing_more
+        # whether the messages of a write come one by one, each with a delay of its own
+        self.splits: Callable[[], bool] = _never
+        self.says_singly = False  # each message that it says is put on the line alone
         # of a datagram, by message id: after how many seconds each copy of it arrives; empty, it is
         # lost. What comes is asked as the negative id, and is lost or not.
         self.network: Callable[[int], Sequence[float]] = _always_once
@@ -378,7 +387,7 @@ class LineCamera(PortByHand):
             return
         self.sent.append(Sent(self.sessions, run, part))
         data = CONTAINER.pack(run.number, run.session, run.trigger, run.index, part, run.token)
-        self._out.append((RESULT, self.wire.words(run.application) + data))
+        self._put(RESULT, self.wire.words(run.application) + data)
 
     def _overtrigger(self) -> None:
         if not self._conditions & OVERTRIGGERED:
@@ -424,7 +433,9 @@ class LineCamera(PortByHand):
         if frames:
             self.writes += 1
             self.arrived += sum(message_id == TRIGGER for message_id, _ in frames)
-            self.towards.put((peer, frames))
+            parts = [[frame] for frame in frames] if self.splits() else [frames]
+            for part in parts:
+                self.towards.put((peer, part))
 
     def _take(self, item: tuple[Peer, list[Frame] | None]) -> None:
         peer, frames = item
@@ -436,9 +447,12 @@ class LineCamera(PortByHand):
         triggers = any(message_id == TRIGGER for message_id, _ in frames) and self._peer is peer
         if triggers:
             self.before(*around)
-        for message_id, payload in frames:
-            if triggers and message_id in {NUMBER, INPUT, TRIGGER}:
-                triggers = False
+        in_front = triggers
+        for word, (message_id, payload) in enumerate(frames):
+            if triggers:
+                self.at_word(around[0], word)
+            if in_front and message_id in {NUMBER, INPUT, TRIGGER}:
+                in_front = False
                 self.between(*around)
             if message_id == CONNECT:
                 self._connect(peer)
@@ -552,7 +566,12 @@ class LineCamera(PortByHand):
             self._say(STATUS, status, *([0] if self.wire.word == "I" else []))
 
     def _say(self, message_id: int, *words: int) -> None:
-        self._out.append((message_id, self.wire.words(*words)))
+        self._put(message_id, self.wire.words(*words))
+
+    def _put(self, message_id: int, payload: bytes) -> None:
+        self._out.append((message_id, payload))
+        if self.says_singly:
+            self._flush()
 
     def flush(self) -> None:
         """Put on the line what was said until now; what comes then is another thing on it."""

@@ -20,7 +20,8 @@ from smartcam import (
 )
 from smartcam.emulator import EmulatedCamera, faults
 from smartcam.protocols import messages as m
-from tests.client.clientkit import FAST, SHORT, SOON, balance, emulated, until
+from tests.client.clientkit import FAST, SHORT, SOON, balance, emulated
+from tests.handmade import until
 
 IDLE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 
@@ -119,7 +120,7 @@ async def test_bid_trigger_error_during_ours_is_an_overtrigger_and_then_reset(
         await box.wait_received(m.Trigger, count=2)
         clock.advance(0.5)
         assert await next_one == 1
-        assert camera.status == IDLE
+        assert await camera.query_status() == IDLE
         balance(camera.statistics())
 
 

@@ -35,6 +35,7 @@ from tests.client.camera_by_hand import (
     INPUT,
     INVALID,
     NOT_READY,
+    OK,
     OK_ID,
     QUERY,
     RESET,
@@ -52,12 +53,12 @@ from tests.client.clientkit import (
     bid_by_hand,
     cancelled,
     gone,
+    hear,
     lose_and_come_back,
     quiet,
     steps,
-    until,
 )
-from tests.handmade import LIMIT, Peer, scripted
+from tests.handmade import LIMIT, Peer, scripted, until
 from tests.insides import inside
 
 TRANSPORTS = pytest.mark.parametrize("transport", ["tcp", "udp"])
@@ -89,8 +90,9 @@ async def test_bid_session_byte_for_byte() -> None:
             ("30000000", "30000400 0200 1500"),
             ("12000000 30000000", "12000200 2100 30000400 0200 1500"),
             (
-                "30000000 40000000 12000000",
-                "30000400 0200 1500 40000200 0000 20000700 1500 48656c6c6f 12000200 2000",
+                "30000000 12000000 40000000 12000000",
+                "30000400 0200 1500 12000200 2100"
+                "40000200 0000 20000700 1500 48656c6c6f 12000200 2000",
             ),
         ):
             sent = bytes.fromhex(request)
@@ -213,12 +215,107 @@ async def test_bid_trigger_refused_ends_at_once_and_the_next_is_taken(
         assert camera.statistics().late == 0
 
 
-async def test_bid_result_before_the_acknowledgement_is_the_triggers() -> None:
+async def test_bid_result_before_the_acknowledgement_is_older() -> None:
     async with bid_by_hand() as (box, camera):
-        box.script[TRIGGER] = lambda _: box.result_frame() + box.said(TRIGGER, 0)
-        assert (await camera.trigger()).value == b"found"
-        assert (await camera.trigger()).value == b"found"
-        assert camera.statistics().unexpected_messages == 0
+        results = camera.results()
+        box.script[TRIGGER] = lambda _: (
+            box.result_frame(b"older") + box.said(TRIGGER, 0) + box.result_frame()
+        )
+        for _ in range(2):
+            assert (await camera.trigger()).value == b"found"
+            assert [(await anext(results)).raw for _ in range(2)] == [b"older", b"found"]
+        statistics = camera.statistics()
+        assert (statistics.triggered, statistics.streamed) == (2, 2)
+        assert statistics.unexpected_messages == 0
+
+
+# ---------------------------------------------------------------------- what shows that it is ours
+
+
+def at_the_triggers_query(box: HandmadeBid, status: int) -> None:
+    """Let the status be another one from the Query on that goes out with the next trigger."""
+    query, count = box.script[QUERY], 0
+
+    def answer(payload: bytes) -> bytes:
+        nonlocal count
+        count += 1
+        if count == 2:  # the first one is behind the status that is asked for before
+            box.status = status
+        return query(payload)
+
+    box.script[QUERY] = answer
+
+
+async def test_bid_trigger_of_a_camera_that_does_not_wait_as_its_status_says_is_in_doubt() -> None:
+    """A sensor has triggered it since it was asked last; its result comes behind our answer."""
+    async with bid_by_hand() as (box, camera):
+        at_the_triggers_query(box, BID_READY)
+
+        def at_trigger(_: bytes) -> bytes:
+            box.status = BID_IDLE
+            return box.said(TRIGGER, OK) + box.result_frame(b"sensor's")
+
+        box.script[TRIGGER] = at_trigger
+        with pytest.raises(OvertriggeredError, match="it cannot be told whose the result is"):
+            await camera.trigger()
+        box.script[TRIGGER] = lambda _: box.said(TRIGGER, OK) + box.result_frame(b"own")
+        assert (await camera.trigger()).raw == b"own"
+        balance(camera.statistics())
+
+
+async def test_bid_trigger_error_that_is_set_again_behind_the_reset_ends_the_call() -> None:
+    """A sensor's trigger was dropped in between, and so may ours have been."""
+    async with bid_by_hand(box={"status": BID_IDLE | BID_TRIGGER_ERROR}) as (box, camera):
+
+        def reset(_: bytes) -> bytes:
+            at_the_triggers_query(box, BID_IDLE | BID_TRIGGER_ERROR)
+            return box.said(RESET, OK) + box.status_frame(BID_IDLE)
+
+        query, box.script[RESET] = box.script[QUERY], reset
+        box.script[TRIGGER] = lambda _: box.said(TRIGGER, OK) + box.result_frame(b"sensor's")
+        with pytest.raises(OvertriggeredError):
+            await camera.trigger()
+        assert TRIGGER in box.ids
+        box.script |= {RESET: box._reset, QUERY: query}
+        box.script[TRIGGER] = lambda _: box.said(TRIGGER, OK) + box.result_frame(b"own")
+        assert (await camera.trigger()).raw == b"own"
+
+
+async def test_bid_reset_of_another_task_hides_no_trigger_that_was_dropped() -> None:
+    async with bid_by_hand() as (box, camera):
+        results = camera.results()
+
+        def dropped(_: bytes) -> bytes:
+            box.status |= BID_TRIGGER_ERROR
+            return box.said(TRIGGER, OK) + box.result_frame(b"sensor's")
+
+        box.script[TRIGGER] = dropped
+        triggering = asyncio.create_task(camera.trigger())
+        await box.wait_for(TRIGGER)
+        resetting = asyncio.create_task(camera.reset_errors())
+        with pytest.raises(OvertriggeredError):
+            await triggering
+        assert await resetting == IDLE
+        assert (await anext(results)).raw == b"sensor's"
+
+
+async def test_bid_result_waits_for_the_status_behind_the_trigger() -> None:
+    async with bid_by_hand() as (box, camera):
+        results, status = camera.results(), box.script[STATUS]
+
+        def at_trigger(_: bytes) -> bytes:
+            box.script[STATUS] = quiet
+            return box.said(TRIGGER, OK) + box.result_frame()
+
+        box.script[TRIGGER] = at_trigger
+        triggering = asyncio.create_task(camera.trigger())
+        streamed = asyncio.ensure_future(anext(results))
+        await box.wait_for(TRIGGER)
+        await steps(50)
+        assert not triggering.done()
+        assert not streamed.done()
+        box.send(status(b""))
+        assert (await triggering).raw == (await streamed).raw == b"found"
 
 
 async def test_bid_acknowledgement_that_never_comes_costs_the_link_at_the_next_trigger() -> None:
@@ -313,10 +410,15 @@ async def test_bid_trigger_error_of_before_is_reset_and_spoils_nothing(transport
         assert camera.status == IDLE
 
 
-async def test_bid_trigger_error_that_no_reset_clears_does_not_stop_the_line() -> None:
-    async with bid_by_hand(box={"status": BID_IDLE | BID_TRIGGER_ERROR}) as (box, camera):
-        box.script[RESET] = lambda _: box.said(RESET, 0) + box.status_frame(box.status)
-        assert (await camera.trigger()).value == b"found"
+@TRANSPORTS
+async def test_bid_trigger_error_that_no_reset_clears_is_never_sent_into(transport: str) -> None:
+    sticky = {"transport": transport, "status": BID_IDLE | BID_TRIGGER_ERROR}
+    async with bid_by_hand(box=sticky) as (box, camera):
+        reset, box.script[RESET] = box.script[RESET], lambda _: box.said(RESET, OK)
+        with pytest.raises(OvertriggeredError, match=r"has stayed set for 1 s.*none was sent"):
+            await camera.trigger(timeout=10.0)
+        assert (TRIGGER in box.ids, RESET in box.ids) == (False, True)
+        box.script[RESET] = reset
         assert (await camera.trigger()).value == b"found"
 
 
@@ -373,7 +475,7 @@ async def test_bid_switch_while_busy_to_the_end_is_a_timeout() -> None:
 async def test_bid_switch_to_an_id_that_does_not_fit_sends_nothing(application: int) -> None:
     async with bid_by_hand() as (box, camera):
         mark = len(box.ids)
-        with pytest.raises(ConfigurationError, match=f"id {application} is not 1 to 65535"):
+        with pytest.raises(ConfigurationError, match=rf"application.* {application}\b"):
             await camera.switch_application(application)
         assert box.commands(mark) == []
 
@@ -572,6 +674,22 @@ async def test_bid_status_is_asked_for_only_while_somebody_wants_it() -> None:
         assert box.ids.count(STATUS) == asked
 
 
+@TRANSPORTS
+async def test_bid_status_is_not_asked_for_again_while_a_trigger_asks(transport: str) -> None:
+    """The answers say nothing of whose they are, so one question of a kind is open at a time."""
+    async with bid_by_hand(box={"transport": transport}) as (box, camera):
+
+        def take_and_say_no_more(_: bytes) -> bytes:
+            box.script[STATUS] = lambda _: b""
+            return box.said(TRIGGER, OK)
+
+        box.script[TRIGGER] = take_and_say_no_more
+        with pytest.raises(TriggerTimeoutError):
+            await camera.trigger(timeout=2 * SHORT)
+        behind = box.ids[box.ids.index(TRIGGER) :]
+        assert behind.count(STATUS) == 1
+
+
 async def test_bid_status_that_comes_by_itself_is_seen() -> None:
     async with bid_by_hand() as (box, camera):
         statuses = camera.statuses()
@@ -593,6 +711,18 @@ async def test_bid_request_gives_the_answers_body() -> None:
         assert await camera.request(TRIGGER) == bytes.fromhex("0000")
         await until(lambda: camera.statistics().received == 1)
         assert camera.statistics().unclaimed == 1
+
+
+async def test_bid_status_from_before_a_request_is_no_answer_to_it() -> None:
+    """It was read, and is handed on when the request has gone out."""
+    async with bid_by_hand() as (box, camera):
+        older = box.status_frame(BID_READY)
+        box.status = BID_IDLE
+        hear(camera, older)
+        newer = await camera.request(STATUS)
+        assert newer == box.status.to_bytes(2, "little")
+        assert newer != older[-2:]
+        assert await camera.request(STATUS) == newer  # nothing is owed any more
 
 
 # ---------------------------------------------------------------------- cancelling

@@ -24,16 +24,13 @@ from smartcam import (
     Result,
     WrongApplicationError,
 )
-from smartcam._client.interpretation import Interpretation
-from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.solvers import chain_of
-from smartcam.calibration._plane.moving_camera import MovingCamera
-from smartcam.emulator import EmulatedCamera
-from smartcam.emulator._scene import PIECES, TablePose, TableScene
+from smartcam._client._inside import Interpretation
+from smartcam.calibration import MovingCamera, PlaneCalibration, Transform, chain_of, fit_plane
+from smartcam.emulator import EmulatedCamera, TablePose, TableScene
+from smartcam.emulator._inside import PIECES
 from smartcam.interpreters import Context, Reader
 from smartcam.interpreters._basic import RecordInterpreter
-from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.models import Calibration
 from tests.client.clientkit import balance, by_hand, emulated, steps
 
@@ -184,8 +181,7 @@ async def test_calibration_applies_to_the_interpreter_of_one_trigger() -> None:
         spec = "localizations: (x: real32, y: real32)*"
         (part,) = (await camera.trigger(interpret_as=spec)).value
         assert part.pose.position == place(0.25, 0.5)
-        with pytest.raises(ConfigurationError, match="got the interpreter 'raw'"):
-            await camera.trigger(interpret_as="raw")
+        assert (await camera.trigger(interpret_as="raw")).value == box.container
 
 
 async def test_calibration_goes_before_an_observer_sees_a_result() -> None:
@@ -366,7 +362,7 @@ def test_calibration_that_is_none_is_refused(given: Any) -> None:
 
 def test_calibration_mapping_from_something_else_is_refused() -> None:
     given: Any = {"7": CALIBRATION}
-    with pytest.raises(ConfigurationError, match=r"^calibration: a mapping .* '7' is no id"):
+    with pytest.raises(ConfigurationError, match=r"^calibration: application: expected an integer"):
         smartcam.connect("bvs://h", interpret_as="localizations", calibration=given)
 
 
@@ -420,6 +416,21 @@ def test_calibration_that_does_not_go_with_the_interpreters_is_refused(
     specs = {7: "localizations", 5: "x: real32"}
     with pytest.raises(ConfigurationError, match=f"^calibration: {text}"):
         smartcam.connect("bvs://h", interpret_as=specs, calibration=calibration)
+
+
+async def test_calibration_is_not_for_what_another_trigger_reads() -> None:
+    options: dict[str, Any] = {"interpret_as": "localizations", "calibration": {7: CALIBRATION}}
+    async with by_hand(**options) as (box, camera):
+        box.container = b"bolt".ljust(50, b"\0")
+        assert (await camera.trigger(interpret_as="strings50")).value == ["bolt"]
+        assert (await camera.trigger(interpret_as="raw")).value == box.container
+        box.container = BOLT
+        for spec in (None, "localizations"):
+            (part,) = (await camera.trigger(interpret_as=spec)).value
+            assert part.pose.header.frame_id == "robot"
+        box.container = bytes(4)
+        with pytest.raises(InterpretationError, match="expected 50 bytes"):
+            await camera.trigger()
 
 
 _PLACES = CORNERS @ TURN[:, :2].T + SHIFT

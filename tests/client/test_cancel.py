@@ -12,7 +12,7 @@ import pytest
 
 import smartcam
 from smartcam import ConnectionClosedError, NotRunningError
-from smartcam._client.correlation import Progress, _Owed
+from smartcam._client.correlation import TriggerEvidence, _Owed
 from smartcam.emulator import EmulatedCamera
 from tests.client.clientkit import balance
 from tests.insides import inside
@@ -33,7 +33,7 @@ COUNTER = {
 }
 """Each run gives another number, so that no result can pass for another one."""
 
-MOST_STEPS = 300
+MAX_STEPS = 300
 """Bound of a sweep; the longest call takes about a fifth of it."""
 
 
@@ -173,18 +173,18 @@ async def test_call_cancelled_at_any_step_leaves_a_camera_that_works(
     dialect: str, name: str, transport: str
 ) -> None:
     calls = BID_CALLS if dialect == "bid" else CALLS
-    for count in range(MOST_STEPS):
+    for count in range(MAX_STEPS):
         async with emulator(transport, dialect=dialect) as box, connect(box) as camera:
             over = await cancel_after(count, calls[name](camera))
             await works(camera, box)
         if over:
             return
-    pytest.fail(f"it is not over after {MOST_STEPS} steps")
+    pytest.fail(f"it is not over after {MAX_STEPS} steps")
 
 
 @pytest.mark.parametrize("name", CALLS)
 async def test_call_cancelled_at_any_step_leaves_a_camera_whose_state_is_known(name: str) -> None:
-    for count in range(MOST_STEPS):
+    for count in range(MAX_STEPS):
         async with emulator() as box, connect(box) as camera:
             over = await cancel_after(count, CALLS[name](camera))
             try:
@@ -201,7 +201,7 @@ async def test_call_cancelled_at_any_step_leaves_a_camera_whose_state_is_known(n
 @pytest.mark.parametrize("name", ["trigger", "trigger in another application", "application"])
 async def test_call_cancelled_at_any_step_and_repeated_is_done(name: str) -> None:
     async with emulator() as box, connect(box) as camera:
-        for count in range(MOST_STEPS):
+        for count in range(MAX_STEPS):
             over = await cancel_after(count, CALLS[name](camera))
             assert await camera.query_application() in {3, 7}
             if over:
@@ -216,7 +216,7 @@ async def test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_res
     dialect: str,
 ) -> None:
     async with emulator(dialect=dialect) as box, connect(box) as camera:
-        for count in range(MOST_STEPS):
+        for count in range(MAX_STEPS):
             over = await cancel_after(count, camera.trigger())
             result = await camera.trigger()
             assert result.sequence == box.device.next_number - 1
@@ -226,7 +226,9 @@ async def test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_res
 
 def _owe(camera: Camera) -> None:
     """Have the client owe a result, as after a trigger that was given up."""
-    inside(camera)._results.correlation.owed.append(_Owed("late", None, 1, Progress(begun=True)))
+    begun = TriggerEvidence()
+    begun.on_beginning()
+    inside(camera)._results.correlation.owed.append(_Owed("late", None, 1, begun))
 
 
 @pytest.mark.parametrize("dialect", ["handbook", "bid"])
@@ -234,7 +236,7 @@ async def test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_resul
     dialect: str,
 ) -> None:
     async with emulator(dialect=dialect) as box, connect(box) as camera:
-        for count in range(MOST_STEPS):
+        for count in range(MAX_STEPS):
             _owe(camera)
             over = await cancel_after(count, camera.trigger())
             result = await camera.trigger()
@@ -250,7 +252,7 @@ async def test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_resul
 async def test_open_cancelled_at_any_step_leaves_a_camera_for_the_next(
     application: int | None, dialect: str, *, running: bool
 ) -> None:
-    for count in range(MOST_STEPS):
+    for count in range(MAX_STEPS):
         async with emulator(running=running, dialect=dialect) as box:
             camera = connect(box, application=application)
             over = await cancel_after(count, camera.open())
@@ -264,7 +266,7 @@ async def test_open_cancelled_at_any_step_leaves_a_camera_for_the_next(
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 async def test_close_cancelled_at_any_step_leaves_nothing(transport: str) -> None:
-    for count in range(MOST_STEPS):
+    for count in range(MAX_STEPS):
         async with emulator(transport) as box:
             camera = await connect(box)
             over = await cancel_after(count, camera.close())
@@ -277,7 +279,7 @@ async def test_close_cancelled_at_any_step_leaves_nothing(transport: str) -> Non
 
 
 async def test_close_at_any_step_of_a_trigger_in_another_application_ends_it() -> None:
-    for count in range(MOST_STEPS):
+    for count in range(MAX_STEPS):
         async with emulator() as box, connect(box) as camera:
             task = asyncio.create_task(camera.trigger(3))
             for _ in range(count):

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam import Status
+from smartcam._client._inside import Interpretation
 from smartcam._client.correlation import (
     FEWEST_NUMBERS,
     MAX_OWED,
@@ -19,229 +20,286 @@ from smartcam._client.correlation import (
     Debt,
     Match,
 )
-from smartcam._client.interpretation import MAX_NUMBER, Interpretation
+from smartcam._client.interpretation import MAX_NUMBER
 from smartcam.protocols.messages import ResultContainer
-from tests.client.correlation_line import READY, WORKING, Line, ready, shown
+from tests.client.correlation_line import READY, WORKING, Line, after_one, ready
 from tests.insides import inside
 
 OURS = Match("triggered")
-HELD = Match("held")
 LATE = Match("late")
 STREAMED = Match("streamed")
 NOBODY = Match("nobody")
 EXTRA = Match("nobody", extra=True)
 
-RAW = Interpretation("raw", lenient=False, y_down=False)
+OVERTRIGGERED = Status.OVERTRIGGERED
+STOPPED = Status(0)
+
+numbers_of_any_width = pytest.mark.parametrize("number", [None, 41, MAX_NUMBER])
+"""None: the layout has none."""
 
 
-# ---------------------------------------------------------------------- without a number
+# ---------------------------------------------------------------------- the evidence
 
 
 def test_container_without_a_trigger_is_nobodys() -> None:
     assert Line().result() == NOBODY
 
 
-@pytest.mark.parametrize("ordered", [True, False])
-def test_container_after_a_triggers_inspection_began_is_its_own(*, ordered: bool) -> None:
-    line = Line(ordered=ordered)
-    line.hear(READY)
-    line.trigger()
-    line.hear(WORKING)
-    assert line.result() == OURS
-
-
-# ---------------------------------------------------------------------- the fence
-
-
-@pytest.mark.parametrize("knows", [True, False])
-@pytest.mark.parametrize("number", [None, 41])
-def test_container_before_the_fence_is_answered_is_older(
-    number: int | None, *, knows: bool
+@numbers_of_any_width
+def test_trigger_ends_by_its_result_when_the_camera_has_shown_that_it_took_it(
+    number: int | None,
 ) -> None:
-    line = shown() if knows else Line()
-    line.hear(READY)
-    pending = line.send(number)
-    line.hear(WORKING)  # somebody else's
-    assert line.result(number).fate == "nobody"
-    assert (pending.early, pending.progress.begun) == (1, False)
-    line.hear(READY)
-    line.answer()
+    line = ready()
+    pending = line.trigger(number)
     line.hear(WORKING)
+    assert line.result(number, "own") == OURS
+    assert not pending.ended  # another inspection may be said before the second answer
+    line.answer()
+    assert pending.ended
+    assert line.returned == ["own"]
+
+
+@numbers_of_any_width
+def test_result_that_comes_behind_the_second_answer_is_the_triggers(number: int | None) -> None:
+    line = ready()
+    pending = line.begin(number)
+    assert not pending.ended
     assert line.result(number) == OURS
+    assert pending.ended
 
 
-@pytest.mark.parametrize("ordered", [True, False])
-def test_container_behind_the_fence_and_before_waiting_drops_is_older(*, ordered: bool) -> None:
-    """Where a status is not told, or may be lost, the fence is all."""
-    line = shown(ordered=ordered)
-    line.fences = True
-    line.hear(READY)
-    line.send()
-    line.answer()
-    assert line.result() == (NOBODY if ordered else OURS)
+@numbers_of_any_width
+@pytest.mark.parametrize("answers", [0, 1, 2])
+def test_result_without_a_shown_inspection_is_not_the_triggers(
+    answers: int, number: int | None
+) -> None:
+    line = ready()
+    pending = line.send(number)
+    for _ in range(answers):
+        line.answer()
+    assert line.result(number) == NOBODY
+    line.hear(READY | Status.OVERHEAT)  # that is no beginning
+    assert line.result(number) == NOBODY
+    assert (pending.early, pending.came, pending.ended) == (2, 0, False)
+
+
+@numbers_of_any_width
+def test_inspection_before_the_first_answer_is_somebody_elses(number: int | None) -> None:
+    line = ready()
+    pending = line.send(number)
     line.hear(WORKING)
-    assert line.result() == (OURS if ordered else NOBODY)
+    assert line.result(number) == NOBODY
+    line.hear(READY)
+    line.answer()
+    assert (line.others, pending.early, pending.evidence.began) == (1, 1, 0)
+    assert line.result(number) == NOBODY  # the camera waits again before it has said all of it
+    line.hear(WORKING)
+    line.answer()
+    assert line.result(number) == OURS
+    assert pending.ended
 
 
-def test_trigger_without_a_fence_is_reached_at_once() -> None:
-    line = Line(ordered=False)
-    assert line.send().progress.reached
+@numbers_of_any_width
+@pytest.mark.parametrize("when", ["at once", "behind its result"])
+def test_two_inspections_between_the_answers_cannot_be_told_apart(
+    when: str, number: int | None
+) -> None:
+    line = ready()
+    pending = line.trigger(number)
+    line.hear(WORKING)
+    if when == "behind its result":
+        assert line.result(number) == OURS  # until it is known better
+    line.hear(READY, WORKING)
+    assert (pending.ended, line.doubts, line.returned) == (True, 1, [])
+    assert line.result(number).fate != "triggered"
+    line.answer()
+    assert line.returned == []
+
+
+def test_inspection_behind_the_second_answer_is_the_triggers_where_none_was_before() -> None:
+    """A camera may say that it took the trigger a moment later."""
+    line = ready()
+    pending = line.trigger()
+    line.answer()
+    line.hear(WORKING)
     assert line.result() == OURS
+    assert pending.ended
 
 
-def test_fence_of_a_trigger_that_is_settled_says_nothing() -> None:
-    line = Line()
+def test_second_inspection_behind_the_second_answer_is_somebody_elses() -> None:
+    line = ready()
+    pending = line.begin()
+    line.hear(READY, WORKING)
+    assert (line.others, line.doubts, pending.ended) == (1, 0, False)
+    assert line.result() == NOBODY
+    assert not pending.ended
+
+
+@pytest.mark.parametrize("answers", [0, 1, 2])
+def test_overtriggered_that_rises_ends_the_trigger(answers: int) -> None:
+    line = ready()
+    pending = line.send()
+    for _ in range(answers):
+        line.answer()
+    line.hear(WORKING)
+    line.result()
+    if answers == 2:
+        assert pending.ended
+        return
+    line.hear(WORKING | OVERTRIGGERED, WORKING)
+    for _ in range(2 - answers):
+        line.answer()
+    assert (pending.ended, line.returned) == (True, [])
+
+
+def test_application_that_is_stopped_ends_the_trigger() -> None:
+    """What begins behind the next start is somebody else's."""
+    line = ready()
+    line.trigger()
+    line.hear(STOPPED)
+    line.answer()
+    line.hear(READY, WORKING)
+    assert line.result().fate != "triggered"
+
+
+@pytest.mark.parametrize("number", [None, 41])
+def test_trigger_over_udp_needs_no_evidence(number: int | None) -> None:
+    line = ready(complete=False)
+    pending = line.send(number)
+    assert line.result(number) == OURS
+    assert pending.ended
+
+
+def test_answers_of_a_trigger_that_is_settled_say_nothing() -> None:
+    line = ready()
     pending = line.send()
     line.give_up()
     line.at.settled()
     line.answer()
-    assert not pending.progress.reached
-
-
-def test_waiting_that_dropped_before_the_fence_is_not_this_triggers() -> None:
-    line = shown()
-    pending = line.send()
-    line.hear(WORKING, READY)
-    line.answer()
-    run = pending.progress
-    assert (run.reached, run.begun, run.shown) == (True, False, False)
     line.hear(WORKING)
-    assert pending.progress.begun
+    assert pending.evidence.began == 0
     assert line.others == 1
 
 
-def test_results_of_the_run_before_that_come_behind_the_fence_are_older() -> None:
-    """The camera waits again before it has said them."""
-    line = shown()
-    line.send()
-    line.hear(WORKING, READY)  # a sensor's
-    line.answer()
-    assert [line.result(), line.result()] == [NOBODY, NOBODY]
-    line.hear(WORKING)
-    assert line.result() == OURS
+# ---------------------------------------------------------------------- where a trigger is answered
 
 
-# ---------------------------------------------------------------------- held
+def polled() -> Line:
+    """A camera of ``bid`` over TCP."""
+    line = Line(complete=False, polled=True)
+    line.hear(READY)
+    return line
 
 
-def test_container_is_held_while_it_is_not_known_whether_the_camera_shows_a_trigger() -> None:
-    line = ready()
-    line.trigger()
-    assert line.result() == HELD
-    assert line.wants_query
-    assert line.judged == []
-
-
-def test_held_container_is_the_triggers_when_a_further_query_is_answered() -> None:
-    line = ready()
+def test_trigger_that_is_answered_ends_by_its_result_and_a_status_behind_it() -> None:
+    line = polled()
     pending = line.trigger()
-    line.result(None, "own")
-    line.answer()
-    assert line.judged == [("own", OURS)]
+    line.hear(READY)
+    line.trigger_answer()
+    assert line.result() == OURS
+    assert not pending.ended
+    line.hear(WORKING)
     assert pending.ended
-    line.leave()
-    for _ in range(3):  # it is known now that the camera shows nothing
-        line.trigger()
-        assert line.result() == OURS
-        line.leave()
 
 
-def test_held_container_is_older_when_waiting_drops_behind_it() -> None:
-    line = ready()
-    line.trigger()
-    line.result(None, "old")
-    line.hear(WORKING)
-    assert line.judged == [("old", NOBODY)]
-    assert line.result() == OURS
-
-
-def test_held_container_stays_held_while_a_status_says_nothing_of_it() -> None:
-    line = ready()
-    line.trigger()
-    line.result()
-    line.hear(READY | Status.OVERHEAT)
-    assert line.judged == []
-    assert len(line.held) == 1
-
-
-@pytest.mark.parametrize("how", ["give up", "lose the link"])
-def test_held_container_of_a_trigger_that_is_given_up_pays_its_debt(how: str) -> None:
-    line = ready()
-    line.trigger()
-    line.result(None, "own")
-    line.give_up() if how == "give up" else line.reconnect()
-    assert line.judged == [("own", LATE)]
-    assert line.at.debt is None
-
-
-def test_query_of_before_tells_nothing_of_what_the_camera_shows() -> None:
-    line = ready()
-    line.send()
-    line.at.on_query_answer()  # its own fence is not answered
-    line.answer()
-    assert line.result() == HELD
-
-
-@pytest.mark.parametrize("what", ["nothing under way", "begun"])
-def test_query_tells_nothing_of_what_the_camera_shows_where_nothing_is_held(what: str) -> None:
-    line = ready()
-    if what == "begun":
-        line.status = None
-        line.trigger()
-        line.hear(WORKING)  # the first status of a session: whether it dropped is not known
-        line.result()
-        line.leave()
-    line.at.on_query_answer()
+def test_result_of_a_trigger_that_is_answered_may_come_behind_the_status() -> None:
+    line = polled()
+    pending = line.trigger()
     line.hear(READY)
-    line.trigger()
-    assert line.result() == HELD
+    line.trigger_answer()
+    line.hear(WORKING)
+    assert not pending.ended
+    assert line.result() == OURS
+    assert pending.ended
 
 
-def test_camera_that_was_taken_for_one_that_shows_nothing_is_known_better_at_the_first_drop() -> (
-    None
-):
-    line = ready()
-    line.trigger()
-    line.result()
-    line.answer()
-    line.leave()
-    line.hear(WORKING, READY)
-    line.trigger()
-    assert line.result().fate == "nobody"
-
-
-# ---------------------------------------------------------------------- shown
-
-
-@pytest.mark.parametrize("knows", [None, False])
-def test_camera_that_did_not_wait_at_the_fence_has_to_drop_waiting(knows: bool | None) -> None:
-    """It can take the trigger only when it waits again, and that is said."""
-    line = ready()
-    if knows is False:
-        line.trigger()
-        line.result()
+@pytest.mark.parametrize("queried", [True, False])
+def test_result_before_the_trigger_is_answered_is_older(*, queried: bool) -> None:
+    line = polled()
+    pending = line.send()
+    if queried:
         line.answer()
-        line.leave()
-    line.send()
-    line.hear(Status.RUNNING | Status.WAITING_FOR_TRIGGER | Status.BUSY)
-    line.status = WORKING  # as the first status of a session might have been
-    line.answer()
-    assert line.pending is not None
-    assert line.pending.progress.shown
-    assert line.result().fate == "nobody"
-    line.hear(READY)
-    assert line.result().fate == "nobody"
-    line.hear(WORKING)
-    assert line.result() == OURS
-
-
-def test_debt_of_a_trigger_that_has_to_drop_waiting_is_not_paid_before() -> None:
-    line = Line()
-    line.status = WORKING
-    line.trigger()
-    line.give_up()
+        line.hear(READY)
     assert line.result() == NOBODY
-    assert line.at.debt == "late"
+    assert (pending.early, pending.came) == (1, 0)
+
+
+BEFORE = {
+    "none": [],
+    "none behind the answer to the Query": [READY, None],
+    "does not wait": [None, WORKING],
+    "does not wait, and then it does": [None, WORKING, READY],
+    "has dropped one": [None, READY | OVERTRIGGERED],
+}
+
+
+@pytest.mark.parametrize("statuses", BEFORE.values(), ids=BEFORE.keys())
+def test_trigger_of_which_no_status_in_front_says_that_the_camera_waits_is_in_doubt(
+    statuses: list[Status | None],
+) -> None:
+    """None: the answer to the Query."""
+    line = polled()
+    line.hear(READY | OVERTRIGGERED)  # in no change of it a rise shows
+    pending = line.send()
+    for status in statuses:
+        line.hear(status) if status is not None else line.answer()
+    assert not pending.ended
+    line.trigger_answer()
+    assert (pending.ended, line.doubts) == (True, 1)
+    assert line.result().fate != "triggered"
+
+
+def test_status_in_front_that_says_that_the_camera_waits_counts_whatever_comes_then() -> None:
+    line = polled()
+    pending = line.trigger()
+    line.hear(READY, WORKING)
+    line.trigger_answer()
+    assert (pending.ended, line.doubts) == (False, 0)
+
+
+@pytest.mark.parametrize("result", [True, False])
+def test_overtriggered_behind_the_answer_to_the_trigger_is_in_doubt(*, result: bool) -> None:
+    """Set before as well: no change of it shows."""
+    line = polled()
+    pending = line.trigger()
+    line.hear(READY)
+    line.status = READY | OVERTRIGGERED
+    line.trigger_answer()
+    if result:
+        assert line.result() == OURS  # until it is known better
+    line.hear(WORKING | OVERTRIGGERED)
+    assert (pending.ended, line.doubts, line.returned) == (True, 1, [])
+
+
+def test_answer_without_a_trigger_says_nothing() -> None:
+    line = polled()
+    line.at.on_trigger_answer()
+    line.at.on_query_answer()
+    pending = line.trigger()
+    assert not pending.evidence.reached
+
+
+def test_answer_of_the_trigger_before_says_nothing_of_the_next() -> None:
+    line = polled()
+    first = line.trigger()
+    line.hear(READY)
+    line.trigger_answer()
+    line.give_up()
+    second = line.send()
+    line.hear(WORKING)
+    assert (first.evidence.proven, second.evidence.proven) == (False, False)
+
+
+# ---------------------------------------------------------------------- where nothing shows it
+
+
+def test_container_behind_the_answer_in_front_is_the_triggers_where_nothing_shows_it() -> None:
+    line = Line(complete=False, fenced=True)
+    pending = line.send()
+    assert line.result() == NOBODY
+    line.answer()
+    assert line.result() == OURS
+    assert pending.ended
 
 
 # ---------------------------------------------------------------------- debts
@@ -250,7 +308,7 @@ def test_debt_of_a_trigger_that_has_to_drop_waiting_is_not_paid_before() -> None
 @pytest.mark.parametrize("debt", ["late", "streamed"])
 def test_container_after_a_trigger_was_given_up_pays_its_debt_once(debt: Debt) -> None:
     line = ready()
-    line.trigger()
+    line.begin()
     line.give_up(debt)
     assert line.at.debt == debt
     assert line.result() == Match(debt)
@@ -258,13 +316,12 @@ def test_container_after_a_trigger_was_given_up_pays_its_debt_once(debt: Debt) -
     assert line.result() == NOBODY
 
 
-def test_container_before_the_fence_of_a_trigger_given_up_does_not_pay_its_debt() -> None:
-    """D1: the second result of the trigger before."""
-    line = shown()
+def test_container_before_a_trigger_given_up_began_does_not_pay_its_debt() -> None:
+    """The second result of the trigger before."""
+    line = after_one()
     line.send()
     line.give_up()
     assert line.result().fate == "nobody"
-    assert line.at.debt == "late"
     line.answer()
     assert line.result().fate == "nobody"
     assert line.at.debt == "late"
@@ -274,8 +331,8 @@ def test_container_before_the_fence_of_a_trigger_given_up_does_not_pay_its_debt(
 
 
 def test_sensors_result_of_before_does_not_pay_a_debt() -> None:
-    """D2: its inspection began before our trigger had come."""
-    line = shown()
+    """Its inspection began before our trigger had come."""
+    line = ready()
     line.send()
     line.give_up()
     line.hear(WORKING)
@@ -288,33 +345,34 @@ def test_sensors_result_of_before_does_not_pay_a_debt() -> None:
 def test_debts_are_paid_in_the_order_of_their_triggers() -> None:
     line = ready()
     for wanted, debt in enumerate(("late", "streamed"), 1):
-        line.trigger(wanted=wanted)
+        line.begin(wanted=wanted)
         line.give_up(debt)  # type: ignore[arg-type]
+        line.hear(READY)
     assert [line.result() for _ in range(4)] == [LATE, STREAMED, STREAMED, NOBODY]
 
 
 def test_trigger_given_up_owes_the_results_that_it_has_not() -> None:
-    line = Line(ordered=False)
-    line.trigger(wanted=3)
+    line = Line(complete=False)
+    line.send(wanted=3)
     line.result()
     line.give_up()
     assert [line.result() for _ in range(3)] == [LATE, LATE, NOBODY]
 
 
 def test_container_that_came_and_was_not_read_is_not_owed() -> None:
-    line = Line(ordered=False)
-    pending = line.trigger(wanted=2)
+    line = Line(complete=False)
+    pending = line.send(wanted=2)
     line.at.give_up(pending, unread=1)
     line.leave()
     assert [line.result(), line.result()] == [LATE, NOBODY]
-    line.at.give_up(line.trigger(), unread=1)
+    line.at.give_up(line.send(), unread=1)
     line.leave()
     assert line.at.debt is None
 
 
 def test_container_of_a_trigger_whose_caller_was_not_woken_yet_is_late() -> None:
     line = ready()
-    line.trigger()
+    line.begin()
     line.cancel()
     assert line.result() == LATE
 
@@ -328,13 +386,22 @@ def test_trigger_given_up_twice_keeps_its_first_fate() -> None:
 
 
 def test_trigger_that_has_its_results_owes_nothing() -> None:
-    line = shown()
-    line.trigger()
-    line.hear(WORKING)
+    line = ready()
+    line.begin()
     line.result()
     line.give_up()
     assert line.at.debt is None
     assert not line.at.doubted
+
+
+def test_trigger_whose_results_were_not_proven_owes_them_still() -> None:
+    """They may be somebody else's, and its own may still come."""
+    line = ready()
+    line.trigger()
+    line.hear(WORKING)
+    line.result()
+    line.give_up()
+    assert line.at.debt == "late"
 
 
 def test_settled_means_that_nothing_of_before_can_come() -> None:
@@ -350,7 +417,7 @@ def test_settled_means_that_nothing_of_before_can_come() -> None:
 
 
 def test_status_is_in_doubt_behind_a_trigger_that_was_given_up_before_it_began() -> None:
-    line = shown()
+    line = ready()
     line.trigger()
     assert not line.at.doubted
     line.give_up()
@@ -363,21 +430,20 @@ def test_status_is_in_doubt_behind_a_trigger_that_was_given_up_before_it_began()
 
 
 def test_status_is_in_no_doubt_behind_a_trigger_that_has_begun() -> None:
-    line = shown()
-    line.trigger()
-    line.hear(WORKING)
+    line = ready()
+    line.begin()
     line.give_up()
     assert not line.at.doubted
 
 
 def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> None:
-    line = shown()
-    line.trigger()
-    line.hear(WORKING)
+    line = ready()
+    line.begin()
     line.give_up()  # begun: it stays
     line.hear(READY)
     line.send(wanted=2)
     line.give_up("streamed")
+    line.answer()
     line.answer()
     line.at.heard()
     assert not line.at.doubted
@@ -386,9 +452,13 @@ def test_debt_of_a_trigger_that_never_began_is_dropped_when_all_is_heard() -> No
     assert line.others == 1  # no trigger of ours is left that it could be
 
 
-@pytest.mark.parametrize("line", [ready(), shown(ordered=False)], ids=["unknown", "unordered"])
-def test_debt_stays_where_it_is_not_known_that_it_would_have_shown(line: Line) -> None:
-    line.trigger()
+@pytest.mark.parametrize("kind", ["udp", "polled"])
+def test_debt_stays_where_not_every_status_is_told(kind: str) -> None:
+    line = ready(complete=False) if kind == "udp" else polled()
+    line.trigger() if kind == "polled" else line.send()
+    if kind == "polled":
+        line.hear(READY)
+        line.trigger_answer()
     line.give_up()
     line.at.heard()
     assert not line.at.doubted
@@ -404,60 +474,63 @@ ORDERS = {
 }
 
 
+@pytest.mark.parametrize("answered", [0, 1, 2, 3])
 @pytest.mark.parametrize("order", ORDERS.values(), ids=ORDERS.keys())
-def test_second_container_of_one_trigger_is_extra_in_each_order(order: list[Any]) -> None:
+def test_second_container_of_one_trigger_is_extra_in_each_order(
+    order: list[Any], answered: int
+) -> None:
+    """The second answer comes before, between or behind them."""
     line = ready()
-    line.trigger()
+    pending = line.trigger()
     line.hear(WORKING)
     verdicts: list[Match] = []
-    for one in order:
+    for count, one in enumerate([*order, None]):
+        if count == answered:
+            line.answer()
         if one == "result":
             verdicts.append(line.result())
-        else:
+        elif one is not None:
             line.hear(one)
     assert verdicts == [OURS, EXTRA]
+    assert pending.ended
 
 
 def test_second_container_that_comes_behind_the_next_trigger_is_not_its() -> None:
-    line = shown()
-    line.trigger()
-    line.hear(WORKING)
-    assert line.result() == OURS
-    line.leave()
-    line.hear(READY)
+    line = after_one()
     pending = line.trigger()
     assert line.result().fate == "nobody"
     line.hear(WORKING)
     assert line.result() == OURS
+    line.answer()
     assert pending.ended
 
 
 def test_several_results_are_all_the_triggers() -> None:
-    line = shown()
-    line.trigger(wanted=3)
-    line.hear(WORKING)
+    line = ready()
+    line.begin(wanted=3)
     assert [line.result() for _ in range(5)] == [OURS, OURS, OURS, EXTRA, EXTRA]
 
 
-def test_more_containers_than_are_wanted_are_not_held() -> None:
-    line = ready()
-    line.trigger(wanted=2)
-    assert [line.result() for _ in range(3)] == [HELD, HELD, NOBODY]
-    line.answer()
-    assert [match for _, match in line.judged] == [NOBODY, OURS, OURS]
-
-
 def test_container_of_somebody_elses_inspection_is_not_extra() -> None:
-    line = shown()
+    line = after_one()
     line.hear(WORKING)
     assert line.result() == NOBODY
+
+
+def test_container_behind_anothers_inspection_is_not_the_triggers_second() -> None:
+    """An inspection says everything before the next one shows; ours has said one result of two."""
+    line = ready()
+    line.begin(wanted=2)
+    assert line.result() == OURS
+    line.hear(READY, WORKING)
+    assert line.result().fate == "nobody"
 
 
 # ---------------------------------------------------------------------- somebody else's
 
 
 def test_inspection_that_no_trigger_of_ours_began_is_somebody_elses() -> None:
-    line = shown()
+    line = after_one()
     assert line.at.judge(None).extra
     line.hear(WORKING)
     assert line.others == 1
@@ -465,20 +538,20 @@ def test_inspection_that_no_trigger_of_ours_began_is_somebody_elses() -> None:
 
 
 @pytest.mark.parametrize(
-    "status", [Status(0), Status.BUSY, READY, READY | Status.BUSY, Status.OVERHEAT]
+    "status", [STOPPED, Status.BUSY, READY, READY | Status.BUSY, Status.OVERHEAT]
 )
 def test_status_that_begins_no_inspection_is_nobodys(status: Status) -> None:
-    line = shown()
+    line = after_one()
     line.hear(status)
     assert line.others == 0
     assert line.at.judge(None).extra
     pending = line.trigger()
     line.hear(status)
-    assert not pending.progress.begun
+    assert not pending.evidence.began
 
 
 def test_status_that_goes_on_working_begins_no_inspection() -> None:
-    line = shown()
+    line = ready()
     line.hear(WORKING, WORKING | Status.OVERHEAT)
     assert line.others == 1
 
@@ -487,26 +560,15 @@ def test_first_status_of_a_session_tells_of_no_drop() -> None:
     line = Line()
     line.hear(WORKING)
     assert line.others == 0
-    line.hear(READY)
-    line.trigger()
-    assert line.result() == HELD
 
 
-def test_first_status_of_a_session_may_be_that_of_the_trigger() -> None:
-    line = Line()
-    pending = line.trigger()
-    line.hear(WORKING)
-    assert pending.progress.begun
-    assert line.result() == OURS
-
-
-@pytest.mark.parametrize("ordered", [True, False])
-def test_second_inspection_behind_a_trigger_is_somebody_elses(*, ordered: bool) -> None:
+@pytest.mark.parametrize("complete", [True, False])
+def test_second_inspection_behind_a_trigger_is_somebody_elses(*, complete: bool) -> None:
     """Where a status may be lost nothing is told of others."""
-    line = shown(ordered=ordered)
-    line.trigger()
+    line = ready(complete=complete)
+    line.begin() if complete else line.send()
     line.hear(WORKING, READY, WORKING)
-    assert line.others == int(ordered)
+    assert line.others == int(complete)
     assert not line.at.judge(None).extra
 
 
@@ -520,121 +582,55 @@ def test_inspection_that_owes_us_a_result_is_ours() -> None:
 
 
 def test_somebody_elses_inspection_has_the_number_that_the_user_has_set() -> None:
-    line = shown()
+    line = ready()
     line.at.give_number(41)
     line.hear(WORKING)
-    assert line.at.take_number(MAX_NUMBER)[0] != 41
-
-
-# ---------------------------------------------------------------------- confirmed
-
-
-def test_trigger_is_confirmed_by_a_status_behind_its_answer() -> None:
-    line = Line(ordered=False, fences=True)
-    pending = line.send(confirms=True)
-    line.answer()
-    line.hear(READY)
-    assert line.result() == OURS
-    line.hear(READY)
-    assert not pending.progress.confirmed
-    line.at.on_answer()
-    assert not pending.ended
-    assert line.result().fate == "nobody"  # it has all that it wants
-    line.hear(WORKING)
-    assert pending.progress.confirmed
-    assert pending.ended
-
-
-def test_answer_without_a_trigger_confirms_none() -> None:
-    line = shown()
-    line.at.on_answer()  # of one that has its results
-    assert not line.send(confirms=True).progress.answered
-
-
-def test_status_of_before_the_answer_does_not_confirm_the_next_trigger() -> None:
-    line = Line(ordered=False, fences=True)
-    first = line.send(confirms=True)
-    line.answer()
-    line.at.on_answer()
-    line.give_up()
-    second = line.send(confirms=True)
-    line.hear(WORKING)
-    assert (first.progress.confirmed, second.progress.confirmed) == (False, False)
+    assert line.at.take_number(MAX_NUMBER) != 41
 
 
 # ---------------------------------------------------------------------- with a number
 
 
-@pytest.mark.parametrize("ordered", [True, False])
-def test_container_with_a_number_of_ours_alone_is_its_own_in_any_order(*, ordered: bool) -> None:
-    line = shown(ordered=ordered)
-    line.send(5000, fenced=False, certain=True)
-    assert line.result(5000) == OURS
-
-
-def test_container_with_a_number_that_others_may_have_is_its_own_behind_the_drop() -> None:
-    """A sensor's run took the number that the user had set, and it waits before it is told."""
-    line = shown()
-    line.send(41)
-    line.hear(WORKING, READY)  # the sensor's
-    line.answer()
-    assert line.result(41) == NOBODY
-    line.hear(WORKING)
-    assert line.result(42) == NOBODY
-    assert line.result(41) == OURS
-
-
-def test_container_with_a_number_that_others_may_have_is_its_own_behind_a_sensors_run() -> None:
-    """The sensor's began between our Query and our SentTrigger, and was over by the SentTrigger."""
-    line = shown()
-    line.trigger(41)
-    line.hear(WORKING, READY)  # the sensor's
-    assert line.result(7) == NOBODY
-    line.hear(WORKING)
-    assert line.result(41) == OURS
-
-
-def test_container_with_a_number_that_others_may_have_is_held_where_nothing_is_known() -> None:
-    line = ready()
-    line.trigger(41)
-    assert line.result(41) == HELD
-    line.answer()
-    assert [match for _, match in line.judged] == [OURS]
-
-
-def test_container_with_a_number_that_others_may_have_is_its_own_over_udp() -> None:
-    line = shown(ordered=False)
-    line.send(41)
-    assert line.result(41) == OURS
-
-
-def test_container_with_another_number_is_nobodys() -> None:
-    line = Line()
-    line.send(5000, certain=True)
-    line.answer()
+@pytest.mark.parametrize("complete", [True, False])
+def test_container_with_another_number_is_nobodys(*, complete: bool) -> None:
+    line = ready(complete=complete)
+    line.begin(5000) if complete else line.send(5000)
     assert line.result(4999) == NOBODY
     assert line.result(5001) == NOBODY
     assert line.result(5000) == OURS
 
 
+@numbers_of_any_width
+def test_container_of_a_sensors_run_that_took_our_number_is_not_the_triggers(
+    number: int | None,
+) -> None:
+    """It came between our two words; ours has the next number."""
+    line = ready()
+    line.trigger(number)
+    line.hear(WORKING)  # the sensor's
+    line.result(number)
+    line.hear(READY, WORKING)  # ours
+    assert (line.doubts, line.returned) == (1, [])
+
+
 @pytest.mark.parametrize("debt", ["late", "streamed"])
 def test_container_with_the_number_of_a_trigger_given_up_is_known(debt: Debt) -> None:
-    line = Line()
+    line = ready()
     line.trigger(1000)
     line.give_up(debt)
-    line.send(2000, certain=True, fenced=False)
+    line.begin(2000)
     assert line.result(1000) == Match(debt)
     assert line.result(2000) == OURS
     assert line.at.debt is None
 
 
 def test_containers_of_several_triggers_given_up_may_come_in_any_order() -> None:
-    line = Line(ordered=False)
+    line = Line(complete=False)
     fates: list[Debt] = ["late", "streamed", "late"]
     for number, debt in enumerate(fates, 1):
-        line.trigger(number * 1000)
+        line.send(number * 1000)
         line.give_up(debt)
-    line.trigger(4000)
+    line.send(4000)
     assert [line.result(number) for number in (2000, 4000, 3000, 1000)] == [
         STREAMED,
         OURS,
@@ -656,25 +652,26 @@ def test_debt_stays_until_every_number_that_is_owed_has_come() -> None:
 
 
 def test_somebody_elses_number_does_not_pay_a_debt() -> None:
-    line = Line()
-    line.trigger(1000)
+    line = ready()
+    line.begin(1000)
     line.give_up()
     assert line.result(77) == NOBODY
     assert line.at.debt == "late"
 
 
 def test_second_container_with_the_number_of_the_last_trigger_is_extra() -> None:
-    line = Line()
-    line.send(1000, certain=True, fenced=False)
+    line = ready()
+    line.begin(1000)
     line.result(1000)
     line.leave()
-    line.send(2000, certain=True, fenced=False)
+    line.hear(READY)
+    line.begin(2000)
     assert line.result(1000) == EXTRA
     assert line.result(2000) == OURS
 
 
 def test_container_without_a_number_is_judged_by_the_order() -> None:
-    line = shown()
+    line = ready()
     line.trigger(5000)
     assert line.result(None).fate == "nobody"
     line.hear(WORKING)
@@ -683,17 +680,18 @@ def test_container_without_a_number_is_judged_by_the_order() -> None:
 
 def test_container_without_a_number_pays_a_debt() -> None:
     line = ready()
-    line.trigger(1000)
+    line.begin(1000)
     line.give_up()
     assert line.result(None) == LATE
 
 
 def test_container_with_a_number_pays_the_debt_of_a_trigger_without() -> None:
     line = ready()
-    line.send(1000, certain=True, fenced=False)
+    line.begin(1000)
     line.result(1000)
     line.leave()
-    line.trigger()
+    line.hear(READY)
+    line.begin()
     line.give_up()
     assert line.result(1001) == LATE
 
@@ -721,7 +719,7 @@ def test_numbers_owed_are_bounded_and_the_oldest_are_forgotten() -> None:
 
 
 def test_trigger_of_a_lost_session_is_owed_in_the_next() -> None:
-    line = shown()
+    line = ready()
     line.send()
     line.reconnect()
     line.hear(READY)  # it may have begun, and ended, while nobody listened
@@ -729,45 +727,39 @@ def test_trigger_of_a_lost_session_is_owed_in_the_next() -> None:
 
 
 def test_drop_in_the_next_session_is_not_the_lost_triggers() -> None:
-    line = shown()
+    line = ready()
     pending = line.send()
     line.reconnect()
     line.hear(READY, WORKING)
-    assert not pending.progress.begun
+    assert not pending.evidence.began
     assert line.others == 1
 
 
-def test_session_begins_without_doubt_and_without_an_old_fence() -> None:
-    line = shown()
-    pending = line.send()
+def test_session_begins_without_doubt_and_without_answers_of_before() -> None:
+    line = ready()
+    pending = line.trigger()
     line.give_up()
     assert line.at.doubted
     line.reconnect()
-    assert (line.at.doubted, line.at.judge(None).extra, line.fence_open) == (False, False, False)
-    line.at.on_fence(int(READY))
-    line.at.on_answer()
-    assert not pending.progress.reached
-
-
-def test_what_the_camera_shows_is_known_over_sessions() -> None:
-    line = shown()
-    line.reconnect()
-    line.hear(READY)
-    line.trigger()
-    assert line.result().fate == "nobody"
+    assert (line.at.doubted, line.at.judge(None).extra) == (False, False)
+    line.at.on_query_answer()
+    line.at.on_trigger_answer()
+    line.hear(READY, WORKING)
+    assert (pending.evidence.began, pending.evidence.proven) == (0, False)
 
 
 def test_numbers_owed_in_a_lost_session_are_known_in_the_next() -> None:
-    line = Line()
+    line = ready()
     line.trigger(1000)
     line.reconnect()
-    line.send(2000, certain=True, fenced=False)
+    line.hear(READY)
+    line.begin(2000)
     assert line.result(1000) == LATE
     assert line.result(2000) == OURS
 
 
 def test_extra_container_is_not_told_over_sessions() -> None:
-    line = shown()
+    line = after_one()
     assert line.result() == EXTRA
     line.reconnect()
     assert line.result() == NOBODY
@@ -799,9 +791,7 @@ def test_numbering_of_a_field_is_as_wide_as_it_and_the_wire(field_type: str, hig
 @pytest.mark.parametrize("highest", sorted(set(FIELDS.values())))
 def test_numbers_fit_and_do_not_come_again_soon(highest: int) -> None:
     attribution = Correlation(chance=0.5)
-    taken = [attribution.take_number(highest) for _ in range(4 * FEWEST_NUMBERS)]
-    numbers = [number for number, _ in taken]
-    assert {certain for _, certain in taken} == {highest == MAX_NUMBER}
+    numbers = [attribution.take_number(highest) for _ in range(4 * FEWEST_NUMBERS)]
     assert all(0 <= number <= highest for number in numbers)
     for first in range(len(numbers) - FEWEST_NUMBERS):
         assert len(set(numbers[first : first + FEWEST_NUMBERS])) == FEWEST_NUMBERS
@@ -816,13 +806,13 @@ def test_runs_of_others_count_away_from_the_next_number(highest: int, chance: fl
     attribution = Correlation(chance)
     step = min(NUMBER_STEP, (highest + 1) // FEWEST_NUMBERS)
     for _ in range(FEWEST_NUMBERS):
-        number, _ = attribution.take_number(highest)
+        number = attribution.take_number(highest)
         following = (number - step) % (highest + 1)
         runs = (following - number) % (highest + 1)
         assert runs == highest + 1 - step
     if highest <= 1 << 16:  # once more by counting
-        first, _ = attribution.take_number(highest)
-        following, _ = attribution.take_number(highest)
+        first = attribution.take_number(highest)
+        following = attribution.take_number(highest)
         others = itertools.takewhile(
             lambda one: one != following, (n % (highest + 1) for n in itertools.count(first + 1))
         )
@@ -831,56 +821,53 @@ def test_runs_of_others_count_away_from_the_next_number(highest: int, chance: fl
 
 def test_number_wraps_around_below_zero() -> None:
     attribution = Correlation(chance=0.0)
-    assert attribution.take_number(MAX_NUMBER) == (MAX_NUMBER + 1 - NUMBER_STEP, True)
-    assert attribution.take_number(MAX_NUMBER) == (MAX_NUMBER + 1 - 2 * NUMBER_STEP, True)
+    assert attribution.take_number(MAX_NUMBER) == MAX_NUMBER + 1 - NUMBER_STEP
+    assert attribution.take_number(MAX_NUMBER) == MAX_NUMBER + 1 - 2 * NUMBER_STEP
 
 
-def test_number_the_user_has_set_is_taken_once_and_may_be_anybodys() -> None:
+def test_number_the_user_has_set_is_taken_once() -> None:
     attribution = Correlation(chance=0.5)
     attribution.give_number(41)
-    assert attribution.take_number(MAX_NUMBER) == (41, False)
-    number, certain = attribution.take_number(MAX_NUMBER)
-    assert number != 41
-    assert certain
+    assert attribution.take_number(MAX_NUMBER) == 41
+    assert attribution.take_number(MAX_NUMBER) != 41
 
 
 def test_number_the_user_has_set_that_does_not_fit_the_field_is_not_taken() -> None:
     attribution = Correlation(chance=0.5)
     attribution.give_number(200)
-    assert 0 <= attribution.take_number(127)[0] <= 127
-    assert attribution.take_number(MAX_NUMBER)[0] != 200
+    assert 0 <= attribution.take_number(127) <= 127
+    assert attribution.take_number(MAX_NUMBER) != 200
 
 
 @pytest.mark.parametrize("highest", [127, MAX_NUMBER])
 def test_number_the_user_has_set_may_be_the_highest(highest: int) -> None:
     attribution = Correlation(chance=0.5)
     attribution.give_number(highest)
-    assert attribution.take_number(highest) == (highest, False)
+    assert attribution.take_number(highest) == highest
 
 
 def test_number_the_user_has_set_again_while_its_result_is_owed_is_not_taken() -> None:
-    line = Line()
+    line = ready()
     line.at.give_number(41)
-    line.trigger(line.at.take_number(MAX_NUMBER)[0])
+    line.trigger(line.at.take_number(MAX_NUMBER))
     line.give_up()
     line.at.give_number(41)
-    number, certain = line.at.take_number(MAX_NUMBER)
-    assert (number != 41, certain) == (True, True)
-    line.send(number, certain=certain, fenced=False)
+    number = line.at.take_number(MAX_NUMBER)
+    assert number != 41
+    line.begin(number)
     assert line.result(41) == LATE
     assert line.result(number) == OURS
 
 
 def test_number_of_the_last_trigger_that_the_user_has_set_again_is_not_taken() -> None:
     """A second result of that trigger may still come."""
-    line = shown()
+    line = ready()
     line.at.give_number(41)
-    line.trigger(line.at.take_number(MAX_NUMBER)[0])
-    line.hear(WORKING)
+    line.begin(line.at.take_number(MAX_NUMBER))
     assert line.result(41) == OURS
     line.leave()
     line.at.give_number(41)
-    assert line.at.take_number(MAX_NUMBER)[0] != 41
+    assert line.at.take_number(MAX_NUMBER) != 41
 
 
 def test_number_the_user_has_set_that_a_trigger_without_a_number_took_is_not_taken_again() -> None:
@@ -889,12 +876,12 @@ def test_number_the_user_has_set_that_a_trigger_without_a_number_took_is_not_tak
     line.at.give_number(500)
     line.trigger()
     line.give_up()
-    assert line.at.take_number(MAX_NUMBER)[0] != 500
+    assert line.at.take_number(MAX_NUMBER) != 500
 
 
 def test_two_clients_begin_at_different_numbers() -> None:
     cameras = [smartcam.connect("bvs://127.0.0.1") for _ in range(5)]
-    first = {inside(one)._results.correlation.take_number(MAX_NUMBER)[0] for one in cameras}
+    first = {inside(one)._results.correlation.take_number(MAX_NUMBER) for one in cameras}
     assert len(first) > 1
 
 
@@ -921,13 +908,3 @@ def test_number_of_any_bytes_is_a_number_or_none(data: bytes, endian: int) -> No
     else:
         order: Literal["little", "big"] = "big" if endian else "little"
         assert number == int.from_bytes(data[:2], order, signed=True)
-
-
-def test_container_behind_anothers_inspection_is_not_the_triggers_second() -> None:
-    """An inspection says everything before the next one shows; ours has said one result of two."""
-    line = shown()
-    line.trigger(wanted=2)
-    line.hear(WORKING)
-    assert line.result() == OURS
-    line.hear(READY, WORKING)
-    assert line.result().fate == "nobody"

@@ -1,4 +1,4 @@
-"""A container is never given to a trigger but its own: against a plain model of a camera."""
+"""A trigger is never given a result but its own: against a plain model of a camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from smartcam import Status
-from smartcam._client.correlation import MAX_OWED, Debt
+from smartcam._client.correlation import MAX_OWED
 from smartcam._client.interpretation import MAX_NUMBER
 from tests.client.correlation_line import READY, WORKING, Line
 
@@ -20,16 +20,18 @@ STOPPED = Status(0)
 SENSOR = 0
 """Whose container it is that somebody else's trigger gave; triggers of ours count from 1."""
 
-MOVES = ["deliver", "take", "say", "sensor"]
+MAX_MOVES = 1000
+"""After which nothing will be as it is awaited."""
+
 Kind = Literal["plain", "number", "perhaps"]
 """Layout of a trigger: without a number, with one, with one that may be missing."""
 
 
 class Word(NamedTuple):
-    """What the client says: to the camera it travels as it is."""
+    """What the client says."""
 
-    what: Literal["query", "number", "trigger", "stop", "start"]
-    write: int = 0  # the trigger that it was written with
+    what: Literal["query", "status", "number", "trigger", "reset", "stop", "start"]
+    whose: int = 0  # the trigger that it was written with
     number: int = 0
 
 
@@ -38,10 +40,13 @@ class Container:
     """One on its way: whose it is, and the number in it."""
 
     whose: int  # the trigger that began its run
-    number: int | None  # in it
-    # the trigger of which the camera had taken the first word and not yet the last when this run
-    # began, by somebody else's trigger
-    between: int | None
+    number: int | None
+    # the trigger of which the camera had taken a word last when somebody else began this run
+    behind: int | None
+
+
+Said = Status | Container | Literal["answer", "taken", "refused"]
+"""What is on its way to the client; an answer to a Query, or to a trigger."""
 
 
 @dataclass
@@ -53,17 +58,20 @@ class ModelCamera:
     """
 
     shows: bool = True  # Waiting for Trigger drops at a trigger
+    late: bool = False  # but behind the next answer only, at a trigger of ours
+    polled: bool = False  # it says its status only when it is asked for it, and answers a trigger
+    latches: bool = False  # Overtriggered stays for a while, or until it is reset
+    refuses: bool = False  # it answers a trigger that it drops by another code
     bits: int = 64  # of a container's number, which has a sign
     heard: deque[Word] = field(default_factory=deque[Word])  # words on their way to it
-    # what is on its way from it
-    said: deque[Status | Container | Literal["answer"]] = field(
-        default_factory=deque["Status | Container | Literal['answer']"]
-    )
+    said: deque[Said] = field(default_factory=deque[Said])  # what is on its way from it
     # what it still has to say of the last inspection
     left: list[Status | Container] = field(default_factory=list["Status | Container"])
     next_number: int = 0
-    between: int | None = None
     running: bool = True
+    overtriggered: bool = False
+    untold: bool = False  # that an inspection has begun
+    behind: int | None = None  # the trigger of which a word was taken last
 
     @property
     def works(self) -> bool:
@@ -71,72 +79,121 @@ class ModelCamera:
 
     @property
     def status(self) -> Status:
-        if not self.running:
-            return STOPPED
-        return WORKING if self.works and self.shows else READY
+        """As it says it."""
+        status = STOPPED
+        if self.running:
+            status = WORKING if self.works and self.shows else READY
+        return status | Status.OVERTRIGGERED if self.overtriggered else status
+
+    def tell_status(self) -> None:
+        """Say it where that is done without a question."""
+        if not self.polled:
+            self.said.append(self.status)
 
     def begin(self, whose: int, left: list[Status | None], *, numbers: bool = True) -> None:
         """Take a trigger, or drop it; a container stands in ``left`` as None."""
         if not self.running:
             return
         if self.works:
-            if self.shows:
-                self.said += [WORKING | Status.OVERTRIGGERED, WORKING]
+            self.drop()
             return
-        self.said += self.left
-        if self.shows:
-            self.said.append(WORKING)
+        while self.left:
+            self.say()
         half = 1 << (self.bits - 1)
         number = (self.next_number + half) % (2 * half) - half
         self.next_number += 1
-        between = self.between if whose == SENSOR else None
-        container = Container(whose, number if numbers else None, between)
+        behind = self.behind if whose == SENSOR else None
+        container = Container(whose, number if numbers else None, behind)
         self.left = [container if one is None else one for one in left]
+        self.untold = True
+        if whose == SENSOR or not self.late:
+            self.tell_beginning()
+
+    def tell_beginning(self) -> None:
+        if self.untold:
+            self.untold = False
+            self.tell_status()
+
+    def drop(self) -> None:
+        """Overtriggered rises where it is not set."""
+        self.tell_beginning()
+        if not self.overtriggered:
+            self.overtriggered = True
+            self.tell_status()
+        if not self.latches:
+            self.calm()
+
+    def calm(self) -> None:
+        """Overtriggered falls."""
+        if self.overtriggered:
+            self.overtriggered = False
+            self.tell_status()
 
     def say(self) -> None:
         """Say the next of what is left."""
-        if self.left:
-            what = self.left.pop(0)
-            if self.shows or isinstance(what, Container):
-                self.said.append(what)
+        if not self.left:
+            return
+        self.tell_beginning()
+        what = self.left.pop(0)
+        if isinstance(what, Container):
+            self.said.append(what)
+        else:
+            self.tell_status()
 
     def stop(self) -> None:
         """Leave run mode; the inspection under way is void."""
-        if not self.works:
-            self.said += self.left
+        while self.left and not self.works:
+            self.say()
         self.left.clear()
         self.running = False
-        self.said.append(STOPPED)
+        self.tell_status()
+
+    def start(self) -> None:
+        self.running = True
+        self.tell_status()
 
 
 class CameraAndClient(RuleBasedStateMachine):
     """Triggers of ours and of somebody else, losses and give-ups, in any order.
 
-    What must hold: a container is never given to a trigger but its own. Only a run that somebody
-    else has begun between the words that one trigger is written with may pass for its own.
+    What must hold: a trigger is never given a container but its own, and is given that one unless
+    it has ended before.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("plain",)
-    sensors = True  # somebody else triggers, too
+    moves: ClassVar[tuple[str, ...]] = ("deliver", "take", "say", "calm", "sensor")
     ordered = True
     shows = True
+    late = False
     highest = MAX_NUMBER
     bits = 64
     results: ClassVar[tuple[int, ...]] = (1,)  # of a run
 
     def __init__(self) -> None:
         super().__init__()
-        self.camera = ModelCamera(shows=self.shows, bits=self.bits)
-        self.line = Line(ordered=self.ordered)
+        self.camera = ModelCamera(shows=self.shows, late=self.late, bits=self.bits)
+        self.line = Line(complete=self.ordered)
         self.sent = 0
         self.lefts: dict[int, list[Status | None]] = {}  # of each trigger under way
-        self.asked = False  # a Query is not answered
+        self.taken: set[int] = set()  # triggers that the camera took
+        self.asked = False  # a Query that was written with no trigger is not answered
         self.number: int | None = None  # of the last trigger
         self.given_up: set[int] = set()
+
+    @property
+    def sensors(self) -> bool:
+        """Somebody else triggers, too."""
+        return "sensor" in self.moves
+
+    @property
+    def gives(self) -> bool:
+        """A trigger gets its result from such a camera."""
+        return self.shows or self.line.is_fenced
 
     @initialize(data=st.data())
     def connect(self, data: st.DataObject) -> None:
         """The camera may be at work for the client before; perhaps we trigger at once."""
+        self.camera.latches = data.draw(st.booleans(), "latches")
         if self.sensors and data.draw(st.booleans(), "at work"):
             self.camera.begin(SENSOR, self.draw_left(data), numbers=self.draw_numbers(data))
             for _ in range(data.draw(st.integers(0, 3), "said")):
@@ -150,7 +207,7 @@ class CameraAndClient(RuleBasedStateMachine):
     def draw_left(self, data: st.DataObject) -> list[Status | None]:
         """What a run will say, in which order."""
         results = data.draw(st.sampled_from(self.results), "results")
-        place = data.draw(st.integers(0, results), "place of Waiting")
+        place = 0 if self.camera.polled else data.draw(st.integers(0, results), "place of Waiting")
         left: list[Status | None] = [None] * results
         left.insert(results - place, READY)
         return left
@@ -165,6 +222,14 @@ class CameraAndClient(RuleBasedStateMachine):
         pending = self.line.pending
         return pending is None or pending.ended or self.line.cancelled
 
+    @property
+    def owes(self) -> bool:
+        """Whether an answer to a Query is open."""
+        return self.asked or self.line.fences_open > 0
+
+    def say_to_camera(self, *words: Word) -> None:
+        self.camera.heard += words
+
     @precondition(lambda self: self.idle and self.line.status is not None)
     @rule(data=st.data())
     def trigger(self, data: st.DataObject) -> None:
@@ -176,25 +241,26 @@ class CameraAndClient(RuleBasedStateMachine):
             at.heard()
         if at.debt is not None and kind != "number":
             self.settle(data)
-        if self.asked:
-            self.go_on(data, lambda: not self.asked)
+        self.go_on(data, lambda: not self.owes)
         if self.line.status != READY:
             return
-        number, certain = None, False
-        if kind != "plain":
-            number, certain = at.take_number(self.highest)
-        fenced = self.ordered and not (certain and kind == "number")
+        number = None if kind == "plain" else at.take_number(self.highest)
+        self.write(data, number)
+
+    def write(self, data: st.DataObject, number: int | None = None) -> None:
+        """Write a trigger with all that goes with it."""
         self.sent += 1
         self.number = number
-        self.asked = fenced
-        wanted = data.draw(st.integers(1, min(self.results)), "wanted")
-        self.line.send(number, wanted, fenced=fenced, certain=certain)
         self.lefts[self.sent] = self.draw_left(data)
-        if fenced:
-            self.camera.heard.append(Word("query", self.sent))
+        self.line.send(number, data.draw(st.integers(1, min(self.results)), "wanted"))
+        fences = self.line.fences_open
+        if fences:
+            self.say_to_camera(Word("query", self.sent))
         if number is not None:
-            self.camera.heard.append(Word("number", self.sent, number))
-        self.camera.heard.append(Word("trigger", self.sent))
+            self.say_to_camera(Word("number", self.sent, number))
+        self.say_to_camera(Word("trigger", self.sent))
+        if fences > 1:
+            self.say_to_camera(Word("query", self.sent))
 
     @precondition(lambda self: self.sensors and self.idle and self.line.status == READY)
     @rule(said=st.integers(0, 2), data=st.data())
@@ -213,59 +279,65 @@ class CameraAndClient(RuleBasedStateMachine):
 
     def round_trip(self, data: st.DataObject) -> None:
         """Send a Query as soon as none is open, and have it answered."""
-        self.go_on(data, lambda: not self.asked)
-        self.query()
-        self.go_on(data, lambda: not self.asked)
-
-    def query(self) -> None:
+        self.go_on(data, lambda: not self.owes)
         self.asked = True
-        self.camera.heard.append(Word("query"))
+        self.say_to_camera(Word("query"))
+        self.go_on(data, lambda: not self.owes)
 
     def settle(self, data: st.DataObject) -> None:
         """What settles a debt: a moment for what is late, then Stop, a Query, Start."""
         at = self.line.at
         if data.draw(st.booleans(), "grace"):
-            self.go_on(data, lambda: self.line.status == READY)
+            self.go_on(data, lambda: self.line.status == READY, give_up=True)
         if at.debt is None:
             return
-        self.camera.heard.append(Word("stop"))
-        self.go_on(data, lambda: self.line.status == STOPPED)
+        self.say_to_camera(Word("stop"))
+        self.go_on(data, lambda: Status.RUNNING not in (self.line.status or STOPPED))
         self.round_trip(data)
-        self.camera.heard.append(Word("start"))
-        self.go_on(data, lambda: self.line.status == READY)
-        at.settled()
+        self.say_to_camera(Word("start"))
+        self.go_on(data, lambda: self.line.status == READY, give_up=True)
+        if self.line.status == READY:  # nobody has stopped it meanwhile
+            at.settled()
 
-    def go_on(self, data: st.DataObject, until: Callable[[], bool]) -> None:
-        """Let things happen until something is so."""
+    def go_on(
+        self, data: st.DataObject, until: Callable[[], bool], *, give_up: bool = False
+    ) -> None:
+        """Let things happen until something is so, or until it is clear that it will not be."""
         for _ in range(12):
             if until():
                 return
-            self.move(data.draw(st.sampled_from(MOVES), "next"), data)
-        while not until():
-            for what in MOVES[:3]:
+            self.move(data.draw(st.sampled_from(self.moves), "next"), data)
+        for _ in range(MAX_MOVES):
+            if until() or (give_up and self.camera_is_silent):
+                return
+            for what in ("deliver", "take", "say", "calm"):
                 self.move(what, data)
+        raise AssertionError("it does not go on")
+
+    @property
+    def camera_is_silent(self) -> bool:
+        """Nothing comes of it any more by itself."""
+        camera = self.camera
+        return not (camera.said or camera.heard or camera.left or camera.overtriggered)
 
     @precondition(lambda self: not self.idle)
     @rule(fate=st.sampled_from(["none", "none", "late", "cancelled"]), woken=st.booleans())
     def give_up(self, fate: Literal["none", "late", "cancelled"], *, woken: bool) -> None:
-        pending = self.line.pending
-        assert pending is not None
         if fate == "none":
             return
+        self.note_given_up()
         if fate == "late":
-            self.line.at.give_up(pending)
-            pending.ended = True
+            self.line.fail("late")
         self.line.cancel()
-        self.given_up.add(self.sent)
         if woken:
             self.wake()
 
-    def fail(self, debt: Debt) -> None:
+    def note_given_up(self) -> None:
+        """Its results are late from now on, unless it has all that it wants already."""
         pending = self.line.pending
         assert pending is not None
-        self.line.at.give_up(pending, debt)
-        pending.ended = True
-        self.given_up.add(self.sent)
+        if pending.came < pending.wanted:
+            self.given_up.add(self.sent)
 
     @precondition(lambda self: self.ordered)
     @rule(really=st.integers(0, 4))
@@ -274,21 +346,22 @@ class CameraAndClient(RuleBasedStateMachine):
         if really:
             return
         if not self.idle:
-            self.given_up.add(self.sent)
+            self.note_given_up()
         else:
             self.wake()  # the next session takes longer than that
         camera = self.camera
         camera.heard.clear()
         camera.said.clear()
-        camera.between, self.asked = None, False
+        camera.behind, self.asked = None, False
         self.line.reconnect()
         camera.said.append(camera.status)
 
     # -- what happens at the camera and on the way
 
-    @rule(moves=st.lists(st.sampled_from(MOVES), min_size=4, max_size=12), data=st.data())
-    def things_happen(self, moves: list[str], data: st.DataObject) -> None:
-        for what in moves:
+    @rule(data=st.data())
+    def things_happen(self, data: st.DataObject) -> None:
+        moves = st.lists(st.sampled_from(self.moves), min_size=4, max_size=12)
+        for what in data.draw(moves, "moves"):
             self.move(what, data)
 
     @rule(data=st.data(), ends=st.booleans())
@@ -298,72 +371,100 @@ class CameraAndClient(RuleBasedStateMachine):
         while camera.heard or camera.said or (ends and camera.left):
             for what in ("take", "say", "deliver") if ends else ("take", "deliver"):
                 self.move(what, data)
+        if ends and self.ordered and self.gives and not self.idle:
+            assert self.sent not in self.taken, "its result came, and it still waits"
 
     def move(self, what: str, data: st.DataObject) -> None:
         camera = self.camera
-        if what == "deliver" and camera.said:
-            self.hear(camera.said.popleft())
-        elif what == "take" and camera.heard:
-            self.take(camera.heard.popleft(), data)
-        elif what == "say":
-            camera.say()
-        elif what == "sensor" and self.sensors:
-            camera.begin(SENSOR, self.draw_left(data), numbers=self.draw_numbers(data))
+        match what:
+            case "deliver" if camera.said:
+                self.hear(camera.said.popleft())
+            case "take" if camera.heard:
+                self.take(camera.heard.popleft(), data)
+            case "say":
+                camera.say()
+            case "calm" if not camera.polled:
+                camera.calm()
+            case "sensor":
+                camera.begin(SENSOR, self.draw_left(data), numbers=self.draw_numbers(data))
+            case "operator":
+                camera.stop() if camera.running else camera.start()
+            case _:
+                pass
 
     def take(self, word: Word, data: st.DataObject) -> None:
         """The camera does what the client has said."""
         camera = self.camera
-        camera.between = word.write or None
+        camera.behind = word.whose or camera.behind
         match word.what:
             case "query":
                 camera.said.append("answer")
+                camera.tell_beginning()
+            case "status":
+                camera.said.append(camera.status)
             case "number":
                 camera.next_number = word.number
             case "trigger":
-                camera.between = None
-                numbers = self.draw_numbers(data)
-                camera.begin(word.write, self.lefts.pop(word.write), numbers=numbers)
+                self.take_trigger(word.whose, data)
+            case "reset":
+                camera.overtriggered = False
             case "stop":
                 camera.stop()
             case _:
-                camera.running = True
-                camera.said.append(READY)
+                camera.start()
 
-    def hear(self, what: Status | Container | Literal["answer"]) -> None:
+    def take_trigger(self, whose: int, data: st.DataObject) -> None:
+        camera = self.camera
+        takes = camera.running and not camera.works
+        if takes:
+            self.taken.add(whose)
+        if camera.polled and not takes and camera.refuses:
+            camera.said.append("refused")
+            return
+        if camera.polled:
+            camera.said.append("taken")
+        camera.begin(whose, self.lefts.pop(whose), numbers=self.draw_numbers(data))
+
+    def hear(self, what: Said) -> None:
         """Something comes to the client."""
         line = self.line
-        if isinstance(what, Container):
-            reads = line.numbered
-            line.result(what.number if reads else None, what)
-        elif what == "answer":
-            self.asked = False
-            line.answer()
-        else:
-            risen = what & ~(line.status or STOPPED)
-            if not self.idle and Status.OVERTRIGGERED in risen:
-                self.fail("streamed")
-            line.hear(what)
-        if line.wants_query and not self.asked:
-            self.query()
-        line.wants_query = False
+        own = isinstance(what, Container) and what.whose == self.sent and not self.idle
+        match what:
+            case Container():
+                line.result(what.number if line.numbered else None, what)
+            case "answer" if line.fences_open:
+                line.answer()
+            case "answer":
+                self.asked = False
+            case "taken" | "refused":
+                self.hear_of_trigger(what)
+            case _:
+                line.hear(what)
         for container, verdict in line.judged:
             assert isinstance(container, Container)
-            self.look_at(container, verdict.fate)
+            self.look_at(container, verdict.fate, own=own)
         line.judged.clear()
+        for container in line.returned:
+            assert isinstance(container, Container)
+            began = container.whose if self.ordered else container.behind or container.whose
+            assert began == self.sent, "a trigger got what is not its own"
+            assert self.gives, "a trigger got what nothing shows to be its own"
+        line.returned = []
+
+    def hear_of_trigger(self, what: Literal["taken", "refused"]) -> None:
+        raise NotImplementedError
 
     # -- what must hold
 
-    def look_at(self, container: Container, fate: str) -> None:
-        if fate == "triggered":
-            began = container.between if container.whose == SENSOR else container.whose
-            assert began == self.sent, "a run that began before the trigger was sent"
-        elif container.whose == self.sent and not self.idle:
-            numbered = self.number is not None and container.number is not None
-            if numbered or not self.sensors:
-                mine = not numbered or container.number == self.number
-                assert not mine, "the trigger's own container was not given to it"
+    def look_at(self, container: Container, fate: str, *, own: bool) -> None:
+        """What is not the trigger's may be taken until it is known better, what is its own is."""
+        if own and self.gives:
+            assert self.line.pending is not None
+            readable = self.number is None or container.number in {None, self.number}
+            full = self.line.pending.came == self.line.pending.wanted
+            assert fate == "triggered" or full or not readable, "the trigger's own was not given it"
         elif container.whose in self.given_up and self.kinds == ("number",) and not self.sensors:
-            assert fate != "nobody", "a late container was not known"
+            assert fate not in {"nobody", "triggered"}, "a late container was not known"
 
     @invariant()
     def bounded(self) -> None:
@@ -373,12 +474,18 @@ class CameraAndClient(RuleBasedStateMachine):
 class CameraAndClientAlone(CameraAndClient):
     """TCP, no numbers, all triggers ours, more results than wanted: each gets its own."""
 
-    sensors = False
-    results = (1, 2, 3)
+    moves = ("deliver", "take", "say", "calm")
+    results: ClassVar[tuple[int, ...]] = (1, 2, 3)
 
 
 class CameraAndClientWithSensor(CameraAndClient):
     """TCP, no numbers: anybody at any time."""
+
+
+class CameraAndClientWithOperator(CameraAndClient):
+    """The same, and somebody stops and starts the application at the camera."""
+
+    moves = (*CameraAndClient.moves, "operator")
 
 
 class CameraAndClientWithExtras(CameraAndClient):
@@ -387,24 +494,40 @@ class CameraAndClientWithExtras(CameraAndClient):
     results = (2, 3)
 
 
-class CameraAndClientThatShowsNothing(CameraAndClient):
-    """TCP, no numbers, all triggers ours: a camera on which Waiting for Trigger never drops."""
+class CameraAndClientThatShowsLate(CameraAndClientAlone):
+    """The camera answers the Query behind the trigger before it shows the inspection."""
 
-    sensors = False
+    late = True
+
+
+class CameraAndClientThatShowsNothing(CameraAndClient):
+    """TCP, no numbers: a camera on which Waiting for Trigger never drops gives no results."""
+
     shows = False
 
 
+class CameraAndClientThatKnowsThatNothingShows(CameraAndClientAlone):
+    """TCP, no numbers, all triggers ours: the client is told that the status does not show them."""
+
+    shows = False
+    results = (1,)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.line = Line(complete=False, fenced=True)
+
+
 class CameraAndClientByNumber(CameraAndClient):
-    """TCP, numbers: anybody at any time, and more results than wanted; no fence is needed."""
+    """TCP, numbers: anybody at any time, and more results than wanted."""
 
     kinds = ("number",)
-    results = (1, 2, 3)
+    results: ClassVar[tuple[int, ...]] = (1, 2, 3)
 
 
 class CameraAndClientByNumberAlone(CameraAndClientByNumber):
     """The same, all triggers ours: what is late is known for late."""
 
-    sensors = False
+    moves = CameraAndClientAlone.moves
 
 
 class CameraAndClientByOnesOwnNumber(CameraAndClient):
@@ -418,7 +541,7 @@ class CameraAndClientByOnesOwnNumber(CameraAndClient):
         """None: the one that the camera would give to its next run."""
         number = self.camera.next_number if number is None else number
         self.line.at.give_number(number)
-        self.camera.heard.append(Word("number", 0, number))
+        self.say_to_camera(Word("number", 0, number))
 
 
 class CameraAndClientByNarrowNumber(CameraAndClient):
@@ -450,7 +573,11 @@ class CameraAndClientByNumberThatMayBeMissing(CameraAndClientByOnesOwnNumber):
 
 
 class CameraAndClientByNumberOverUdp(CameraAndClient):
-    """UDP, numbers: what the camera says is overtaken and lost, what it is told is lost."""
+    """UDP, numbers: what the camera says is overtaken and lost, what it is told is lost.
+
+    A run that somebody else has begun behind the number may pass for the trigger's own, where the
+    trigger is lost, or the status that says that it was dropped.
+    """
 
     kinds = ("number",)
     ordered = False
@@ -474,11 +601,95 @@ class CameraAndClientByNumberOverUdp(CameraAndClient):
             camera.heard.popleft()
 
 
+class CameraAndClientThatAnswers(CameraAndClient):
+    """``bid`` over TCP: a trigger is answered, the status is asked for, anybody at any time."""
+
+    moves = (*CameraAndClient.moves, "poll", "push", "reset")
+    results = (1, 2)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.camera.polled = self.camera.latches = True
+        self.line = Line(complete=False, polled=True)
+        self.unanswered = False  # a trigger
+
+    @initialize(data=st.data())
+    def connect(self, data: st.DataObject) -> None:
+        super().connect(data)
+        self.camera.latches = True
+        self.camera.refuses = data.draw(st.booleans(), "refuses")
+
+    def move(self, what: str, data: st.DataObject) -> None:
+        if what == "poll" and self.line.status is not None:
+            self.say_to_camera(Word("status"))
+        elif what == "reset" and self.line.status is not None:  # another task's
+            self.say_to_camera(Word("reset"))
+        elif what == "push":
+            self.camera.said.append(self.camera.status)
+        super().move(what, data)
+
+    @precondition(lambda self: self.idle and self.line.status is not None)
+    @rule(data=st.data())
+    def trigger(self, data: st.DataObject) -> None:
+        at = self.line.at
+        self.wake()
+        self.refresh(data)
+        at.heard()
+        if at.debt is not None:
+            self.go_on(data, lambda: self.asks_until_ready())
+            self.round_trip(data)
+            at.settled()
+        if self.line.status == READY | Status.OVERTRIGGERED:
+            self.say_to_camera(Word("reset"))
+            self.refresh(data)
+        self.go_on(data, lambda: not self.owes)
+        if self.line.status != READY:
+            return
+        self.go_on(data, lambda: not self.unanswered)
+        self.write(data)
+
+    def asks_until_ready(self) -> bool:
+        status = self.line.status or STOPPED
+        if Status.WAITING_FOR_TRIGGER in status:
+            return True
+        if Word("status") not in self.camera.heard:
+            self.say_to_camera(Word("status"))
+        return False
+
+    def refresh(self, data: st.DataObject) -> None:
+        self.say_to_camera(Word("status"))
+        self.round_trip(data)
+
+    def write(self, data: st.DataObject, number: int | None = None) -> None:
+        self.sent += 1
+        self.lefts[self.sent] = self.draw_left(data)
+        self.line.send(number, data.draw(st.integers(1, min(self.results)), "wanted"))
+        words = Word("query"), Word("status"), Word("trigger", self.sent), Word("status")
+        self.say_to_camera(*words)
+        self.unanswered = True
+
+    def lose_the_link(self, really: int) -> None:
+        super().lose_the_link(really)
+        self.unanswered = self.unanswered and really > 0
+
+    def hear_of_trigger(self, what: Literal["taken", "refused"]) -> None:
+        self.unanswered = False
+        line = self.line
+        if what == "taken":
+            line.trigger_answer()
+        elif not self.idle:
+            assert line.pending is not None
+            line.pending.ended = True
+
+
 MACHINES: list[type[CameraAndClient]] = [
     CameraAndClientAlone,
     CameraAndClientWithSensor,
+    CameraAndClientWithOperator,
     CameraAndClientWithExtras,
+    CameraAndClientThatShowsLate,
     CameraAndClientThatShowsNothing,
+    CameraAndClientThatKnowsThatNothingShows,
     CameraAndClientByNumber,
     CameraAndClientByNumberAlone,
     CameraAndClientByOnesOwnNumber,
@@ -486,6 +697,7 @@ MACHINES: list[type[CameraAndClient]] = [
     CameraAndClientOfAllKinds,
     CameraAndClientByNumberThatMayBeMissing,
     CameraAndClientByNumberOverUdp,
+    CameraAndClientThatAnswers,
 ]
 for _machine in MACHINES:
     _machine.TestCase.settings = settings(stateful_step_count=100)

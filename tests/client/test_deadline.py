@@ -11,7 +11,7 @@ import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from smartcam._client.deadline import DeadlineTimer
+from smartcam._client._inside import DeadlineTimer
 
 Arguments = TypeVarTuple("Arguments")
 

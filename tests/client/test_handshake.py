@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from smartcam._client import handshake
-from smartcam._client.attempts import Try
-from smartcam._client.handshake import Session, establish
+from smartcam._client._inside import Session, Try
+from smartcam._client.handshake import establish
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -23,10 +23,10 @@ from smartcam.exceptions import (
 )
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
+from smartcam.protocols import BVS, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import load_protocol
-from smartcam.protocols._bvs import BVS, HANDBOOK, THESIS
-from smartcam.protocols._framed.machine import Event, State
+from smartcam.protocols._bvs import THESIS
+from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
 from tests.handmade import (
@@ -467,7 +467,7 @@ async def thesis_camera(peer: Peer, number: int) -> None:
 async def test_establish_thesis_camera_is_found_from_an_unpinned_url(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(handshake, "DETECTION_SHARE", 0.05)
+    monkeypatch.setattr(handshake, "DETECTION_TIMEOUT", 0.05)
     loop = asyncio.get_running_loop()
     start = loop.time()
     async with session_with(thesis_camera, query="") as session:
@@ -487,7 +487,7 @@ async def test_establish_pinned_dialect_tries_no_other() -> None:
 async def test_establish_first_round_is_short_and_later_ones_share_the_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(handshake, "DETECTION_SHARE", 0.02)
+    monkeypatch.setattr(handshake, "DETECTION_TIMEOUT", 0.02)
     error = await failure_with(silent, query="", connect_timeout=0.7, connect_attempts=2)
     waited = [text.rpartition(" for ")[2] for text in error.attempts]
     seconds = [float(text.removesuffix(" s")) for text in waited]
@@ -567,7 +567,7 @@ async def test_establish_udp_refused_port_is_named() -> None:
 async def test_establish_udp_thesis_camera_is_found_with_a_fresh_socket(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(handshake, "DETECTION_SHARE", 0.05)
+    monkeypatch.setattr(handshake, "DETECTION_TIMEOUT", 0.05)
 
     def talk(data: bytes) -> list[bytes]:
         connect = THESIS_OPENING[12:]

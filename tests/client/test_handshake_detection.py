@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from smartcam._client import handshake
-from smartcam._client.handshake import DETECTION_SHARE, Session, establish
+from smartcam._client._inside import Session
+from smartcam._client.handshake import DETECTION_TIMEOUT, establish
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectFailedError, MessageError
 from smartcam.models import Status
@@ -48,7 +49,7 @@ CAMERAS: dict[str, tuple[str, dict[str, Any]]] = {
 @pytest.fixture
 def short_share(monkeypatch: pytest.MonkeyPatch) -> None:
     """A dialect gets little time in the first round."""
-    monkeypatch.setattr(handshake, "DETECTION_SHARE", 0.2)
+    monkeypatch.setattr(handshake, "DETECTION_TIMEOUT", 0.2)
 
 
 def settings(port: int, transport: str = "tcp", query: str = "", **options: Any) -> CameraSettings:
@@ -357,7 +358,7 @@ async def test_datagrams_that_nobody_answers_are_tried_for_the_whole_time(
     dialects = 1 if query else 3
     assert len(tried) == attempts * dialects
     if dialects > 1 and attempts > 1:
-        hurried = (f"silence for {DETECTION_SHARE:.1f} s",) * dialects
+        hurried = (f"silence for {DETECTION_TIMEOUT:.1f} s",) * dialects
         assert tuple(one.rpartition(": ")[2] for one in tried[:dialects]) == hurried
 
 

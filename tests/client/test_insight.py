@@ -31,13 +31,12 @@ from smartcam import (
     TriggerTimeoutError,
     UnsupportedError,
 )
-from smartcam.doctor._probing import trials
-from smartcam.emulator._clock import ManualClock
-from smartcam.emulator._insight.camera import EmulatedInSight
+from smartcam.doctor._inside import trials
+from smartcam.emulator import EmulatedInSight, ManualClock
 from smartcam.observers import Observer
 from smartcam.settings import parse_address
-from tests.client.clientkit import SHORT, balance, cancelled, gone, steps, until
-from tests.handmade import Peer, scripted
+from tests.client.clientkit import SHORT, balance, cancelled, gone, steps
+from tests.handmade import Peer, scripted, until
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Coroutine
@@ -464,7 +463,7 @@ async def test_switch_sees_what_an_operator_did_to_the_mode(online: bool) -> Non
 @pytest.mark.parametrize("name", ["a\r\nSO1", "a\0", "\x1b[m"])
 async def test_switch_to_what_is_no_name_changes_nothing(name: str) -> None:
     async with insight() as (emulator, camera):
-        with pytest.raises(ConfigurationError, match="is no file's name"):
+        with pytest.raises(ConfigurationError, match="expected a file's name"):
             await camera.switch_application(name)
         assert "SO0" not in said(emulator)
         assert (await camera.trigger()).application == 7
@@ -698,7 +697,7 @@ async def test_silent_camera_is_given_up() -> None:
 
 
 async def test_silent_camera_costs_a_request_its_link() -> None:
-    async with insight() as (emulator, camera):
+    async with insight(liveness_timeout=20 * SHORT) as (emulator, camera):
         emulator.silent = True
         with pytest.raises(smartcam.ResponseTimeoutError, match=r"no answer to ReadImage \(RI\) "):
             await camera.read_image(timeout=SHORT)
@@ -777,7 +776,7 @@ async def test_probe_of_a_camera_that_falls_silent_repeats_no_password() -> None
 
 # ---------------------------------------------------------------------- cancellation
 
-MOST_STEPS = 300
+MAX_STEPS = 300
 """Bound of a sweep."""
 
 
@@ -815,7 +814,7 @@ async def test_cancelled_after_any_step_the_camera_goes_on(name: str) -> None:
         EmulatedInSight(jobs, online=True, clock=ManualClock()) as emulator,
         smartcam.connect(emulator.url + "?cells=A1", interpret_as="n: int32") as camera,
     ):
-        for count in range(MOST_STEPS):
+        for count in range(MAX_STEPS):
             task = asyncio.ensure_future(CALLS[name](camera))
             await steps(count)
             over = task.done()
@@ -829,7 +828,7 @@ async def test_cancelled_after_any_step_the_camera_goes_on(name: str) -> None:
             if over:
                 break
         else:
-            pytest.fail(f"{name} did not end in {MOST_STEPS} steps")
+            pytest.fail(f"{name} did not end in {MAX_STEPS} steps")
         assert camera.statistics().reconnects == 0
         balance(camera.statistics())
 

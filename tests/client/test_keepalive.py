@@ -36,11 +36,12 @@ from tests.client.camera_by_hand import (
     TRIGGER,
     HandmadeCamera,
 )
-from tests.client.clientkit import SHORT, by_hand, gone, quiet, steps, until
+from tests.client.clientkit import SHORT, by_hand, gone, quiet, steps
+from tests.handmade import until
 from tests.insides import inside
 
-LIVENESS, HALF = 1000.0, 500.0
-"""Seconds of the time that leaps: a Query after half of it, the end after all of it."""
+LIVENESS, HALF, END = 1000.0, 500.0, 1500.0
+"""Seconds of the time that leaps: a Query after half of it, the end after all of it from then."""
 
 SWITCHING = 3000.0
 """Seconds of the time that leaps: ``switch_timeout``."""
@@ -108,7 +109,7 @@ async def test_silent_camera_is_found_without_any_call(transport: str) -> None:
         assert isinstance(event, Disconnected)
         assert re.fullmatch(r"no sign of life for \d\.\d s", event.reason)
         assert not event.expected
-        assert waited >= 2 * SHORT * 0.9
+        assert waited >= 3 * SHORT * 0.9
         await box.wait_for(DISCONNECT, 2)
         assert box.ids == [DISCONNECT, CONNECT, QUERY, QUERY, DISCONNECT]
 
@@ -144,7 +145,7 @@ async def test_silence_is_the_cause_that_who_waits_is_told(transport: str) -> No
 
 
 @TRANSPORTS
-async def test_query_is_sent_after_half_the_time_and_the_link_ends_after_all_of_it(
+async def test_query_is_sent_after_half_the_time_and_has_all_of_it_for_its_answer(
     transport: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with leaping(monkeypatch, box={"transport": transport}) as (box, camera, time):
@@ -153,9 +154,10 @@ async def test_query_is_sent_after_half_the_time_and_the_link_ends_after_all_of_
         assert queries(box) == 0
         await time.at(HALF)
         await box.wait_for(QUERY, 2)
-        await time.at(LIVENESS - JUST)
-        assert camera.connected
         await time.at(LIVENESS)
+        await time.at(END - JUST)
+        assert camera.connected
+        await time.at(END)
         assert not camera.connected
         assert queries(box) == 1
 
@@ -178,13 +180,35 @@ async def test_answer_in_the_last_moment_keeps_the_link(monkeypatch: pytest.Monk
         query, box.script[QUERY] = box.script[QUERY], quiet
         await time.at(HALF)
         await box.wait_for(QUERY, 2)
-        await time.at(LIVENESS - JUST)
+        await time.at(END - JUST)
         await heard(camera, box, query(b""))
-        await time.at(LIVENESS + HALF - 2 * JUST)
+        await time.at(END + HALF - 2 * JUST)
         assert camera.connected
         assert queries(box) == 1
-        await time.at(LIVENESS + HALF)
+        await time.at(END + HALF)
         await box.wait_for(QUERY, 3)
+
+
+@pytest.mark.parametrize("begin", [0.0, 0.25, 0.45])
+async def test_stall_that_is_shorter_than_the_timeout_ends_no_idle_session(
+    begin: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stall that begins any time between two questions; the camera answers behind it."""
+    async with leaping(monkeypatch) as (box, camera, time):
+        answer, box.script[QUERY] = box.script[QUERY], quiet
+        stall = begin * LIVENESS, begin * LIVENESS + 0.9 * LIVENESS
+        moment = HALF
+        while moment < stall[1]:
+            await time.at(moment)
+            moment += HALF / 2
+        await box.wait_for(QUERY, 2)
+        await time.at(stall[1])
+        assert camera.connected
+        await heard(camera, box, answer(b""))
+        box.script[QUERY] = answer
+        await time.at(stall[1] + HALF + JUST)
+        await box.wait_for(QUERY, 3)
+        assert camera.connected
 
 
 SIGNS_OF_LIFE = {
@@ -227,10 +251,10 @@ async def test_byte_after_the_question_keeps_the_link_and_it_is_not_asked_twice(
         await heard(camera, box, box.status_frame(READY))
         await time.at(LIVENESS)
         await time.at(700.0 + HALF + JUST)
-        await time.at(700.0 + LIVENESS)
+        await time.at(700.0 + END)
         assert camera.connected
         assert queries(box) == 1
-        await time.at(700.0 + LIVENESS + 2 * JUST)
+        await time.at(700.0 + END + 2 * JUST)
         assert not camera.connected
 
 
@@ -275,10 +299,10 @@ async def test_users_open_query_is_question_enough(monkeypatch: pytest.MonkeyPat
         asking = asyncio.create_task(camera.query_application(timeout=LONG))
         await box.wait_for(QUERY, 2)
         await time.at(HALF)
-        await time.at(LIVENESS - JUST)
+        await time.at(END - JUST)
         assert queries(box) == 1
         assert not asking.done()
-        await time.at(LIVENESS)
+        await time.at(END)
         assert isinstance(await gone(asking), ConnectionLostError)
 
 
@@ -346,9 +370,9 @@ async def test_own_switch_is_left_in_peace_until_its_timeout(
         assert camera.connected
         await time.at(SWITCHING)
         await box.wait_for(QUERY, 2)
-        await time.at(SWITCHING + HALF - JUST)
+        await time.at(SWITCHING + LIVENESS - JUST)
         assert camera.connected
-        await time.at(SWITCHING + HALF + JUST)
+        await time.at(SWITCHING + LIVENESS + JUST)
         assert isinstance(await gone(switching), ConnectionLostError)
 
 
@@ -379,7 +403,7 @@ async def test_somebody_elses_switch_is_left_in_peace(
         assert camera.connected
         await time.at(SWITCHING)
         await box.wait_for(QUERY, 2)
-        await time.at(SWITCHING + HALF + JUST)
+        await time.at(SWITCHING + LIVENESS + JUST)
         assert not camera.connected
 
 

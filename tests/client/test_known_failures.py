@@ -20,7 +20,7 @@ from smartcam import Camera, ConnectionLostError, FrameError, ResponseTimeoutErr
 from smartcam._client.link import Link
 from smartcam.protocols._framed import frame_age
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy._rules import Rule, SplitBytes
+from smartcam.testing.proxy import Rule, SplitBytes
 from tests.client.camera_by_hand import (
     HANDBOOK,
     QUERY,
@@ -32,17 +32,8 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
     words,
 )
-from tests.client.clientkit import (
-    FAST,
-    SHORT,
-    SOON,
-    balance,
-    bid_by_hand,
-    by_hand,
-    gone,
-    steps,
-    until,
-)
+from tests.client.clientkit import FAST, SHORT, SOON, balance, bid_by_hand, by_hand, gone, steps
+from tests.handmade import until
 
 HEADER = 12
 """Bytes of a frame's header."""
@@ -205,8 +196,8 @@ async def test_image_sized_answer_pays_no_idle_wait(monkeypatch: pytest.MonkeyPa
         box.script[TRIGGER] = lambda _: sent
         before = sum(work.sizes)
         triggering = asyncio.create_task(camera.trigger(timeout=60))
-        answer = box.said(QUERY, box.active)  # to the question in front of the trigger
-        await until(lambda: sum(work.sizes) == before + len(answer) + len(sent))
+        answer = box.said(QUERY, box.active)  # to the question in front, and to that behind it
+        await until(lambda: sum(work.sizes) == before + 2 * len(answer) + len(sent))
         loop = asyncio.get_running_loop()
         now = loop.time()
         with monkeypatch.context() as standing:

@@ -14,17 +14,9 @@ from smartcam._client.link import Chunk, Link, open_link
 from smartcam.exceptions import ConnectionLostError, FrameError, LocalProtocolError
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
+from smartcam.protocols import BVS, LinkEnded, LinkFailed, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._bvs import BVS, HANDBOOK
-from smartcam.protocols._framed.machine import (
-    Event,
-    LinkEnded,
-    LinkFailed,
-    Machine,
-    ResultBurst,
-    State,
-)
+from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
 from tests.handmade import (
     BUSY,
     CONNECT,
@@ -200,7 +192,7 @@ async def test_delivery_with_many_frames_is_taken_in_several_turns(
     server: Listener, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection, "LARGEST_CHUNK", 64)
-    monkeypatch.setattr(connection, "LEAST_CHUNK", 64)
+    monkeypatch.setattr(connection, "MIN_FRAMES_PER_CHUNK", 64)
     link, peer = await session(server)
     await deliver(link, peer, RESULT * 120 + BUSY * 10)
     assert not link._transport.is_reading()
@@ -217,7 +209,8 @@ def weight(event: Event) -> int:
 
 
 @pytest.mark.parametrize(
-    ("took", "frames"), [(0.0, 86), (connection.TURN, 64), (connection.TURN * 1.5, 42), (60.0, 32)]
+    ("took", "frames"),
+    [(0.0, 86), (connection.TURN_TIME, 64), (connection.TURN_TIME * 1.5, 42), (60.0, 32)],
 )
 async def test_chunk_is_as_large_as_a_turn_takes(
     server: Listener, took: float, frames: int, monkeypatch: pytest.MonkeyPatch

@@ -15,8 +15,8 @@ from smartcam._client.doorbell import Doorbell
 from smartcam._client.link import LARGEST_CHUNK
 from smartcam.observers import Observer, TraceEntry
 from tests.client.camera_by_hand import READY, RUNNING
-from tests.client.clientkit import balance, by_hand, until
-from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted
+from tests.client.clientkit import balance, by_hand
+from tests.handmade import CONNECT_ANSWER, OPENING, QUERY, RESULT, STATUS, Peer, scripted, until
 
 # ---------------------------------------------------------------------- what comes early
 

@@ -21,6 +21,7 @@ from smartcam import (
 from tests.client.camera_by_hand import QUERY, READY, RUNNING, START, STOP, SWITCH, TRIGGER
 from tests.client.clientkit import (
     FAST,
+    FENCED,
     OPENING,
     SHORT,
     SOON,
@@ -29,8 +30,8 @@ from tests.client.clientkit import (
     lose_and_come_back,
     quiet,
     steps,
-    until,
 )
+from tests.handmade import until
 
 # ---------------------------------------------------------------------- application, run state
 
@@ -115,7 +116,7 @@ async def test_restore_with_nothing_wanted_changes_nothing() -> None:
 async def test_restore_has_nothing_to_do_in_the_first_session() -> None:
     async with by_hand(application=7, restore=True, reconnect=FAST) as (box, camera):
         await camera.trigger()
-        assert box.ids == [*OPENING, QUERY, QUERY, TRIGGER]
+        assert box.ids == [*OPENING, QUERY, *FENCED]
 
 
 async def test_wait_connected_waits_for_what_is_restored() -> None:
@@ -210,7 +211,7 @@ async def test_command_waits_for_going_back_in_the_next_session() -> None:
     async with lost_inside(3) as (box, camera):
         await until(lambda: camera.connected)
         assert (await camera.trigger()).application == 7
-        assert box.ids[-1] == TRIGGER
+        assert box.ids[-3:] == FENCED
 
 
 async def test_trigger_in_another_application_that_is_lost_is_gone_back_from() -> None:
@@ -316,7 +317,7 @@ async def test_result_of_the_lost_session_is_late_and_never_the_next_triggers(or
 
 async def test_result_of_the_lost_session_that_never_comes_is_made_impossible() -> None:
     async with by_hand(reconnect=FAST) as (box, camera):
-        trigger, box.script[TRIGGER] = box.script[TRIGGER], quiet
+        trigger, box.script[TRIGGER] = box.script[TRIGGER], box.takes
         triggering = asyncio.create_task(camera.trigger())
         await box.wait_for(TRIGGER)
         box.script[TRIGGER] = trigger
@@ -324,7 +325,7 @@ async def test_result_of_the_lost_session_that_never_comes_is_made_impossible() 
         await gone(triggering)
         mark = len(box.ids)
         assert (await camera.trigger()).raw == b"found"
-        assert box.since(mark) == [STOP, QUERY, START, QUERY, TRIGGER]
+        assert box.since(mark) == [STOP, QUERY, START, *FENCED]
 
 
 async def test_result_of_the_lost_session_is_not_taken_by_next_result() -> None:
@@ -343,7 +344,7 @@ async def test_result_of_the_lost_session_is_not_taken_by_next_result() -> None:
 async def test_fence_that_a_loss_interrupted_leaves_no_stopped_camera() -> None:
     async with by_hand(reconnect=FAST) as (box, camera):
         script = dict(box.script)
-        box.script |= {TRIGGER: quiet, START: quiet}
+        box.script |= {TRIGGER: box.takes, START: quiet}
         await gone(camera.trigger(timeout=SHORT))
         fencing = asyncio.create_task(camera.trigger())
         await box.wait_for(START)

@@ -45,7 +45,8 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
     Peer,
 )
-from tests.client.clientkit import SHORT, by_hand, cancelled, emulated, gone, steps, until
+from tests.client.clientkit import SHORT, by_hand, cancelled, emulated, gone, steps
+from tests.handmade import until
 from tests.insides import inside
 
 TCP_DIALECTS = ["handbook", "thesis"]
@@ -255,7 +256,7 @@ async def test_timeout_that_is_no_number_of_seconds_is_refused(timeout: float) -
             lambda: camera.get_clock(timeout=timeout),
         ]
         for call in calls:
-            with pytest.raises(ConfigurationError, match="is no number of seconds"):
+            with pytest.raises(ConfigurationError, match="timeout: expected seconds"):
                 await call()
         assert box.ids == [DISCONNECT, CONNECT, QUERY]
 
@@ -419,6 +420,20 @@ async def test_lost_link_tells_everybody_who_comes_later() -> None:
                     await wait(camera)
         assert camera.status == Status(READY)
         assert "closed the connection" in str(camera.statistics().last_error)
+
+
+async def test_trouble_is_what_a_call_would_raise() -> None:
+    async with HandmadeCamera() as box:
+        camera = smartcam.connect(box.url, reconnect=None)
+        assert isinstance(camera.trouble, ConnectionClosedError)
+        async with camera:
+            assert camera.trouble is None
+            box.hang_up()
+            await until(lambda: camera.trouble is not None)
+            assert isinstance(camera.trouble, ConnectionLostError)
+            with pytest.raises(ConnectionLostError) as caught:
+                await camera.query_application()
+            assert str(camera.trouble) == str(caught.value)
 
 
 async def test_error_raised_again_and_again_does_not_grow() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import itertools
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from smartcam import (
     TriggerTimeoutError,
 )
 from smartcam.emulator import EmulatedCamera
-from tests.client.camera_by_hand import CONNECT, REBOOT, TRIGGER, HandmadeCamera
+from tests.client.camera_by_hand import CONNECT, QUERY, REBOOT, TRIGGER, HandmadeCamera
 from tests.client.clientkit import (
     FAST,
     SHORT,
@@ -30,8 +31,9 @@ from tests.client.clientkit import (
     lose_and_come_back,
     quiet,
     steps,
-    until,
 )
+from tests.handmade import until
+from tests.insides import inside
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -144,6 +146,53 @@ async def test_session_that_a_broken_frame_ended_was_not_taken() -> None:
     async with by_hand(reconnect=FAST) as (box, camera):
         for sessions in range(2, 5):
             box.send(b"no frame at all")
+            await until(lambda: camera.statistics().sessions == sessions)  # noqa: B023
+            await camera.wait_connected(SOON)
+        assert (await camera.trigger()).raw == b"found"
+
+
+NO_SIGN = TimeoutError("no sign of life for 5.0 s")
+
+
+@pytest.mark.parametrize(
+    ("cause", "tcp", "udp"),
+    [
+        (NO_SIGN, False, True),  # over UDP a client that is served no more hears nothing
+        (OSError(errno.ETIMEDOUT, "the network acknowledges nothing"), False, True),
+        (OSError(errno.EHOSTUNREACH, "no route"), False, False),
+        (OSError(errno.ENETDOWN, "the cable is out"), False, False),
+        (ConnectionRefusedError("nothing listens there"), False, False),
+        (smartcam.ResponseTimeoutError("too late"), False, True),
+        (smartcam.ProtocolError("no frame at all"), False, False),
+        (RuntimeError("a fault of this program"), False, False),
+        (ConnectionResetError("the camera closed the connection"), True, True),
+        (BrokenPipeError("the camera reads no more"), True, True),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("transport", ["tcp", "udp"])
+async def test_only_what_another_client_can_have_caused_is_taken_for_it(
+    transport: str, cause: Exception, tcp: bool, udp: bool
+) -> None:
+    async with by_hand(box={"transport": transport}, reconnect=FAST) as (_, camera):
+        supervisor = inside(camera)._supervisor
+        for sessions in range(2, 4):
+            inside(camera)._connection.require_link().abort(cause)
+            await until(lambda: supervisor.over or camera.statistics().sessions == sessions)  # noqa: B023
+        if tcp if transport == "tcp" else udp:
+            with pytest.raises(ConnectionTakenError):
+                await camera.wait_connected(SOON)
+        else:
+            assert (await camera.trigger()).raw == b"found"
+
+
+async def test_camera_that_hangs_again_and_again_is_not_given_up() -> None:
+    async with by_hand(reconnect=FAST, liveness_timeout=2 * SHORT) as (box, camera):
+        answering = box.script[QUERY]
+        for sessions in range(2, 5):
+            box.script[QUERY] = quiet
+            await until(lambda: not camera.connected)
+            box.script[QUERY] = answering
             await until(lambda: camera.statistics().sessions == sessions)  # noqa: B023
             await camera.wait_connected(SOON)
         assert (await camera.trigger()).raw == b"found"

@@ -17,7 +17,7 @@ from smartcam import (
     Status,
     TriggerTimeoutError,
 )
-from smartcam.emulator import EmulatedCamera
+from smartcam.emulator import EmulatedCamera, faults
 from smartcam.protocols import messages as m
 from tests.client.camera_by_hand import (
     BUSY,
@@ -39,7 +39,8 @@ from tests.client.camera_by_hand import (
     HandmadeCamera,
     words,
 )
-from tests.client.clientkit import SHORT, balance, by_hand, cancelled, emulated, until
+from tests.client.clientkit import SHORT, balance, by_hand, cancelled, emulated
+from tests.handmade import until
 
 DIALECTS = pytest.mark.parametrize("dialect", ["handbook", "thesis"])
 UDP = {"transport": "udp"}
@@ -255,3 +256,20 @@ async def test_stop_whose_status_is_lost_is_noticed_after_a_trigger_without_a_re
             await camera.trigger(timeout=1)
         assert START not in box.ids
         assert box.ids.count(TRIGGER) == 1
+
+
+@pytest.mark.parametrize(
+    "fault", [faults.Drop(on="TriggerAnswer"), faults.Delay(on="TriggerAnswer", seconds=0.2)]
+)
+async def test_result_comes_where_the_answer_to_its_trigger_is_lost_or_late(
+    fault: faults.Drop | faults.Delay,
+) -> None:
+    box = EmulatedCamera(
+        [{"id": 5, "layout": "n: int32", "generator": "sequence", "processing_time": 0.05}],
+        dialect="bid",
+        transport="udp",
+        faults=[fault],
+    )
+    async with box, smartcam.connect(box.url, application=5, interpret_as="n: int32") as camera:
+        assert (await camera.trigger(timeout=1.0)).value.n == 0
+        assert camera.statistics().unclaimed == 0

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
+from smartcam.protocols import LinkEnded
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.machine import LinkEnded
 from tests.machines import EXAMPLES
 from tests.protocols.camera_model import PROGRAMS
 

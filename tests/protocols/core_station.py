@@ -11,9 +11,9 @@ import pytest
 from smartcam.emulator import Application, Device, Quirks
 from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.exceptions import LocalProtocolError, UnsupportedError
+from smartcam.protocols import LinkFailed, Machine, Role, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import POLICIES, Role, Transport
-from smartcam.protocols._framed.machine import Event, LinkFailed, Machine
+from smartcam.protocols._inside import POLICIES, Event
 from tests.machines import BY_LABEL, one_by_one
 from tests.protocols.camera_model import CameraModel, Options
 from tests.protocols.core_model import LIMIT, WIRES, CameraEnd, ClientEnd, framed, meaning, surplus

@@ -5,14 +5,14 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING
 
+from smartcam.protocols import Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._framed.machine import Event, State
+from smartcam.protocols._inside import Event
 from smartcam.protocols._insight.dialect import NATIVE, InSightDialect
 from smartcam.protocols._insight.machine import InSightMachine
 
 if TYPE_CHECKING:
-    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols import Frame
 
 GREETING = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "
 LOGIN = GREETING + b"Password: User Logged In\r\n"

@@ -10,13 +10,12 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, FrameError, MessageError
 from smartcam.models import Capabilities, Status
-from smartcam.protocols import messages as m
-from smartcam.protocols._base import (
-    POLICIES,
-    UNDOCUMENTED,
+from smartcam.protocols import (
+    BVS,
     CodeMeaning,
     Dialect,
-    Policy,
+    Frame,
+    Machine,
     Protocol,
     RawRequest,
     Role,
@@ -24,9 +23,10 @@ from smartcam.protocols._base import (
     Transport,
     Verdict,
 )
-from smartcam.protocols._bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols import messages as m
+from smartcam.protocols._base import UNDOCUMENTED
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy
 from tests.machines import CODE, NO_ID
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT

@@ -6,20 +6,10 @@ from typing import cast
 
 import pytest
 
+from smartcam.protocols import BVS, FramedDialect, HeaderLayout, Protocol, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Protocol, Transport
-from smartcam.protocols._bvs import (
-    B16,
-    BID,
-    BVS,
-    DEFAULT_PORT,
-    HANDBOOK,
-    MESSAGES,
-    THESIS,
-    MessageId,
-)
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import HeaderLayout
+from smartcam.protocols._bvs import B16, BID, MESSAGES, THESIS
+from smartcam.protocols._inside import DEFAULT_PORT, HANDBOOK, MessageId
 from smartcam.registry import PROTOCOLS
 from tests.machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, NO_ID, camera, client, label
 

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import MessageError, ProtocolError
 from smartcam.models import Status
+from smartcam.protocols import FramedDialect
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols._framed.constructs import FieldView, frame_view, view_fields
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Framer
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._framed.constructs import FieldView, frame_view
+from smartcam.protocols._inside import HANDBOOK, Framer, view_fields
 from tests.machines import BIG_ENDIAN_NUMBER, DIALECTS, EVERYTHING, EXAMPLES, label
 from tests.strategies import messages, over, streams
 

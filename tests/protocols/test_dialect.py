@@ -14,11 +14,20 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.models import Status
+from smartcam.protocols import (
+    CodeMeaning,
+    Frame,
+    FramedDialect,
+    RawRequest,
+    Spelled,
+    StatusBits,
+    Verdict,
+)
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import UNDOCUMENTED, CodeMeaning, RawRequest, Spelled, Verdict
-from smartcam.protocols._bvs import B16, BID, CODES, HANDBOOK, MESSAGES, THESIS, ResultCode
-from smartcam.protocols._framed.dialect import MAX_KNOWN, SWITCH_CODES, FramedDialect, StatusBits
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._base import UNDOCUMENTED
+from smartcam.protocols._bvs import B16, BID, CODES, MESSAGES, THESIS
+from smartcam.protocols._framed.dialect import MAX_KNOWN, SWITCH_CODES
+from smartcam.protocols._inside import HANDBOOK, ResultCode
 from tests.machines import BIG_ENDIAN_NUMBER, CODE, DIALECTS, EVERYTHING, EXAMPLES, NO_ID, label
 from tests.strategies import over
 

@@ -6,13 +6,12 @@ import pytest
 
 from smartcam.exceptions import FrameError
 from smartcam.models import Status
+from smartcam.protocols import FramedDialect, LinkFailed, Machine, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
-from smartcam.protocols._bvs import B16, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import MAX_SURPLUS, FramedDialect
+from smartcam.protocols._bvs import B16, THESIS
+from smartcam.protocols._framed.dialect import MAX_SURPLUS
 from smartcam.protocols._framed.frame_age import FRAME_RATE, FRAME_TIME, HINT_TIME, Unfinished
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH
-from smartcam.protocols._framed.machine import Event, LinkFailed, Machine, State
+from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event
 from tests.machines import DIALECTS, camera, client, label
 from tests.strategies import over
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import pytest
 
 from smartcam.exceptions import FrameError
-from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
+from smartcam.protocols import Frame, FramedDialect, HeaderLayout
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Framer
 from tests.machines import DIALECTS
 
 MAGIC = bytes.fromhex("50535642")

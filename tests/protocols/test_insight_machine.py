@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError, LocalProtocolError, UnsupportedError
 from smartcam.models import Status
+from smartcam.protocols import INSIGHT, Frame, LinkEnded, LinkFailed, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import Event, LinkEnded, LinkFailed, State
-from smartcam.protocols._insight.dialect import INSIGHT, NATIVE
+from smartcam.protocols._inside import Event
+from smartcam.protocols._insight.dialect import NATIVE
 from smartcam.protocols._insight.machine import READ_SIZE, Command, InSightMachine, Piece, Reply
 from smartcam.protocols._insight.words import MAX_LINE
 from tests.protocols.insight_lines import (

@@ -17,9 +17,10 @@ from smartcam.emulator._clock import NANOSECONDS
 from smartcam.emulator._insight.commands import InSightCommands
 from smartcam.emulator._insight.device import InSightDevice
 from smartcam.exceptions import LocalProtocolError
+from smartcam.protocols import State
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.machine import Event, State
-from smartcam.protocols._insight.machine import ONLINE, Command, Reply
+from smartcam.protocols._inside import ONLINE, Event
+from smartcam.protocols._insight.machine import Command, Reply
 from smartcam.protocols._insight.words import command_reader
 from tests.protocols.insight_lines import LOGIN, Talk, with_cells
 
@@ -48,7 +49,7 @@ ANSWERS: dict[type[m.Message], type[m.Message]] = {
     Command: Reply,
 }
 
-MOST_ROUNDS = 50
+MAX_ROUNDS = 50
 """Bound of what it takes to answer everything: nine requests of up to four lines."""
 
 
@@ -138,13 +139,13 @@ class Wires(RuleBasedStateMachine):
 
     @rule()
     def carry_all(self) -> None:
-        for _ in range(MOST_ROUNDS):
+        for _ in range(MAX_ROUNDS):
             self.carry_to_camera(1000)
             self.carry_to_client(10_000)
             self.pass_time(0.3)
             if not self.open:
                 return
-        pytest.fail(f"not answered in {MOST_ROUNDS} rounds: {self.open}")
+        pytest.fail(f"not answered in {MAX_ROUNDS} rounds: {self.open}")
 
     # ------------------------------------------------------------------ what must hold
 

@@ -11,9 +11,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, FrameError
-from smartcam.protocols._insight import words
+from smartcam.protocols._inside import StatusCode, words
 from smartcam.protocols._insight.answers import MAX_IMAGE, AnswerReader, CommandAnswer
-from smartcam.protocols._insight.words import AnswerForm, Cell, StatusCode, hex_lines
+from smartcam.protocols._insight.words import AnswerForm, Cell, hex_lines
 from smartcam.protocols._line_reader import LineReader
 from tests.protocols.insight_lines import BITMAP, DIGITS, IMAGE_LINES, crc
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import struct
+from typing import Any
 
 import pytest
 
@@ -16,22 +17,21 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.models import Status
-from smartcam.protocols import messages as m
-from smartcam.protocols._base import Policy, Role, Transport
-from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame
-from smartcam.protocols._framed.machine import (
-    MAX_FAMILIAR,
-    TRANSITIONS,
+from smartcam.protocols import (
     Counters,
-    Event,
+    Frame,
+    FramedDialect,
     LinkEnded,
     LinkFailed,
     Machine,
-    ResultBurst,
+    Role,
     State,
+    Transport,
 )
+from smartcam.protocols import messages as m
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._framed.machine import MAX_FAMILIAR, TRANSITIONS
+from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event, Policy, ResultBurst
 from tests.machines import (
     BIG_ENDIAN_NUMBER,
     CODE,
@@ -462,6 +462,33 @@ def test_client_one_open_request_per_id(request_: m.Request, answer: m.Message) 
     assert (made.data_to_send(), made.counters) == ([HANDBOOK.encode(request_)], sent)
     assert feed(made, STATUS, HANDBOOK.encode(answer)) == [STATUS_MESSAGE, answer]
     made.send(request_)
+
+
+@pytest.mark.parametrize("trace", [None, lambda *_: None], ids=["plain", "traced"])
+@pytest.mark.parametrize("together", [True, False])
+def test_client_query_that_is_sent_again_is_answered_twice(*, together: bool, trace: Any) -> None:
+    """One stands in front of a trigger and one behind it; a third one is refused."""
+    made = client(trace=trace)
+    for turn in range(1, 4):  # what came before is known by its bytes
+        made.send(m.Query(), again=True)
+        made.send(m.Trigger(), again=True)
+        made.send(m.Query(), again=True)
+        with pytest.raises(LocalProtocolError, match="0x30 is still owed"):
+            made.send(m.Query(), again=True)
+        pieces = [QUERY_ANSWER * 3] if together else [QUERY_ANSWER] * 3
+        assert feed(made, *pieces) == [m.QueryAnswer(application=21)] * 2
+        assert made.counters.unexpected_messages == turn
+
+
+def test_client_second_query_is_refused_while_one_of_two_is_open() -> None:
+    made = client()
+    made.send(m.Query(), again=True)
+    made.send(m.Query(), again=True)
+    assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+    with pytest.raises(LocalProtocolError, match="0x30 is still owed"):
+        made.send(m.Query())
+    assert feed(made, QUERY_ANSWER) == [m.QueryAnswer(application=21)]
+    made.send(m.Query())
 
 
 def test_client_requests_of_different_ids_are_open_together() -> None:

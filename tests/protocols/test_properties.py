@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
+from smartcam.protocols import (
+    Frame,
+    FramedDialect,
+    LinkEnded,
+    LinkFailed,
+    Machine,
+    Role,
+    State,
+    Transport,
+)
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Policy, Role, Transport
-from smartcam.protocols._bvs import HANDBOOK
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Frame, Framer
-from smartcam.protocols._framed.machine import Event, LinkEnded, LinkFailed, Machine, State
+from smartcam.protocols._inside import HANDBOOK, Event, Framer, Policy
 from tests.machines import DIALECTS, camera, client, feed, label, machine, one_by_one
 from tests.strategies import bodies, chunkings, garbage, messages, split, streams
 

@@ -20,22 +20,20 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameError, LocalProtocolError, MessageError
 from smartcam.models import Status
+from smartcam.protocols import Frame, FramedDialect, HeaderLayout, LinkFailed, Machine, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Policy
-from smartcam.protocols._bvs import HANDBOOK, THESIS
+from smartcam.protocols._bvs import THESIS
 from smartcam.protocols._framed import framing, machine
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer, HeaderLayout
-from smartcam.protocols._framed.machine import LinkFailed, Machine, ResultBurst, State
+from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Framer, Policy, ResultBurst
 from tests.machines import DIALECTS, client, label, one_by_one
 
-LARGE, FIRST_READ, MOST_READ, ALIKE = 32, 32, 128, 3
+LARGE, FIRST_READ, MAX_READ, ALIKE = 32, 32, 128, 3
 SIZES = st.one_of(
     st.integers(0, 40),
     st.integers(0, 300),
-    *(st.integers(size - 16, size + 2) for size in (LARGE, 2 * FIRST_READ, MOST_READ)),
+    *(st.integers(size - 16, size + 2) for size in (LARGE, 2 * FIRST_READ, MAX_READ)),
 )
-LIMITS = st.sampled_from([0, 24, LARGE, 100, MOST_READ, 300])
+LIMITS = st.sampled_from([0, 24, LARGE, 100, MAX_READ, 300])
 CLEAR = 0
 """Drop everything kept, instead of a read of no bytes."""
 READS = st.lists(
@@ -52,7 +50,7 @@ each_header = pytest.mark.parametrize(
 @contextlib.contextmanager
 def small_buffers() -> Iterator[None]:
     with mock.patch.multiple(
-        framing, LARGE=LARGE, FIRST_READ=FIRST_READ, MOST_READ=MOST_READ, ALIKE=ALIKE
+        framing, LARGE=LARGE, FIRST_READ=FIRST_READ, MAX_READ_BYTES=MAX_READ, ALIKE=ALIKE
     ):
         yield
 
@@ -116,7 +114,7 @@ def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
     header = dialect.header
     stream = data.draw(streams(header, limit))
     turns = cycle(data.draw(st.permutations([*reads, *data.draw(st.sampled_from([[], [CLEAR]]))])))
-    most_kept = max(MOST_READ, header.size + limit)
+    most_kept = max(MAX_READ, header.size + limit)
     with small_buffers():
         written, fed = Framer(header, limit), Framer(header, limit)
         all_written: list[Any] = []
@@ -146,7 +144,7 @@ def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
 def test_written_frames_around_every_limit_come_out_whole(
     dialect: FramedDialect, most: int
 ) -> None:
-    limits = (framing.LARGE, framing.MOST_READ, DEFAULT_MAX_LENGTH - 1)
+    limits = (framing.LARGE, framing.MAX_READ_BYTES, DEFAULT_MAX_LENGTH - 1)
     sizes = [size + more for size in limits for more in (-13, -12, -1, 0, 1)]
     sizes += [8] * 2000
     frames = [Frame(0x20, payload(size)) for size in sizes]
@@ -180,23 +178,23 @@ def test_written_reads_grow_while_they_are_filled_and_stop() -> None:
         rooms.append(len(framer.room()))
         stream = stream[read_into(framer, stream, 1 << 30) :]
         assert taken(framer)
-    doublings = (framing.MOST_READ // framing.FIRST_READ).bit_length()
+    doublings = (framing.MAX_READ_BYTES // framing.FIRST_READ).bit_length()
     growing = [framing.FIRST_READ << turn for turn in range(doublings)]
     assert rooms[:doublings] == growing
-    assert {*rooms[doublings:]} == {framing.MOST_READ}
+    assert {*rooms[doublings:]} == {framing.MAX_READ_BYTES}
     read_into(framer, b"P", 1)
-    assert len(framer.room()) == framing.MOST_READ
+    assert len(framer.room()) == framing.MAX_READ_BYTES
 
 
 def test_written_reads_never_keep_more_than_the_longest() -> None:
-    limit = framing.MOST_READ - 1000  # a frame leaves that much room, which a read may fill
+    limit = framing.MAX_READ_BYTES - 1000  # a frame leaves that much room, which a read may fill
     framer = Framer(HANDBOOK.header, limit)
     stream = HANDBOOK.encode_frame(Frame(0x20, payload(limit)))
     stream += HANDBOOK.encode(m.Connect()) * limit
     while stream:
         stream = stream[read_into(framer, stream, 1 << 30) :]
         taken(framer)
-        assert len(framer.room()) <= len(framer._store) <= framing.MOST_READ
+        assert len(framer.room()) <= len(framer._store) <= framing.MAX_READ_BYTES
 
 
 @pytest.mark.parametrize("write", [True, False], ids=["written", "fed"])
@@ -341,7 +339,7 @@ def test_reads_shrink_until_they_have_no_more_frames_than_one_turn_takes(
         stream = stream[read_into(made, stream, 1 << 30) :]
         counts.append(made.counters.frames_received - before)
         made.events()
-    grown = framing.MOST_READ.bit_length()
+    grown = framing.MAX_READ_BYTES.bit_length()
     assert max(counts[:grown]) > most
     assert most // 4 < max(counts[grown:]) <= most
-    assert len(made.room()) < framing.MOST_READ
+    assert len(made.room()) < framing.MAX_READ_BYTES

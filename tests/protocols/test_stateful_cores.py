@@ -27,8 +27,8 @@ from hypothesis.stateful import (
 
 from smartcam.emulator._bvs.device import OPERATOR_CONDITIONS
 from smartcam.models import Status
+from smartcam.protocols import Role, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
 from tests.machines import EXAMPLES
 from tests.protocols.camera_model import PROGRAMS, Options
 from tests.protocols.core_model import (

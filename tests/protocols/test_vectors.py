@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import pytest
 
 from smartcam.models import Status
+from smartcam.protocols import Frame, FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._bvs import B16, BID, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Frame, Framer
-from smartcam.protocols._framed.machine import TRANSITIONS, Machine, State
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._framed.machine import TRANSITIONS
+from smartcam.protocols._inside import HANDBOOK, Framer
 from tests import ROOT
 from tests.machines import (
     BIG_ENDIAN_NUMBER,

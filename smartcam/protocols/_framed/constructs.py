@@ -28,9 +28,9 @@ class FieldView(NamedTuple):
     """One field of a frame.
 
     Attributes:
-        name: as in the message, or ``magic``, ``length``, ``message_id``.
-        offset: of its first byte in the frame.
-        raw: its bytes.
+        name: name of the field in the message, or ``magic``, ``length``, ``message_id``.
+        offset: offset of the field's first byte in the frame.
+        raw: bytes of the field.
         value: an integer, or the bytes.
     """
 

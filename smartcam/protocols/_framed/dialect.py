@@ -10,9 +10,9 @@ import dataclasses
 import struct
 import sys
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from smartcam._forks import cached_property
 from smartcam.exceptions import (
     ConfigurationError,
     LocalProtocolError,
@@ -31,7 +31,8 @@ from smartcam.protocols._base import (
     Spelled,
     Verdict,
 )
-from smartcam.protocols._framed.framing import Buffer, Frame, Framer, HeaderLayout
+from smartcam.protocols._framed.framing import Buffer, Framer, HeaderLayout
+from smartcam.protocols._machine import Frame
 from smartcam.protocols.messages import (
     Acknowledgement,
     ConnectAnswer,
@@ -80,7 +81,7 @@ NO_STATUS = Status(0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatusBits:
-    """What the bits of a dialect's status word are; without any, they are those of Status.
+    """The meaning of the bits in a dialect's status word; by default, those of Status.
 
     Attributes:
         named: bit on the wire to the status bit that means the same.
@@ -133,11 +134,11 @@ class Codec:
     """One message of one dialect, compiled.
 
     Attributes:
-        type: the message.
-        message_id: its id.
-        size: of the fields that have one, bytes.
-        has_data: whether every byte behind them is a field.
-        names: of all its fields.
+        type: class of the message.
+        message_id: id of the message on the wire.
+        size: bytes of the fields of fixed size together.
+        has_data: True if the bytes behind these fields are a field, too.
+        names: names of all fields.
     """
 
     __slots__ = (
@@ -178,7 +179,7 @@ class Codec:
 
     @property
     def may_be_a_code(self) -> bool:
-        """Whether a result code that refuses may come alone."""
+        """True if a result code that refuses may come alone."""
         return self._code is not None and self._code.size < self.size
 
     @property
@@ -188,11 +189,11 @@ class Codec:
         return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS + 1)
 
     def fits(self, size: int) -> bool:
-        """Return whether a body has the documented length."""
+        """Return True if a body has the documented length."""
         return size >= self.size if self.has_data else size == self.size
 
     def _refuses(self, payload: bytes) -> bool:
-        """Return whether a body that is too short is a result code that is not good."""
+        """Return True if a body that is too short is a result code of a refusal."""
         code = self._code
         if code is None or len(payload) != code.size:
             return False
@@ -238,7 +239,7 @@ class Codec:
         return message
 
     def like(self, message: Message) -> Callable[[bytes], Message]:
-        """Return what makes messages that differ from one in nothing but their data."""
+        """Return a function that makes copies of a message with other data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
         names = [one.name for one in dataclasses.fields(kind) if one.name != data_name]
         others = [(_filler(kind, name), getattr(message, name)) for name in names]
@@ -263,7 +264,7 @@ class Codec:
 
 
 def _filler(message_type: type[Message], name: str) -> Callable[[Message, Any], None]:
-    """Return what fills a slot; those of a base class stand there."""
+    """Return the setter of a field's slot, from the class that declares the slot."""
     owner = next(one for one in message_type.__mro__ if name in vars(one))
     fill: Callable[[Message, Any], None] = vars(owner)[name].__set__
     return fill
@@ -285,6 +286,9 @@ class WireQuirk(NamedTuple):
     codes: Mapping[int, CodeMeaning] | None = None
 
 
+SHOWS_TRIGGERS = "shows_triggers"
+"""Parameter of a URL: ``no`` for a camera whose status does not tell of each trigger it takes."""
+
 _ABILITIES: Mapping[str, type[Message]] = {
     "switch": m.SwitchApplication,
     "load_file": m.LoadFile,
@@ -304,7 +308,7 @@ SWITCH_CODES: Mapping[int, CodeMeaning] = {
     0: CodeMeaning("done", Verdict.DONE),
     1: CodeMeaning("id invalid", Verdict.REFUSED),
 }
-"""What the answer to a switch says where no other has a code (SC manual p. 34, published)."""
+"""Meanings of the answer to a switch where no other has a code (SC manual p. 34, published)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -312,13 +316,14 @@ class FramedDialect(Dialect):
     """A dialect of binary frames, as data.
 
     Args:
-        name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
-        header: what a frame's header looks like.
+        name, about, source, quirks, shows_triggers: as those of
+            :class:`~smartcam.protocols.Dialect`.
+        header: layout of a frame's header.
         word: ``struct`` code of the bodies' ordinary integers: ``I`` or ``H``.
-        table: its messages.
-        status_bits: what the bits of its status word are.
-        codes: what the codes of its answers mean.
-        status_by_itself: the status comes with the session and at every change.
+        table: rows of the dialect's messages.
+        status_bits: meaning of the bits of the status word.
+        codes: meaning of the codes in answers.
+        status_by_itself: True if the camera sends its status with the session and at every change.
         wire_quirks: deviations by their names.
     """
 
@@ -395,14 +400,31 @@ class FramedDialect(Dialect):
             vars(variant)["_variants"] = self._variants  # one for all of them
         return variant
 
+    def with_parameters(self, parameters: Mapping[str, str]) -> FramedDialect:
+        """Return the dialect with what a URL says of ``shows_triggers``, always the same one.
+
+        Raises:
+            ConfigurationError: it is neither ``yes`` nor ``no``.
+        """
+        said = parameters.get(SHOWS_TRIGGERS, "yes")
+        if said not in {"yes", "no"}:
+            raise ConfigurationError(f"{SHOWS_TRIGGERS}: yes or no, not {said!r}")
+        if said == "yes" or not self.shows_triggers:
+            return self
+        key = (*self.quirks, f"?{SHOWS_TRIGGERS}=no")
+        variant = self._variants.get(key)
+        if variant is None:
+            variant = self._variants[key] = dataclasses.replace(self, shows_triggers=False)
+        return variant
+
     @property
     def coded(self) -> bool:
-        """Whether each answer begins with a result code."""
+        """True if each answer begins with a result code."""
         return any(row.type is ConnectAnswer and "code" not in row.omits for row in self.table)
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a camera can do in it."""
+        """Abilities of a camera in this dialect."""
         return Capabilities(
             dialect=self.name,
             status_by_itself=self.status_by_itself,
@@ -421,7 +443,7 @@ class FramedDialect(Dialect):
         return self.codes.get(code, UNDOCUMENTED)
 
     def has(self, message_type: type[Message]) -> bool:
-        """Return whether there is such a message."""
+        """Return True if the dialect has a message of this type."""
         return message_type in self._encoders
 
     def fields(self, message_type: type[Message]) -> tuple[str, ...]:
@@ -513,7 +535,7 @@ class FramedDialect(Dialect):
         return {number: codec.lengths for number, codec in self.decoders(sender).items()}
 
     def knows(self, sender: Sender, message_id: int) -> bool:
-        """Return whether there is a message with this id from this sender."""
+        """Return True if this sender has a message with this id."""
         return message_id in self.decoders(sender)
 
     def answer_id(self, request_id: int) -> int | None:
@@ -524,7 +546,7 @@ class FramedDialect(Dialect):
         return self._answers.get(request_id, request_id)
 
     def framer(self, max_length: int) -> Framer:
-        """Return what cuts frames of this dialect; a longer payload breaks the protocol."""
+        """Return a new framer of this dialect; a longer payload breaks the protocol."""
         return Framer(self.header, max_length)
 
     def encode_frame(self, frame: Frame) -> bytes:

@@ -1,4 +1,4 @@
-"""How long a frame that is not whole yet may take.
+"""Bound the time that a frame may take to become whole.
 
 A length that is wrong makes a frame of what comes behind it, and nothing else is heard meanwhile.
 A peer that breaks off sends nothing more, which liveness finds. So it is enough to look whenever

@@ -14,9 +14,10 @@ from __future__ import annotations
 import functools
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from smartcam.exceptions import FrameError, hex_excerpt
+from smartcam.protocols._machine import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -38,25 +39,18 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 FIRST_READ = 1 << 12
 """Bytes that one read takes at most, at first. It doubles each time that a read took so many."""
 
-MOST_READ = 1 << 15
+MAX_READ_BYTES = 1 << 15
 """Bytes that one read takes at most in the end; right after a large frame as many as that had. So
 many bytes of results fit into a subscriber's queue where each has 16 bytes or more: then one that
 keeps up loses nothing."""
 
 
-LEAST_READ = 1 << 10
+MIN_READ_BYTES = 1 << 10
 """Bytes that one read takes at most where the frames are many and small."""
 
 
 ALIKE = 16
 """Frames that are cut at once where they begin with the same bytes, the length among them."""
-
-
-class Frame(NamedTuple):
-    """One frame: message id and the bytes behind the header."""
-
-    message_id: int
-    payload: bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +60,7 @@ class HeaderLayout:
     Args:
         magic: the magic number's bytes on the wire, empty for a dialect without one.
         code: ``struct`` code of length and message id: ``I`` or ``H``.
-        order: which of the two comes first.
+        order: order of length and message id on the wire.
         length_includes: bytes that the length field counts beside the payload (4 where it counts
             the message id).
     """
@@ -136,7 +130,7 @@ class Framer:
         self._filled = 0
         self._store = memoryview(b"")  # where a transport writes; large frames stay there
         self._window = self._store  # what of it the next read may take
-        self._most = MOST_READ  # what it may be in the end
+        self._most = MAX_READ_BYTES  # what it may be in the end
 
     def expect(self, lengths: Mapping[int, range]) -> None:
         """Refuse a payload that is longer than its message may have, even if it is not too long.
@@ -196,9 +190,9 @@ class Framer:
             return self._large is None
         data = self._window[:count]
         if count < len(self._window):
-            self._most = MOST_READ
+            self._most = MAX_READ_BYTES
         elif count < self._most:
-            self._window = self._store = memoryview(bytearray(min(2 * count, MOST_READ)))
+            self._window = self._store = memoryview(bytearray(min(2 * count, MAX_READ_BYTES)))
         if self.start < len(self.buffer):
             self.feed(data)
         elif count >= LARGE and self._header_at(data, 0)[1] >= LARGE:
@@ -206,8 +200,8 @@ class Framer:
             self._window = self._store
         else:
             self.buffer, self.start = bytes(data), 0
-            if len(self._window) > MOST_READ:
-                self._window = self._store[:MOST_READ]
+            if len(self._window) > MAX_READ_BYTES:
+                self._window = self._store[:MAX_READ_BYTES]
         return True
 
     def read_less(self) -> None:
@@ -215,7 +209,7 @@ class Framer:
 
         As long as reads are filled; who has little to say is not held back.
         """
-        self._most = max(LEAST_READ, min(len(self._window), MOST_READ) // 2)
+        self._most = max(MIN_READ_BYTES, min(len(self._window), MAX_READ_BYTES) // 2)
         self._window = self._store[: self._most]
 
     def cut(self) -> tuple[int, int, int] | None:
@@ -345,6 +339,7 @@ class Framer:
         magic = self._header.magic
         if self._large is not None:
             self.buffer, self.start, self._large = self.pending, 0, None
+        self._keep(self.start)  # of a view there would be a copy for each place
         begin = self.start
         found = bytes(self.buffer).find(magic, begin + 1) if magic else -1
         if found < 0:
@@ -437,5 +432,5 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[
 
 @functools.lru_cache(maxsize=64)
 def _cutter(count: int, head: int, rest: int) -> Read:
-    """Return what cuts ``count`` frames into heads and the bytes behind them, by turns."""
+    """Return a function that unpacks ``count`` frames into their headers and bodies, by turns."""
     return struct.Struct(f"{head}s{rest}s" * count).unpack_from

@@ -8,9 +8,7 @@ dropped and counted.
 
 from __future__ import annotations
 
-import enum
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from smartcam.exceptions import (
     FrameError,
@@ -22,10 +20,19 @@ from smartcam.exceptions import (
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import POLICIES, Policy, Role, Transport
 from smartcam.protocols._framed import frame_age
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Frame, Framer
+from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Framer
+from smartcam.protocols._machine import (
+    Counters,
+    Event,
+    Frame,
+    LinkEnded,
+    LinkFailed,
+    ResultBurst,
+    State,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.protocols._base import Dialect
     from smartcam.protocols._framed.dialect import Codec, FramedDialect
@@ -43,23 +50,6 @@ the receive task takes in a turn, so that reading would have to pause after each
 MAX_FAMILIAR = 64
 """Messages of a kind that are known by their frames: of statuses and answers a camera has a handful
 each, and a peer could send any."""
-
-
-class State(enum.Enum):
-    """Where a link is."""
-
-    IDLE = "idle"
-    """Open, without a session."""
-    CONNECTING = "connecting"
-    """Connect was sent, its answer has not come."""
-    CONNECTED = "connected"
-    """In a session."""
-    DISCONNECTED = "disconnected"
-    """Disconnect was sent; what the camera had under way may still come."""
-    CLOSED = "closed"
-    """The peer closed the link."""
-    FAILED = "failed"
-    """The peer broke the protocol; nothing is read any more."""
 
 
 _SESSION_REQUESTS = (
@@ -138,140 +128,7 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
     for state in State
     for sender in m.Sender
 }
-"""The same by state and sender, for the way of every message."""
-
-
-@dataclass(slots=True, kw_only=True)
-class ResultBurst:
-    """Result containers of one application, one right after the other; two or more as they come.
-
-    The client's machine gives it for containers that came in one delivery, so that a camera that
-    runs free costs no object for each. Iterating gives them one by one.
-
-    Attributes:
-        application: whose they are.
-        data: what each has behind the id.
-        size: bytes of all data.
-    """
-
-    application: int
-    data: list[bytes]
-    size: int
-
-    def __iter__(self) -> Iterator[m.ResultContainer]:
-        return (m.ResultContainer(application=self.application, data=one) for one in self.data)
-
-    def cut(self, count: int) -> tuple[ResultBurst, ResultBurst]:
-        """Return the first ``count`` containers and the others."""
-        data, rest = self.data[:count], self.data[count:]
-        size = sum(map(len, data))
-        return (
-            ResultBurst(application=self.application, data=data, size=size),
-            ResultBurst(application=self.application, data=rest, size=self.size - size),
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkFailed:
-    """The peer broke the protocol: close the link. Always the last event."""
-
-    error: RemoteProtocolError
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkEnded:
-    """The peer closed the link; ``pending`` bytes of an unfinished frame were left."""
-
-    pending: int
-
-
-Event = m.Message | ResultBurst | LinkFailed | LinkEnded
-
-
-class LinkMachine(Protocol):
-    """What a link needs of the machine that speaks over it, in the client's role.
-
-    :class:`Machine` speaks in frames; a protocol of another kind brings its own. What comes goes in
-    by :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram), and out by
-    :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever the wire looks like.
-    """
-
-    transport: Transport
-    """What carries it."""
-    replies: bool
-    """Whether what comes may make it say something by itself."""
-    counters: Counters
-    """What went through."""
-
-    @property
-    def dialect(self) -> Dialect:
-        """What is spoken."""
-        ...
-
-    @property
-    def kin(self) -> Sequence[Dialect]:
-        """What it may be: more than one until :meth:`adopt` says which."""
-        ...
-
-    @property
-    def state(self) -> State:
-        """Where the link is."""
-        ...
-
-    @property
-    def pending(self) -> bytes:
-        """What came and still waits for its rest."""
-        ...
-
-    def adopt(self, dialect: Dialect) -> None:
-        """Speak this one of :attr:`kin` from now on."""
-
-    def room(self) -> memoryview:
-        """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
-        ...
-
-    def filled(self, count: int, now: float) -> bool:
-        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet.
-
-        ``now`` is for who bounds the time that a frame may take: seconds since any beginning.
-        """
-        ...
-
-    def receive_data(self, data: bytes) -> None:
-        """Take bytes of a stream, or one whole datagram; never raises for what is in them."""
-
-    def receive_eof(self) -> None:
-        """Take note that the peer will send no more."""
-
-    def events(self) -> list[Event]:
-        """Return the events since the last call, in order; the caller owns the list."""
-        ...
-
-    def send(self, message: Message, *, answered: bool | None = None) -> None:
-        """Say something; write :meth:`data_to_send` next.
-
-        Raises:
-            LocalProtocolError: not now. Nothing has changed.
-            UnsupportedError: the dialect has no such message.
-        """
-
-    def data_to_send(self) -> list[bytes]:
-        """Return the bytes to write, in order."""
-        ...
-
-
-@dataclass(slots=True)
-class Counters:
-    """What went through a machine."""
-
-    frames_received: int = 0
-    frames_sent: int = 0
-    bytes_received: int = 0
-    bytes_sent: int = 0
-    ignored_frames: int = 0
-    unknown_ids: int = 0
-    unexpected_messages: int = 0
-    long_bodies: int = 0
+""":data:`TRANSITIONS` by state and sender, which is faster to look up for each message."""
 
 
 class Machine:
@@ -282,10 +139,10 @@ class Machine:
 
     Args:
         dialect: the wire variant.
-        role: which side this is.
+        role: side of the link that this machine speaks for.
         transport: stream or datagrams.
-        max_length: largest payload accepted, bytes.
-        policy: other than the role's own; the emulator's quirks use it.
+        max_length: bytes of the largest payload that is accepted.
+        policy: policy in place of the role's own; the emulator's quirks use it.
         trace: called with the sender and each whole frame, in both directions, and with the error
             for bytes that make none.
         kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
@@ -321,6 +178,8 @@ class Machine:
         self._events: list[Event] = []
         self._outbox: list[bytes] = []
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
+        # ids of which it owes two: of what was sent ``again``
+        self._open_twice: set[int] = set()
         self._sender = role.receives
         self._asks = role is Role.CLIENT
         self._plain = self._asks and trace is None
@@ -363,7 +222,7 @@ class Machine:
 
     @property
     def state(self) -> State:
-        """Where the link is."""
+        """State of the link."""
         return self._state
 
     @state.setter
@@ -450,13 +309,15 @@ class Machine:
 
     # ------------------------------------------------------------------ messages out
 
-    def send(self, message: Message, *, answered: bool | None = None) -> None:
+    def send(self, message: Message, *, answered: bool | None = None, again: bool = False) -> None:
         """Say something; write :meth:`data_to_send` next.
 
         Args:
             message: what to say.
             answered: for an :class:`~smartcam.protocols.messages.UnknownMessage`, whether an
                 answer is expected; by default what the table says, True for an unknown id.
+            again: True if another request of the same kind may still wait for its answer: the
+                answers come in the order of the requests.
 
         Raises:
             LocalProtocolError: this state forbids it, it does not fit its fields, or an answer of
@@ -474,12 +335,12 @@ class Machine:
         if answered is not None:
             owed = message_id if answered else None
         if owed is not None and self._asks:
-            if owed in self._open:
+            if owed in (self._open_twice if again else self._open):
                 raise LocalProtocolError(
                     f"an answer to message {message_id:#04x} is still owed; one request of an id "
                     "can be open"
                 )
-            self._open.add(owed)
+            (self._open_twice if owed in self._open else self._open).add(owed)
         if following is not self._state:
             self.state = following
         self._outbox.append(data)
@@ -578,12 +439,12 @@ class Machine:
                 end = start + self._header_size + self._decoders[message_id].size
                 message = frames.get(buffer[start:end])
                 if message is not None:
-                    self._open.remove(message_id)
+                    self._close(message_id)
                     return message, end
         return None
 
     def _is_overdue(self, now: float) -> bool:
-        """Return whether the frame that is begun will not become whole; then it is rejected."""
+        """Return True if the unfinished frame will not become whole; reject that frame."""
         framer, begun = self._framer, self._unfinished
         age = begun.age(self._begun, self._begun_at, now)
         if age < frame_age.HINT_TIME:
@@ -726,13 +587,17 @@ class Machine:
         self._events[-1] = ResultBurst(application=first.application, data=more, size=size)
 
     def _wanted(self, message_id: int, *, known: bool) -> bool:
-        """Return whether the client sees it: an answer that nothing asked for is counted only."""
+        """Return True if the client sees a message; an answer to no request is counted only."""
         self.counters.unknown_ids += not known
         if message_id in self._open:
-            self._open.remove(message_id)
+            self._close(message_id)
             return True
         self.counters.unexpected_messages += known
         return not known
+
+    def _close(self, message_id: int) -> None:
+        """Note that one answer which is owed has come."""
+        (self._open_twice if message_id in self._open_twice else self._open).remove(message_id)
 
     def _reject(self, error: RemoteProtocolError) -> bool:
         """Fail the link (True) or drop and count, as the policy says."""

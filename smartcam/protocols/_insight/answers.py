@@ -184,7 +184,7 @@ class AnswerReader(LineReader):
 
 
 def _from_hex(digits: bytes) -> bytes | None:
-    """Return what hexadecimal digits say; None: they are none."""
+    """Return the bytes that hexadecimal digits stand for; None for any other text."""
     try:
         return binascii.unhexlify(digits)
     except ValueError:

@@ -46,7 +46,7 @@ from smartcam.protocols._insight.words import (
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols._machine import Frame
 
 MAX_LOGIN = 255
 """Characters of a user's name or password; the camera's own bound is not published."""
@@ -55,7 +55,7 @@ _VERDICTS: Mapping[int, Verdict] = {
     StatusCode.DONE: Verdict.DONE,
     StatusCode.UNRECOGNIZED: Verdict.UNKNOWN,
 }
-"""What codes say; the others refuse."""
+"""Verdicts by status code; all other codes refuse."""
 
 _LOGIN = CodeMeaning("the user or the password is wrong", Verdict.REFUSED)
 
@@ -83,8 +83,8 @@ class InSightDialect(Dialect):
 
     Args:
         name, about, source, quirks: as those of :class:`~smartcam.protocols.Dialect`.
-        user: who logs in.
-        password: the user's.
+        user: name of the user who logs in.
+        password: password of that user.
         cells: cells that are read after each trigger, in order, as commands name them.
         counter: a cell that counts runs, read before and after them; "" for none.
     """
@@ -120,14 +120,14 @@ class InSightDialect(Dialect):
 
     @property
     def remark(self) -> str:
-        """That a result is empty where no cells are asked for."""
+        """Text which says that a result is empty where no cells are asked for."""
         if self.cells:
             return ""
         return "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a camera can do in it."""
+        """Abilities of a camera in this dialect."""
         return Capabilities(
             dialect=self.name,
             switch=True,
@@ -151,7 +151,7 @@ class InSightDialect(Dialect):
         return CodeMeaning(code_text(mnemonic, code), _VERDICTS.get(code, Verdict.REFUSED))
 
     def has(self, message_type: type[m.Message]) -> bool:
-        """Return whether there is such a message."""
+        """Return True if the dialect has a message of this type."""
         return message_type in _REQUESTS or message_type in _REPORTS
 
     def message_id(self, message: m.Message | type[m.Message]) -> int:
@@ -249,4 +249,4 @@ INSIGHT = Protocol(
     emulator="smartcam.emulator._insight.camera:EmulatedInSight",
     greeting=WELCOME.encode(ENCODING),
 )
-"""What the entry point ``insight`` gives."""
+"""The protocol that the entry point ``insight`` gives."""

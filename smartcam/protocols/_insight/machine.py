@@ -22,8 +22,6 @@ from smartcam.exceptions import (
 from smartcam.models import Status
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import Dialect, Role, Transport
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import Counters, Event, LinkEnded, LinkFailed, State
 from smartcam.protocols._insight.answers import AnswerReader, CommandAnswer, unexpected
 from smartcam.protocols._insight.words import (
     COMMANDS,
@@ -40,6 +38,7 @@ from smartcam.protocols._insight.words import (
     WELCOME,
     StatusCode,
 )
+from smartcam.protocols._machine import Counters, Event, Frame, LinkEnded, LinkFailed, State
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterator, Sequence
@@ -57,7 +56,7 @@ READ_SIZE = 1 << 15
 
 
 class Piece(enum.IntEnum):
-    """What a frame of a trace is; it stands where other protocols have the message id."""
+    """The kind of a frame in a trace; it stands where other protocols have the message id."""
 
     LINE = 0
     """A line, without its end."""
@@ -256,7 +255,9 @@ class InSightMachine:
 
     # ------------------------------------------------------------------ messages out
 
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
         """Put a request in line; write :meth:`data_to_send` next.
 
         A Get status that is in line already is not repeated: its answer is new enough. Disconnect

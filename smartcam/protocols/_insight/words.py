@@ -25,19 +25,19 @@ DEFAULT_PORT = 23
 """The telnet port (manual, published)."""
 
 ENCODING = "latin-1"
-"""Of all text: a value with a degree sign came as the one byte B0 (clients, derived)."""
+"""Encoding of all texts: a value with a degree sign came as the one byte B0 (derived)."""
 
 LINE_END = b"\r\n"
-"""Ends each line over telnet, in both directions (manual, published)."""
+"""The end of each line over telnet, in both directions (manual, published)."""
 
 WELCOME = "Welcome to In-Sight"
-"""How the camera's first line begins (clients, derived)."""
+"""The beginning of the camera's first line (clients, derived)."""
 
 USER_PROMPT = b"User: "
-"""Asks for the user; no line end follows (clients, derived)."""
+"""The prompt for the user, which no line end follows (clients, derived)."""
 
 PASSWORD_PROMPT = b"Password: "
-"""Asks for the password; no line end follows (clients, derived)."""
+"""The prompt for the password, which no line end follows (clients, derived)."""
 
 LOGGED_IN = "User Logged In"
 """The line that says that commands are taken from now on (clients, derived)."""
@@ -50,23 +50,23 @@ MAX_LINE = 4096
 of cells; the camera's own bound is not published."""
 
 LAST_COLUMN = "Z"
-"""Of the spreadsheet, beginning with A (manual, published)."""
+"""The last column of the spreadsheet; the first one is A (manual, published)."""
 
 LAST_ROW = 399
-"""Of the spreadsheet, beginning with 0 (manual, published)."""
+"""The last row of the spreadsheet; the first one is 0 (manual, published)."""
 
 MAX_CELLS = 1024
 """Cells that a range, or a result, may have; ranges are of this library: each cell is asked for on
 its own, which takes a round trip."""
 
 LAST_JOB_ID = 999
-"""Ids of jobs are 0 to this (manual, published)."""
+"""The largest id of a job; the first one is 0 (manual, published)."""
 
 TRIGGER_EVENT = 8
 """The event that acquires an image; 0 to 7 are soft events of the job (manual, published)."""
 
 ERROR_VALUE = "#ERR"
-"""What a cell shows whose function failed (manual, published)."""
+"""The text of a cell whose function failed (manual, published)."""
 
 HEX_WIDTH = 80
 """Hexadecimal digits a line of image data (manual, published)."""
@@ -89,7 +89,7 @@ class StatusCode(enum.IntEnum):
 
 
 class AnswerForm(enum.Enum):
-    """What an answer consists of. A code other than 1 always stands alone."""
+    """The parts of an answer. A code other than 1 always stands alone."""
 
     CODE = "code"
     """The code, nothing else."""
@@ -117,13 +117,13 @@ class CommandRow(NamedTuple):
     """One command.
 
     Attributes:
-        mnemonic: its two letters; upper and lower case are the same (manual, published).
-        title: the manual's name.
-        arguments: what stands behind the letters, without a space unless one is shown.
-        form: the answer's form.
-        mode: in which mode it is possible; otherwise the answer is -2.
-        codes: what the codes mean beside 1 and 0.
-        source: where the row stands, with its grade.
+        mnemonic: the command's two letters, in upper or lower case (manual, published).
+        title: name of the command in the manual.
+        arguments: text behind the letters, without a space unless one is shown.
+        form: form of the answer.
+        mode: mode in which the command is possible; in the other mode the answer is -2.
+        codes: meaning of the status codes other than 1 and 0.
+        source: document that the row is from, with the grade of this knowledge.
     """
 
     mnemonic: str
@@ -284,7 +284,7 @@ _GENERAL_TEXTS = {
     -5: "accepted, but an operator or an input holds the camera offline",
     **_NO_ACCESS,
 }
-"""What codes mean where the command is not named."""
+"""Meanings of the codes where the command is not named."""
 
 
 def code_text(command: str, code: int) -> str:
@@ -304,8 +304,8 @@ class Cell(NamedTuple):
     """A cell of the spreadsheet.
 
     Attributes:
-        column: its letter, upper case.
-        row: its number, 0 to 399.
+        column: letter of the column, upper case.
+        row: number of the row, 0 to 399.
     """
 
     column: str
@@ -418,13 +418,13 @@ def hex_lines(data: bytes) -> tuple[int, bytes]:
 # ---------------------------------------------------------------------- lines
 
 ENDS = re.compile(rb"\r\n")
-"""What ends a line of the camera."""
+"""The end of a line from the camera."""
 
 COMMAND_ENDS = re.compile(rb"\r\n|\r?\x00")
-r"""What ends a line of a client: a byte NUL does as CR LF does (manual, published); a CR right
+r"""The end of a line from a client: a byte NUL does as CR LF does (manual, published); a CR right
 before it is dropped, since ``\r\0`` is telnet's bare CR."""
 
 
 def command_reader() -> LineReader:
-    """Return what cuts a client's lines."""
+    """Return a new reader that cuts a client's bytes into lines."""
     return LineReader(COMMAND_ENDS, max_line=MAX_LINE, encoding=ENCODING)

@@ -1,0 +1,54 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.protocols._base import POLICIES, Policy, load_protocol
+    from smartcam.protocols._bvs import DEFAULT_PORT, HANDBOOK, MessageId, ResultCode
+    from smartcam.protocols._framed.constructs import view_fields
+    from smartcam.protocols._framed.dialect import SHOWS_TRIGGERS
+    from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH, Framer
+    from smartcam.protocols._insight import words
+    from smartcam.protocols._insight.machine import ONLINE
+    from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
+    from smartcam.protocols._machine import Event, ResultBurst
+
+__all__ = [
+    "DEFAULT_MAX_LENGTH",
+    "DEFAULT_PORT",
+    "HANDBOOK",
+    "ONLINE",
+    "POLICIES",
+    "SHOWS_TRIGGERS",
+    "TRIGGER_EVENT",
+    "Event",
+    "Framer",
+    "MessageId",
+    "Policy",
+    "ResultBurst",
+    "ResultCode",
+    "StatusCode",
+    "load_protocol",
+    "view_fields",
+    "words",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_base": "POLICIES Policy load_protocol",
+            "_bvs": "DEFAULT_PORT HANDBOOK MessageId ResultCode",
+            "_framed.constructs": "view_fields",
+            "_framed.dialect": "SHOWS_TRIGGERS",
+            "_framed.framing": "DEFAULT_MAX_LENGTH Framer",
+            "_insight.": "words",
+            "_insight.machine": "ONLINE",
+            "_insight.words": "TRIGGER_EVENT StatusCode",
+            "_machine": "Event ResultBurst",
+        },
+    )

@@ -1,0 +1,178 @@
+"""The contract between a link and the protocol spoken over it, which every machine keeps.
+
+A machine takes bytes and gives events, and takes messages and gives bytes, in either role; it
+imports no socket, loop or clock. ``_framed`` has the one for frames, ``_lines`` and ``_insight``
+those for lines of text.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.exceptions import RemoteProtocolError
+    from smartcam.protocols._base import Dialect, Transport
+    from smartcam.protocols.messages import Message
+
+
+class State(enum.Enum):
+    """The state of a link."""
+
+    IDLE = "idle"
+    """Open, without a session."""
+    CONNECTING = "connecting"
+    """Connect was sent, its answer has not come."""
+    CONNECTED = "connected"
+    """In a session."""
+    DISCONNECTED = "disconnected"
+    """Disconnect was sent; what the camera had under way may still come."""
+    CLOSED = "closed"
+    """The peer closed the link."""
+    FAILED = "failed"
+    """The peer broke the protocol; nothing is read any more."""
+
+
+class Frame(NamedTuple):
+    """One frame: message id and the bytes behind the header."""
+
+    message_id: int
+    payload: bytes
+
+
+@dataclass(slots=True, kw_only=True)
+class ResultBurst:
+    """Result containers of one application, one right after the other; two or more as they come.
+
+    The client's machine gives it for containers that came in one delivery, so that a camera that
+    runs free costs no object for each. Iterating gives them one by one.
+
+    Attributes:
+        application: id of the application that sent the containers.
+        data: bytes of each container behind the application id.
+        size: bytes of all data together.
+    """
+
+    application: int
+    data: list[bytes]
+    size: int
+
+    def __iter__(self) -> Iterator[m.ResultContainer]:
+        return (m.ResultContainer(application=self.application, data=one) for one in self.data)
+
+    def cut(self, count: int) -> tuple[ResultBurst, ResultBurst]:
+        """Return the first ``count`` containers and the others."""
+        data, rest = self.data[:count], self.data[count:]
+        size = sum(map(len, data))
+        return (
+            ResultBurst(application=self.application, data=data, size=size),
+            ResultBurst(application=self.application, data=rest, size=self.size - size),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkFailed:
+    """The peer broke the protocol: close the link. Always the last event."""
+
+    error: RemoteProtocolError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkEnded:
+    """The peer closed the link; ``pending`` bytes of an unfinished frame were left."""
+
+    pending: int
+
+
+Event = m.Message | ResultBurst | LinkFailed | LinkEnded
+
+
+class LinkMachine(Protocol):
+    """The machine's side of a link in the client's role: the methods that a link calls.
+
+    Each kind of protocol brings its own: for frames, for lines of text. What comes goes in by
+    :meth:`room` and :meth:`filled` (a stream) or :meth:`receive_data` (a datagram), and out by
+    :meth:`events` as messages of :mod:`smartcam.protocols.messages`, whatever the wire looks like.
+    """
+
+    transport: Transport
+    """The transport of the link."""
+    replies: bool
+    """True if the machine may have bytes to send after it received some."""
+    counters: Counters
+    """The counters of bytes and messages."""
+
+    @property
+    def dialect(self) -> Dialect:
+        """The dialect that is spoken."""
+        ...
+
+    @property
+    def kin(self) -> Sequence[Dialect]:
+        """The dialects that this may be: more than one until :meth:`adopt` says which."""
+        ...
+
+    @property
+    def state(self) -> State:
+        """State of the link."""
+        ...
+
+    @property
+    def pending(self) -> bytes:
+        """Bytes that came and still wait for their rest."""
+        ...
+
+    def adopt(self, dialect: Dialect) -> None:
+        """Speak this one of :attr:`kin` from now on."""
+
+    def room(self) -> memoryview:
+        """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
+        ...
+
+    def filled(self, count: int, now: float) -> bool:
+        """Take ``count`` bytes that were written into :meth:`room`; False for no events yet.
+
+        ``now`` is for who bounds the time that a frame may take: seconds since any beginning.
+        """
+        ...
+
+    def receive_data(self, data: bytes) -> None:
+        """Take bytes of a stream, or one whole datagram; never raises for what is in them."""
+
+    def receive_eof(self) -> None:
+        """Take note that the peer will send no more."""
+
+    def events(self) -> list[Event]:
+        """Return the events since the last call, in order; the caller owns the list."""
+        ...
+
+    def send(self, message: Message, *, answered: bool | None = None, again: bool = False) -> None:
+        """Say something; write :meth:`data_to_send` next.
+
+        Raises:
+            LocalProtocolError: not now. Nothing has changed.
+            UnsupportedError: the dialect has no such message.
+        """
+
+    def data_to_send(self) -> list[bytes]:
+        """Return the bytes to write, in order."""
+        ...
+
+
+@dataclass(slots=True)
+class Counters:
+    """Counters of bytes and messages that went through a machine."""
+
+    frames_received: int = 0
+    frames_sent: int = 0
+    bytes_received: int = 0
+    bytes_sent: int = 0
+    ignored_frames: int = 0
+    unknown_ids: int = 0
+    unexpected_messages: int = 0
+    long_bodies: int = 0

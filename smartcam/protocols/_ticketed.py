@@ -1,0 +1,152 @@
+"""Cameras that speak in frames with a header of text: a ticket, the length, and the content.
+
+Each request carries a ticket, and its answer carries it back, so answers may come in any order, and
+with other things between. A dialect of this kind is one of lines whose lines are cut by length.
+Contents are bytes; as texts they are Latin-1, in which each character is one byte.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.protocols._base import Spelled
+from smartcam.protocols._line_reader import LineReader
+from smartcam.protocols._lines import LineDialect
+
+if TYPE_CHECKING:
+    from smartcam.protocols import messages as m
+    from smartcam.protocols._machine import Frame
+
+ENCODING = "latin-1"
+"""One byte for each character, whatever is in it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TicketedDialect(LineDialect):
+    """A dialect of frames: ``TTTT`` ``L`` and a length, ``CR LF``, the ticket again and content.
+
+    Args:
+        digits: digits of the length, 0 for frames without a header, which end with their first
+            ``CR LF``. The length counts the ticket, the content and the ``CR LF`` behind it.
+        asks_with_length: requests have the header, too.
+    """
+
+    digits: int = 9
+    asks_with_length: bool = True
+
+    encoding: str = ENCODING
+    line_end: bytes = b"\r\n"
+    max_line: int = 1 << 16
+    tickets: range = range(1000, 10000)
+    at_once: bool = True
+
+    def __post_init__(self) -> None:
+        if self.split is None and self.tickets:
+            object.__setattr__(self, "split", self._split)
+
+    @property
+    def width(self) -> int:
+        """Digits of a ticket, 0 without tickets."""
+        return len(str(self.tickets[-1])) if self.tickets else 0
+
+    def _split(self, line: str) -> tuple[str, str]:
+        """Return the ticket of a frame, and its content."""
+        ticket = line[: self.width]
+        if len(ticket) < self.width or not (ticket.isascii() and ticket.isdecimal()):
+            raise ValueError(line)
+        return ticket, line[self.width :]
+
+    def frame(self, content: bytes, ticket: str, *, length: bool) -> bytes:
+        """Return the bytes of a frame, with or without the length."""
+        body = ticket.encode() + content + self.line_end
+        if not length:
+            return body
+        return f"{ticket}L{len(body):0{self.digits}}".encode() + self.line_end + body
+
+    def pack(self, line: str, ticket: str) -> bytes:
+        """Return the bytes of a request.
+
+        Raises:
+            ConfigurationError: it cannot stand in a frame.
+        """
+        data = line.encode(ENCODING, "replace")
+        if len(data) > self.max_line or (not self.asks_with_length and b"\r\n" in data):
+            raise ConfigurationError(
+                f"dialect {self.name}: {line[:64]!r} is no request of {self.max_line} bytes"
+            )
+        return self.frame(data, ticket, length=self.asks_with_length)
+
+    def reader(self, max_length: int = 0) -> LineReader:
+        """Return a new reader that cuts a stream into contents, each with its ticket."""
+        if self.digits:
+            return HeaderReader(self.width, self.digits, max_length)
+        ends = re.compile(re.escape(self.line_end))
+        return LineReader(ends, max_line=max_length, encoding=ENCODING)
+
+    def spell(self, sender: m.Sender, frame: Frame) -> Spelled:
+        """Return a frame in words."""
+        asked = sender.value == "client"  # whose frames are traced with their header
+        headed = asked and self.asks_with_length
+        body = frame.payload.partition(b"\r\n")[2] if headed else frame.payload
+        ticket, content = body[: self.width].decode(ENCODING), body[self.width :]
+        data = frame.payload + self.line_end
+        if not asked:
+            data = self.frame(content, ticket, length=self.digits > 0)
+        return Spelled(None, "frame", {"ticket": ticket, "text": content.decode(ENCODING)}, data)
+
+
+class HeaderReader(LineReader):
+    """Cuts frames with a header of text from a stream of bytes.
+
+    Args:
+        width: digits of a ticket, 0 for frames without.
+        digits: digits of the length.
+        max_length: bytes of a content at most.
+    """
+
+    def __init__(self, width: int, digits: int, max_length: int) -> None:
+        super().__init__(re.compile(b"\r\n"), max_line=0, encoding=ENCODING)
+        self._width = width
+        self._size = width + 1 + digits + 2
+        self._form = re.compile(rb"([0-9]{%d})L([0-9]{%d})\r\n" % (width, digits))
+        self._max_length = max_length
+
+    def next_line(self) -> str | None:
+        """Return the next frame's ticket and content, None if no whole one is there.
+
+        Raises FrameError: what came is no frame; the stream cannot be read on.
+        """
+        header = bytes(self._buffer[: self._size])
+        if len(header) < self._size:
+            if not _may_begin(header, self._width):
+                raise FrameError(f"{header!r} came, no frame begins so", data=header)
+            return None
+        form = self._form.fullmatch(header)
+        if form is None:
+            raise FrameError(f"{header!r} came, no frame begins so", data=header)
+        length = int(form[2])
+        if not self._width + 2 <= length <= self._width + 2 + self._max_length:
+            raise FrameError(
+                f"a frame of {length} bytes came, at most {self._max_length} are accepted",
+                data=header,
+            )
+        if len(self._buffer) < self._size + length:
+            return None
+        self.take(self._size)
+        body = self.take(length) or b""
+        if not body.endswith(b"\r\n") or not body.startswith(form[1]):
+            raise FrameError(f"frame {form[1].decode()} does not hold what it says", data=body[:64])
+        return body[:-2].decode(ENCODING)
+
+
+def _may_begin(header: bytes, width: int) -> bool:
+    """Return True if a frame may begin with these bytes, of which there are too few."""
+    ticket, rest = header[:width], header[width:]
+    return (
+        (not ticket or ticket.isdigit())
+        and rest[:1] in {b"", b"L"}
+        and rest[1:10].isdigit() | (len(rest) < 2)
+    )
