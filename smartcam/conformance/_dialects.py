@@ -6,4 +6,4 @@ SMART: tuple[str, ...] = ("handbook", "thesis", "b16")
 """The dialects of smart cameras: with a run mode, statuses by themselves, and no result codes."""
 
 EVERY_DIALECT: tuple[str, ...] = (*SMART, "bid")
-"""All dialects."""
+"""Names of all dialects."""

@@ -39,7 +39,7 @@ CAMERA: Mapping[str, str] = {
     "--camera-input": "input data that the application takes, as hex",
     "--camera-report": "file to write the report to, as JSON",
 }
-"""Help text of each that is about a camera."""
+"""Help text of each option that is about a camera."""
 
 CLIENT: Mapping[str, str] = {
     "--client-command": (
@@ -51,7 +51,7 @@ CLIENT: Mapping[str, str] = {
     "--client-transport": "tcp, udp, or both with a comma between them; default tcp.",
     "--client-timeout": "Seconds that a task may take; default 30.",
 }
-"""Help text of each that is about a client."""
+"""Help text of each option that is about a client."""
 
 
 def add_options(parser: Any) -> None:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._scenario.states import DeviceState
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator._scene import TablePose, TableScene
+    from smartcam.emulator._ticketed_camera import TicketedCamera, TicketedClient
     from smartcam.emulator._traffic import LogEntry, Visit
     from smartcam.emulator._wire_camera import WireCamera
     from smartcam.emulator.faults import FiredFault
@@ -54,6 +55,8 @@ __all__ = [
     "Scenario",
     "TablePose",
     "TableScene",
+    "TicketedCamera",
+    "TicketedClient",
     "Visit",
     "WireCamera",
     "faults",
@@ -84,6 +87,7 @@ if not TYPE_CHECKING:
             "_scenario.states": "DeviceState",
             "_scenario.timeline": "Cue",
             "_scene": "TablePose TableScene",
+            "_ticketed_camera": "TicketedCamera TicketedClient",
             "_traffic": "LogEntry Visit",
             "_wire_camera": "WireCamera",
             "faults": "FiredFault",

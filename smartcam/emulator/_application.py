@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
+from smartcam._forks import cached_property
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.emulator._data import EmulatorData, Seconds
 from smartcam.emulator._generators import Generator, Run, Values, find_generator, wrap_number
 from smartcam.emulator._scene import TableScene
@@ -85,7 +86,7 @@ class Application(EmulatorData):
 
     @property
     def triggered(self) -> bool:
-        """Whether it waits for triggers."""
+        """True if the application waits for triggers."""
         return self.rate is None
 
     @cached_property
@@ -134,9 +135,27 @@ class Application(EmulatorData):
         if layout is None:
             return None
         run = Run(number, turn, time, layout, scene, values, self.parameters)
+        return self.container_of(self._values(run), number=number, byte_order=byte_order)
+
+    def container_of(
+        self, values: Values, *, number: int, byte_order: ByteOrder = "little"
+    ) -> bytes | None:
+        """Return the result container's bytes of values, None without a "send results" tool.
+
+        Args:
+            values: what the layout holds.
+            number: the run's sequence number.
+            byte_order: order of the bytes of a number.
+
+        Raises:
+            ConfigurationError: the values do not fit the layout.
+        """
+        layout = self.result_layout
+        if layout is None:
+            return None
         field = layout.sequence_field
         data = layout.build(
-            self._values(run),
+            values,
             byte_order,
             slots=self.slots,
             sequence=None if field is None else wrap_number(field, number),
@@ -188,7 +207,9 @@ class Application(EmulatorData):
                 self.container(number=0, turn=turn, time=0.0, scene=TableScene())
             except SmartCamError as exc:
                 raise ValueError(f"{what}{exc}") from exc
-            except Exception as exc:
+            except ENDS_PROGRAM:
+                raise
+            except BaseException as exc:
                 raise ValueError(f"the generator failed: {exc!r}") from exc
 
 

@@ -13,11 +13,13 @@ import logging
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from smartcam._arguments import check_application, check_flag, check_port, check_seed, check_text
 from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK
 from smartcam.emulator._bvs.device import Device
 from smartcam.emulator._client_link import MAX_INPUT, SecondClientSession
 from smartcam.emulator._clock import ManualClock, nanoseconds
+from smartcam.emulator._inspected import InspectedApplication
 from smartcam.emulator._scenario.merge import make_plan
 from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._scene import TableScene
@@ -25,10 +27,9 @@ from smartcam.emulator._wire_camera import WireCamera
 from smartcam.emulator.faults._matching import misfit
 from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.models import Status
+from smartcam.protocols import BVS, Machine, Role, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import POLICIES, Policy, Role, Transport
-from smartcam.protocols._bvs import BVS
-from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols._inside import POLICIES, SHOWS_TRIGGERS, Policy
 from smartcam.settings import Address
 
 if TYPE_CHECKING:
@@ -43,14 +44,13 @@ if TYPE_CHECKING:
     from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator._scenario.timeline import Cue
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.protocols._framed.dialect import FramedDialect
-    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols import Frame, FramedDialect
 
 CONDITIONS = {"overheat": Status.OVERHEAT, "system_error": Status.SYSTEM_ERROR}
-"""What an operator can set and clear, by name."""
+"""The conditions that an operator can set and clear, by name."""
 
 SHOWN = ("id", "name", "layout", "input", "rate", "load_time", "processing_time")
-"""What the page shows of an application."""
+"""The fields of an application that the page shows."""
 
 _SHOWN = 20  # ids that an error names
 
@@ -60,7 +60,8 @@ BAD_FRAME: Mapping[str, Policy] = {
     "skip": POLICIES[Role.CAMERA, Transport.TCP],
     "close": Policy(fatal=(FrameError,), exact_length=True),
 }
-"""What the quirk ``bad_frame`` means on TCP; a broken body or an unknown id never matters."""
+"""Policies over TCP by value of the quirk ``bad_frame``; a broken body or an unknown id never
+matters."""
 
 
 class EmulatedCamera(WireCamera):
@@ -84,9 +85,9 @@ class EmulatedCamera(WireCamera):
         dialect: name of the wire dialect: ``handbook``, ``thesis``, ``b16`` or ``bid``; default
             what the scenario says, else ``handbook``. ``bid`` is a BVS ID: it runs always, and
             answers every request with a result code.
-        clock: its time; a :class:`ManualClock` in tests. Default: real time.
+        clock: clock that the camera runs by; a :class:`ManualClock` in tests. Default: real time.
         quirks: what is not known of real cameras: :class:`Quirks` or a mapping of its fields.
-        name: for logs.
+        name: name of the camera in logs.
         active: id of the application that is loaded at first; default the first given, else 1.
         running: in run mode from the beginning.
         seed: of all that is left to chance, the scene's noise and the timeline; default 0.
@@ -103,7 +104,7 @@ class EmulatedCamera(WireCamera):
         dialect: as given.
         name: as given.
         scenario: what all that was given comes to.
-        clock: its clock.
+        clock: clock that the camera runs by.
         device: the camera behind the wire. Its operator's methods (``trigger()``,
             ``set_condition()``, ...) may be called at any time in the event loop's thread; what
             they cause is sent. Its time is brought up whenever something happens.
@@ -137,6 +138,19 @@ class EmulatedCamera(WireCamera):
         faults: Iterable[BaseFault | Mapping[str, Any]] = (),
         timeline: Iterable[Cue | Mapping[str, Any]] = (),
     ) -> None:
+        who = "emulator"
+        if port is not None:
+            port = check_port(port, who)
+        if name is not None:
+            name = check_text(name, "name", who, most=200)
+        if active is not None:
+            active = check_application(active, "active", who)
+        if running is not None:
+            running = check_flag(running, "running", who)
+        if seed is not None:
+            seed = check_seed(seed, who)
+        if builtins is not None:
+            builtins = check_flag(builtins, "builtins", who)
         plan = make_plan(
             scenario,
             applications,
@@ -247,7 +261,16 @@ class EmulatedCamera(WireCamera):
         """Its address with the dialect pinned."""
         kind = Transport(self.transport)
         scheme = next(s for s, t in BVS.schemes.items() if t is kind)
-        return Address("bvs", scheme, self.host, self.port, self.dialect, self.spoken.quirks).url
+        hidden = self.device.quirks.hidden_triggers
+        return Address(
+            "bvs",
+            scheme,
+            self.host,
+            self.port,
+            self.dialect,
+            self.spoken.quirks,
+            ((SHOWS_TRIGGERS, "no"),) if hidden else (),
+        ).url
 
     @property
     def application_ids(self) -> list[int]:
@@ -263,13 +286,20 @@ class EmulatedCamera(WireCamera):
         return self.device.scene
 
     @property
+    def table(self) -> TableScene | None:
+        """The table that its pages show; None where all applications inspect real pictures."""
+        applications = self.device.applications.values()
+        inspects = all(isinstance(one, InspectedApplication) for one in applications)
+        return None if inspects else self.scene
+
+    @property
     def clock_time(self) -> datetime:
-        """What its own clock shows."""
+        """Time that the device's own clock shows."""
         return self.device.clock_time
 
     @property
     def last_report(self) -> LastReport | None:
-        """What the last run reported, whether anybody heard it or not; its time is the log's."""
+        """The last run's report, whether anybody heard it or not; its time is the log's."""
         last = self.device.last_report
         if last is None:
             return None
@@ -280,7 +310,7 @@ class EmulatedCamera(WireCamera):
         return self.device.applications.get(message.application)
 
     def shown(self) -> dict[str, Any]:
-        """Return what its page shows of its state."""
+        """Return the state of the camera that its page shows."""
         device = self.device
         return {
             **super().shown(),
@@ -307,7 +337,7 @@ class EmulatedCamera(WireCamera):
 
     @property
     def has_session(self) -> bool:
-        """Whether a client has the session."""
+        """True while a client has the session."""
         return self._active is not None
 
     @property
@@ -335,7 +365,7 @@ class EmulatedCamera(WireCamera):
         return dataclasses.replace(policy, tells=self.device.behaviour.tells_bad_messages)
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """A link received a message; who has no session is heard with Connect only."""
+        """Take a message of a link; a link without the session is heard with Connect only."""
         connects = isinstance(message, m.Connect)
         if not connects and link is not self._active:
             return
@@ -354,16 +384,16 @@ class EmulatedCamera(WireCamera):
             self._act(faults, "after")
 
     def serves(self, link: ClientLink) -> bool:
-        """Whether the link has the session."""
+        """Return True if the link has the session."""
         return link is self._active
 
     def lost(self, link: ClientLink) -> None:
-        """A link is gone; if it had the session, that is over."""
+        """Forget a link that is gone; if it had the session, end that."""
         if link is self._active:
             self._leave_session()
 
     def _let_second_client_in(self) -> None:
-        """Another client connects and gets the session, unless a quirk refuses newcomers."""
+        """Let another client connect, which gets the session unless a quirk refuses newcomers."""
         if self.device.rebooting or self._refusal is not None or not self._may_take_over(None):
             return
         self._hand_session(SecondClientSession(self.spoken, self._told_second_client))
@@ -451,14 +481,14 @@ class EmulatedCamera(WireCamera):
     # ------------------------------------------------------------------ the port
 
     def _go_down(self) -> None:
-        """The camera restarts: every connection is lost, the port is shut."""
+        """Restart: lose every connection, and shut the port."""
         _log.info("= %s: rebooting", self.name)
         self._down = True
         self._active = None
         self._port.shut()
 
     def _come_up(self) -> None:
-        """The camera is there again."""
+        """Come back after a restart."""
         _log.info("= %s: up again", self.name)
         self._down = False
         if self._refusal is None:

@@ -17,9 +17,8 @@ from smartcam.emulator._clock import OneTimer, nanoseconds
 from smartcam.emulator.faults._delay_line import DelayLine
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
 from smartcam.exceptions import LocalProtocolError
+from smartcam.protocols import Frame, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
-from smartcam.protocols._framed.framing import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -31,8 +30,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults._matching import FaultQueue
     from smartcam.emulator.faults._wire_effects import WireCodec, WireFramer
     from smartcam.exceptions import RemoteProtocolError
-    from smartcam.protocols._framed.dialect import FramedDialect
-    from smartcam.protocols._framed.machine import State
+    from smartcam.protocols import FramedDialect, State
 
 _log = logging.getLogger("smartcam.emulator")
 
@@ -47,13 +45,13 @@ Trace: TypeAlias = "Callable[[m.Sender, Frame | RemoteProtocolError], None]"
 
 
 class CameraMachine(Protocol):
-    """What a link needs of the machine that speaks over it, in the camera's role."""
+    """The methods that a link needs of the machine which speaks over it, in the camera's role."""
 
     transport: Transport
 
     @property
     def state(self) -> State:
-        """Where the link is."""
+        """State of the link."""
         ...
 
     @property
@@ -65,7 +63,7 @@ class CameraMachine(Protocol):
         """Take bytes; never raises for what is in them."""
 
     def events(self) -> Iterable[object]:
-        """Return what was heard since the last call."""
+        """Return the messages and bytes heard since the last call."""
         ...
 
     def send(self, message: Any) -> None:
@@ -77,7 +75,7 @@ class CameraMachine(Protocol):
 
 
 class LinkOwner(Protocol):
-    """What links want from the emulator behind them."""
+    """The methods that links need of the emulator behind them."""
 
     clock: Clock
     queue: FaultQueue  # the faults that wait
@@ -98,31 +96,31 @@ class LinkOwner(Protocol):
         ...
 
     def arrived(self, link: ClientLink) -> None:
-        """A connection was made."""
+        """Note that a connection was made."""
         ...
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """A link received a message."""
+        """Take a message of a link."""
         ...
 
     def serves(self, link: ClientLink) -> bool:
-        """Whether the link has the session."""
+        """Return True if the link has the session."""
         ...
 
     def lost(self, link: ClientLink) -> None:
-        """A link is gone; harmless when said twice."""
+        """Forget a link that is gone; a second call does nothing."""
         ...
 
     def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
-        """A connection has ended."""
+        """Note that a connection has ended."""
         ...
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        """A machine saw a frame, or bytes that make none."""
+        """Note a frame that a machine saw, or bytes that make none."""
         ...
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """What faults made of a message has passed, or is lost."""
+        """Take note of a message that passed or is lost, as faults have made it."""
         ...
 
 
@@ -160,6 +158,15 @@ class ClientLink(ABC):
         if faulty.idle:
             self._faulty = None
 
+    @property
+    def settled(self) -> bool:
+        """True if the link has the session and so makes room for nobody."""
+        return self._owner.serves(self)
+
+    def turn_away(self, why: str) -> None:
+        """End the link to make room, or because it was without a session for too long."""
+        self.close(why)
+
     @abstractmethod
     def close(self, reason: str) -> None:
         """End the link; nothing is read or written any more."""
@@ -170,10 +177,10 @@ class ClientLink(ABC):
             self.close(reason)
 
     def unseated(self) -> None:  # noqa: B027  only where links have an order of their own
-        """The client has given the session back; it may stay."""
+        """Note that the client has given the session back; it may stay."""
 
     def heard(self) -> None:
-        """The camera heard something: write what it said to it."""
+        """Write the camera's answers to what it heard."""
         self.flush()
 
     def feed(self, data: bytes) -> None:
@@ -203,7 +210,7 @@ class ClientLink(ABC):
         """End what a fault does to the link for long."""
 
     def overflow(self) -> None:
-        """Faults hold back too much."""
+        """End the link: faults hold back too much."""
         self.close(f"more than {self._owner.write_limit} bytes are held back")
 
     @abstractmethod
@@ -266,7 +273,7 @@ class FaultyLink:
 
     @property
     def idle(self) -> bool:
-        """Whether messages may go the short way again, as far as this link is concerned."""
+        """True if messages may go the short way again, as far as this link is concerned."""
         return (
             self.muted is None
             and not self.dead
@@ -277,7 +284,7 @@ class FaultyLink:
 
     @property
     def unheard(self) -> bool:
-        """Whether something of the client's is held back."""
+        """True while something of the client's is held back."""
         return bool(self._incoming)
 
     def close(self) -> None:
@@ -401,7 +408,7 @@ class FaultyLink:
 
     @property
     def _why(self) -> str:
-        """Why something is lost now."""
+        """Reason for which something is lost now."""
         return self.muted or (_ENDED if self._link.closed else _UNSENT)
 
     def _end(self, ending: Ending) -> None:
@@ -443,7 +450,7 @@ class SecondClientSession:
         self._traced(frame)
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Do nothing, since nothing waits."""
 
     def dismiss(self, reason: str) -> None:
-        """Another client has the session; nothing is there to be closed."""
+        """Do nothing: another client has the session, and nothing is there to be closed."""

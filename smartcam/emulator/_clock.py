@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+from smartcam._arguments import check_callable, check_moment, check_seconds
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def nanoseconds(seconds: float) -> int:
 
 
 class TimerHandle(Protocol):
-    """What :meth:`Clock.call_at` returns."""
+    """The timer that :meth:`Clock.call_at` returns."""
 
     def cancel(self) -> None:
         """Do not call; harmless after the call."""
@@ -113,7 +114,8 @@ class ManualClock(Clock):
 
     def call_at(self, when: float, callback: Callable[[], None]) -> TimerHandle:
         """Call ``callback`` inside the :meth:`advance` that reaches ``when``."""
-        timer = _Timer(callback)
+        when = check_moment(when, "when", "clock")
+        timer = _Timer(check_callable(callback, "callback", "clock"))
         entry = (nanoseconds(when), next(self._numbers), timer)
         heapq.heappush(self._timers, entry)
         return timer
@@ -131,8 +133,7 @@ class ManualClock(Clock):
         Raises:
             ConfigurationError: a negative time, or a call from inside another one.
         """
-        if not seconds >= 0:
-            raise ConfigurationError(f"clock: the time goes forwards, got {seconds} s")
+        seconds = check_seconds(seconds, "seconds", "clock")
         if self._advancing:
             raise ConfigurationError("clock: advance() was called inside advance()")
         target = self._now + nanoseconds(seconds)

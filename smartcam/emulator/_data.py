@@ -1,10 +1,12 @@
-"""What the data have in common of which emulated cameras are made."""
+"""The base of the data from which emulated cameras are made."""
 
 from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from smartcam._forks import cached_property
 
 Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 """A time of up to an hour."""
@@ -13,4 +15,6 @@ Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 class EmulatorData(BaseModel):
     """Base of the data: they do not change, and a field that they lack is refused."""
 
-    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        frozen=True, extra="forbid", ignored_types=(cached_property,)
+    )

@@ -6,16 +6,17 @@ import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from smartcam._arguments import check_all, check_kind
 from smartcam._server import Server
 from smartcam.emulator._makes import emulated_class
 from smartcam.emulator._scenario.file import load_scenarios
+from smartcam.emulator._scenario.scenario import Scenario
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from smartcam.emulator._clock import Clock
-    from smartcam.emulator._scenario.scenario import Scenario
     from smartcam.emulator._wire_camera import WireCamera
 
 
@@ -53,10 +54,11 @@ class EmulatedFleet(Server):
         given = (
             load_scenarios(scenarios, dialect=dialect)
             if isinstance(scenarios, (str, Path))
-            else tuple(scenarios)
+            else check_all(scenarios, "scenarios", "a file's path, or scenarios", "emulator")
         )
         self._cameras: dict[str, WireCamera] = {}
         for scenario in given:
+            check_kind(scenario, Scenario, "scenarios", "a file's path, or scenarios", "emulator")
             if scenario.name in self._cameras:
                 raise ConfigurationError(f"emulator: two cameras are called {scenario.name!r}")
             self._cameras[scenario.name] = emulated_class(scenario.protocol).from_scenario(

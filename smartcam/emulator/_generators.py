@@ -1,4 +1,4 @@
-"""Where an application's values may come from beside constants: functions with a name.
+"""Functions, by their names, that make an application's values where they are not constants.
 
 A generator takes a :class:`Run` and returns what ``Layout.build`` takes: a mapping for a record, a
 list of mappings for ``( ... )*``. :func:`register_generator` adds one that scenario files can name,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import heapq
 import itertools
 import logging
@@ -16,42 +17,46 @@ from smartcam.emulator._scenario.timeline import Cue
 from smartcam.emulator._wire_camera import WireCamera
 from smartcam.emulator.faults._matching import misfit
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._lines import LineDialect
+from smartcam.protocols import LineDialect
+from smartcam.protocols import messages as m
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from typing import Self
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from smartcam.emulator._client_link import ClientLink, Trace
     from smartcam.emulator._clock import Clock
     from smartcam.emulator._scenario.scenario import Mistake, Scenario
     from smartcam.emulator.faults._base import BaseFault
-    from smartcam.protocols import messages as m
-    from smartcam.protocols._base import Protocol, Transport
+    from smartcam.protocols import Protocol, Transport
 
 _log = logging.getLogger("smartcam.emulator")
 
-MAX_WAITING = 1 << 16
-"""Bytes of lines that wait behind one under way; more are left to the network."""
+MAX_INPUT_BYTES = 1 << 16
+"""Bytes of lines that may wait behind the one under way; more bytes are not read yet."""
 
 MAX_AGENDA = 10_000
-"""What may be put off to a later time at once."""
+"""Calls that may be scheduled for later at one time."""
 
 
 _FIELDS = frozenset({"name", "protocol", "port", "seed", "timeline", "options", "cameras"})
-"""Fields of a scenario that say something of such a camera."""
+"""The fields of a scenario that apply to every camera of this kind."""
 
 _STATE = frozenset({"active", "running"})
-"""And those of cameras that know programs."""
+"""The fields of a scenario that apply to cameras with programs only."""
 
 
 class LineClient:
     """A client of an emulated camera that speaks in lines.
 
     Attributes:
-        peer: its address and port.
-        heard: it has said a line.
+        peer: address and port of the client.
+        heard: True once the client has sent the line that begins a session; where the dialect has
+            none, any line that the dialect knows.
     """
 
     def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
@@ -61,6 +66,24 @@ class LineClient:
         self._link = link
         self._server = server
         self._row = 0  # of the line under way
+        self._kept = False
+
+    def keep(self) -> Self:
+        """Return a client that answers the line under way later; the next line is heard now."""
+        self._kept = True
+        kept = copy.copy(self)
+        self._kept = False
+        self.go_on()
+        return kept
+
+    @property
+    def gone(self) -> bool:
+        """True once the connection has ended."""
+        return self._link.closed
+
+    def pack(self, text: str) -> bytes:
+        """Return an answer to the line under way as the camera says it."""
+        return self._camera.lines.data(text)
 
     def say(self, text: str) -> None:
         """Say a line that answers nothing."""
@@ -69,8 +92,9 @@ class LineClient:
     def answer(self, text: str | None) -> None:
         """Answer the line under way, None with silence; the next one is heard then."""
         if text is not None:
-            self.say_bytes(self._camera.lines.data(text))
-        self.go_on()
+            self.say_bytes(self.pack(text))
+        if not self._kept:
+            self.go_on()
 
     def say_bytes(self, data: bytes, *, row: int | None = None) -> None:
         """Say bytes as they are: a part of an answer, or a prompt."""
@@ -78,8 +102,12 @@ class LineClient:
             message = SaidLine(row=self._row if row is None else row, data=data)
             self._camera.say(self._link, message)
 
+    def say_again(self, data: bytes) -> None:
+        """Say bytes that a camera once said as the answer to the line under way."""
+        self.say_bytes(data)
+
     def go_on(self) -> None:
-        """The line under way is done: hear the next."""
+        """End the line under way, and hear the next."""
         self._server.busy = False
         if not self._server.going and not self._link.closed:
             with self._camera.step():
@@ -99,8 +127,8 @@ class LineClient:
         self._link.part("close", reason)
 
     def begin(self, message: HeardLine) -> None:
-        """A line is under way."""
-        self.heard = True
+        """Begin a line."""
+        self.heard = self.heard or self._camera.begins_session(message)
         self._row, self._server.busy = message.row, True
 
 
@@ -121,16 +149,16 @@ class LineCamera(WireCamera):
     Args:
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
-        name: for logs.
-        clock: its time; a :class:`ManualClock` in tests. Default: real time.
-        seed: of what a timeline leaves to chance.
+        name: name of the camera in logs.
+        clock: clock that the camera runs by; a :class:`ManualClock` in tests. Default: real time.
+        seed: seed of the random numbers that a timeline uses.
         faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
             of their fields with ``kind``. ``on`` names a request of the dialect's rows, or what
             answers one.
         timeline: what happens by itself, and when: cues, or mappings of their fields.
 
     Attributes:
-        protocol: what it speaks; its first dialect is the one.
+        protocol: protocol of the camera, which speaks its first dialect.
         device: what an operator can do, where a subclass puts anything there: ``start()``,
             ``stop()``, ``trigger()``, ``reboot(seconds)``,
             ``switch_application(id, running=False)``. Faults, scenarios and the page find what
@@ -249,6 +277,17 @@ class LineCamera(WireCamera):
                     return ("timeline", number, "do", place, wrong[0]), wrong[1]
         return None
 
+    @classmethod
+    def image_answer(cls, image: NDArray[np.uint8]) -> bytes | None:
+        """Return the bytes that answer a line that asks for a picture; None: it has none.
+
+        A replay asks for it where a picture was recorded and the line was not.
+
+        Args:
+            image: (H, W), the brightness.
+        """
+        return None
+
     def make_codec(self) -> LineCodec:
         """Return the lines it speaks: those of its protocol's first dialect.
 
@@ -267,6 +306,7 @@ class LineCamera(WireCamera):
             ends=re.compile(re.escape(dialect.line_end)),
             max_line=dialect.max_line,
             encoding=dialect.encoding,
+            split=dialect.split,
         )
 
     # ------------------------------------------------------------------ for subclasses
@@ -278,6 +318,9 @@ class LineCamera(WireCamera):
     def hear(self, client: LineClient, line: str) -> None:
         """Do what a line says, and call ``client.answer()`` once, now or later."""
         client.answer(self.answer(line))
+
+    def begun(self, client: LineClient, message: HeardLine) -> None:
+        """Note a client's line as it came, before it is heard; nothing unless overridden."""
 
     def greet(self, client: LineClient) -> None:
         """Say something to a client that has just come; nothing unless overridden."""
@@ -322,7 +365,7 @@ class LineCamera(WireCamera):
         return LineServer(self.lines, transport, trace)
 
     def arrived(self, link: ClientLink) -> None:
-        """A connection was made."""
+        """Note that a connection was made."""
         assert isinstance(link.machine, LineServer)  # noqa: S101 - it is what make_machine made
         client = self._clients[link] = self.make_client(link, link.machine)
         with self.step():
@@ -334,22 +377,30 @@ class LineCamera(WireCamera):
         return LineClient(self, link, server)
 
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """A link received a line."""
+        """Take a line of a link."""
         client = self._clients.get(link)
         if client is None or not isinstance(message, HeardLine):
             return
         faults = self._provoke(self.queue.device_heard, message)
         client.begin(message)
+        self.begun(client, message)
         self.hear(client, self.lines.text(message.data))
         self._act(faults, "after")
 
+    def begins_session(self, message: HeardLine) -> bool:
+        """Return True if a line begins a session: Connect, or without Connect any known line."""
+        if not message.row:
+            return False
+        kind = self.lines.message_type(m.Sender.CLIENT, message.row)
+        return kind is m.Connect or not self.lines.has(m.Connect)
+
     def serves(self, link: ClientLink) -> bool:
-        """Whether the client on it has said anything."""
+        """Return True if the client on the link has begun a session."""
         client = self._clients.get(link)
         return client is not None and client.heard
 
     def lost(self, link: ClientLink) -> None:
-        """A link is gone; harmless when said twice."""
+        """Forget a link that is gone; a second call does nothing."""
         self._spoken_to.pop(link, None)
         if self._clients.pop(link, None) is not None:
             self._timeline.entered(DeviceState.DISCONNECTED)
@@ -378,7 +429,7 @@ class LineCamera(WireCamera):
                 link.flush()
         self._spoken_to.clear()
         for link in self._clients:
-            link.hold(link.machine.buffered > MAX_WAITING)
+            link.hold(link.machine.buffered > MAX_INPUT_BYTES)
         self._timer.set(self._due())
 
     def _due(self) -> int | None:

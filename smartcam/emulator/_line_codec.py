@@ -8,28 +8,25 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam.exceptions import FrameError, UnsupportedError
+from smartcam.protocols import Frame, LineCommand, MessageRow, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.dialect import MessageRow
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from smartcam.emulator._client_link import Trace
-    from smartcam.protocols._base import Transport
-    from smartcam.protocols._lines import LineRow
+    from smartcam.protocols import LineRow, Transport
 
 MAX_LOGGED = 4096
 """Bytes of a line, or of an answer of several, that the log keeps."""
 
 HIDDEN = b"***"
-"""What the log shows of a line that is secret."""
+"""The text that the log shows in place of a secret line."""
 
-_FIELD = re.compile(r"\{\w+\}")
+_FIELD = re.compile(r"\{\w+(?::\w+)?\}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +55,7 @@ class LineCodec:
         ends: what ends a client's line.
         max_line: bytes of a client's line, its end not counted.
         encoding: of characters.
+        split: splits an answer into what it is known by and the text that rows read.
     """
 
     def __init__(
@@ -69,7 +67,9 @@ class LineCodec:
         ends: re.Pattern[bytes],
         max_line: int,
         encoding: str,
+        split: Callable[[str], tuple[str, str]] | None = None,
     ) -> None:
+        self._split = split
         self.label: str = label
         self.line_end: bytes = line_end
         self.ends: re.Pattern[bytes] = ends
@@ -78,12 +78,12 @@ class LineCodec:
         self.table: tuple[MessageRow, ...] = tuple(
             MessageRow(number, kind, row.line, "")
             for number, row in enumerate(rows, start=1)
-            for kind in (row.request, row.answer)
+            for kind in dict.fromkeys((row.request, row.answer, *row.also))
             if kind is not None
         )
         self._rows = rows
-        self._patterns = [
-            (number, re.compile(_pattern(row.line), re.DOTALL))
+        self._forms = [
+            (number, _LineForm.of(row.line))
             for number, row in enumerate(rows, start=1)
             if row.request is not None
         ]
@@ -93,34 +93,55 @@ class LineCodec:
         found = self.ends.search(data)
         return data[: found.start() if found else None].decode(self.encoding, "replace")
 
+    def said(self, data: bytes) -> str:
+        """Return the text of what the camera says."""
+        return data.removesuffix(self.line_end).decode(self.encoding, "replace")
+
     def data(self, text: str) -> bytes:
         """Return a text as the camera says it."""
         return text.encode(self.encoding, "replace") + self.line_end
 
     def row_of(self, text: str) -> int:
         """Return the number of the row of a client's line, 0 for none."""
-        return next((number for number, one in self._patterns if one.fullmatch(text)), 0)
+        return next((number for number, one in self._forms if one.read(text) is not None), 0)
+
+    def request_key(self, data: bytes) -> str:
+        """Return the word or ticket of the answer to a line, "" where order alone tells."""
+        if self._split is None:
+            return ""
+        text = self.text(data)
+        row = self._rows[self.row_of(text) - 1] if self.row_of(text) else None
+        word = None if row is None else row.word
+        return text.partition(",")[0] if word is None else word
+
+    def answer_key(self, data: bytes) -> str:
+        """Return the word or ticket of an answer, "" where order alone tells."""
+        try:
+            return "" if self._split is None else self._split(self.said(data))[0]
+        except (ValueError, LookupError):
+            return ""
 
     # ------------------------------------------------------------------ as a codec
 
     def framer(self, max_length: int) -> LineFramer:
-        """Return what cuts a client's lines."""
+        """Return a new reader that cuts a client's bytes into lines."""
         return LineFramer(self)
 
     def has(self, message_type: type[m.Message], /) -> bool:
-        """Return whether a row has it, as a request or an answer."""
-        return any(message_type in {row.request, row.answer} for row in self._rows)
+        """Return True if a row has the message as a request or an answer."""
+        return any(message_type in {row.request, row.answer, *row.also} for row in self._rows)
 
     def message_id(self, message: m.Message, /) -> int:
         """Return the number of its row."""
         return message.row if isinstance(message, (HeardLine, SaidLine)) else 0
 
     def message_type(self, sender: m.Sender, message_id: int) -> type[m.Message]:
-        """Return what a row is asked by, or what it answers."""
+        """Return the type of a row's request, or of its answer if the camera is the sender."""
         if not 0 < message_id <= len(self._rows):
             return m.UnknownMessage
         row = self._rows[message_id - 1]
-        return row.answer if sender is m.Sender.CAMERA else row.request or m.UnknownMessage
+        kind = row.answer if sender is m.Sender.CAMERA else row.request
+        return kind or m.UnknownMessage
 
     def encode(self, message: m.Message) -> bytes:
         """Return the bytes of a line; UnsupportedError: it is another message."""
@@ -141,23 +162,29 @@ class LineCodec:
         return 0
 
     def decode(self, sender: m.Sender, frame: Frame) -> m.Message:
-        """Return what a line means; UnknownMessage where no row says it."""
+        """Return the message that a line stands for; UnknownMessage where no row has the line."""
         kind = self.message_type(sender, frame.message_id)
         if sender is m.Sender.CLIENT and kind is not m.UnknownMessage:
             return self._request(kind, frame.message_id, self.text(frame.payload))
         if kind is not m.UnknownMessage:
-            said = frame.payload.removesuffix(self.line_end).decode(self.encoding, "replace")
+            said = self.said(frame.payload)
             try:
-                return self._rows[frame.message_id - 1].read(said)
+                told = self._rows[frame.message_id - 1].read(
+                    said if self._split is None else self._split(said)[1]
+                )
             except (ValueError, LookupError):
                 pass
+            else:
+                found = told if isinstance(told, tuple) else (told,)
+                return next((one for one in found if type(one) is kind), found[0])
         return m.UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
     def _request(self, kind: type[m.Message], number: int, text: str) -> m.Message:
         """Return a request with what its line says for its fields, or zeros."""
-        pattern = next(one for row, one in self._patterns if row == number)
-        found = pattern.fullmatch(text)
-        said: dict[str, Any] = {} if found is None else found.groupdict()
+        if kind is LineCommand:
+            return LineCommand(line=text)
+        form = next(one for row, one in self._forms if row == number)
+        said = form.read(text) or {}
         values: dict[str, Any] = {}
         for name, wire in m.wire_fields(kind):
             word = said.get(name, "")
@@ -171,14 +198,44 @@ class LineCodec:
         return kind(**values)
 
 
-def _pattern(line: str) -> str:
-    """Return the pattern of a row's line: its fields are any text."""
-    fixed = _FIELD.split(line)
-    names = [name[1:-1] for name in _FIELD.findall(line)]
-    parts = [re.escape(fixed[0])]
-    for name, text in zip(names, fixed[1:], strict=True):
-        parts += [f"(?P<{name}>.*)", re.escape(text)]
-    return "".join(parts)
+class _LineForm(NamedTuple):
+    """The form of a row's line: fixed texts with a field of any text between each two of them.
+
+    Attributes:
+        fields: names of the fields.
+        texts: one more than there are fields.
+    """
+
+    fields: tuple[str, ...]
+    texts: tuple[str, ...]
+
+    @classmethod
+    def of(cls, line: str) -> _LineForm:
+        """Return the form of a row's line, which has its fields in braces."""
+        return cls(
+            tuple(name[1:-1].partition(":")[0] for name in _FIELD.findall(line)),
+            tuple(_FIELD.split(line)),
+        )
+
+    def read(self, text: str) -> dict[str, str] | None:
+        """Return the fields of a line, each as long as it can be; None: it has another form.
+
+        Each fixed text is looked for from behind, so that no character is looked at twice.
+        """
+        first, *texts = self.texts
+        if not texts:
+            return {} if text == first else None
+        end = len(text) - len(texts[-1])
+        if not text.startswith(first) or not text.endswith(texts[-1]) or end < len(first):
+            return None
+        found: dict[str, str] = {}
+        for name, before in zip(reversed(self.fields), reversed((first, *texts[:-1])), strict=True):
+            place = text.rfind(before, len(first), end) if len(found) < len(texts) - 1 else 0
+            if place < 0:
+                return None
+            found[name] = text[place + len(before) : end]
+            end = place
+        return found
 
 
 class LineFramer:
@@ -191,7 +248,7 @@ class LineFramer:
 
     @property
     def pending(self) -> bytes:
-        """What is not cut yet."""
+        """Bytes that are not cut into lines yet."""
         return bytes(self._buffer)
 
     def __len__(self) -> int:

@@ -14,28 +14,27 @@ import struct
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from smartcam._accepting import Acceptor
+from smartcam._accepting import HANDSHAKE_TIMEOUT, RESERVED_BY_CAMERAS, Acceptor, Places
 from smartcam._datagrams import read_no_more_than_needed
 from smartcam.emulator._client_link import ClientLink
-from smartcam.protocols._base import Transport
-from smartcam.protocols._framed.machine import State
+from smartcam.protocols import State, Transport
 
 if TYPE_CHECKING:
     from smartcam.emulator._client_link import LinkOwner
 
 _log = logging.getLogger("smartcam.emulator")
 
-FAREWELL = 1.0
+CLOSE_TIMEOUT = 1.0
 """Seconds of real time that a client has to close its side after a fault closed the camera's."""
 
 _NO_LINGER = struct.pack("hh" if os.name == "nt" else "ii", 1, 0)
 
-LEAST_READ = 1 << 10
+FIRST_READ_BYTES = 1 << 10
 """Bytes that one read of a connection takes at most, at first: what a client says is short, and
 hundreds of cameras may have a buffer each. It doubles each time that a read took so many, as input
 data may; a read that took fewer makes it small again."""
 
-MOST_READ = 1 << 16
+MAX_READ_BYTES = 1 << 16
 """Bytes that one read takes at most in the end."""
 
 REFUSED = "refuse"
@@ -56,19 +55,22 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
 
     def __init__(self, listener: TcpListener, owner: LinkOwner) -> None:
         super().__init__(owner, Transport.TCP, "?")
+        self.address: Any = None
         self._listener = listener
         self._farewell: asyncio.TimerHandle | None = None
         self._end_waits = False
-        self._room = memoryview(bytearray(LEAST_READ))
+        self._room = memoryview(bytearray(FIRST_READ_BYTES))
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self.peer: str = _peer_text(transport.get_extra_info("peername"))
+        self.address = transport.get_extra_info("peername")
+        self.peer: str = _peer_text(self.address)
         if self._listener.down:
             self.close("the camera is down")
             return
-        self._listener.enter(self)
-        if self.closed:
+        refusal = self._listener.enter(self)
+        if refusal:
+            self.close(refusal)
             return
         # the camera does so too (newest SC manual p. 40: published)
         with contextlib.suppress(OSError):  # the client may be gone already
@@ -81,10 +83,10 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
     def buffer_updated(self, nbytes: int) -> None:
         room, size = self._room, len(self._room)
         data = bytes(room[:nbytes])
-        if nbytes == size < MOST_READ:
+        if nbytes == size < MAX_READ_BYTES:
             self._room = memoryview(bytearray(2 * size))
-        elif nbytes < size > LEAST_READ:
-            self._room = memoryview(bytearray(LEAST_READ))
+        elif nbytes < size > FIRST_READ_BYTES:
+            self._room = memoryview(bytearray(FIRST_READ_BYTES))
         if self.closed:  # it says farewell
             return
         with self._owner.step():
@@ -92,7 +94,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self.heard()
 
     def eof_received(self) -> bool:
-        """The client has closed its side: that waits behind what faults hold back."""
+        """Note that the client has closed its side, which waits behind what faults hold back."""
         self._end_waits = self._faulty is not None and self._faulty.unheard
         return self._end_waits
 
@@ -108,7 +110,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self._farewell.cancel()
         by_client = not self.closed
         self._leave()
-        self._listener.links.pop(self, None)
+        self._listener.leave(self)
         with self._owner.step():
             self._owner.lost(self)
         self._owner.parted(self, by_client=by_client, reset=exc is not None)
@@ -123,12 +125,10 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         return True
 
     def unseated(self) -> None:
-        if self in self._listener.links:
-            del self._listener.links[self]
-            self._listener.links[self] = None
+        self._listener.unseated(self)
 
     def close(self, reason: str) -> None:
-        self._listener.links.pop(self, None)
+        self._listener.leave(self)
         if not self.closed:
             self._leave()
             _log.info("= %s: connection closed: %s", self.peer, reason)
@@ -150,10 +150,11 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
         with contextlib.suppress(OSError):
             self._transport.write_eof()
         loop = asyncio.get_running_loop()
-        self._farewell = loop.call_later(FAREWELL, self._transport.abort)
+        self._farewell = loop.call_later(CLOSE_TIMEOUT, self._transport.abort)
 
     def stop_listening(self) -> None:
         self._transport.pause_reading()
+        self._listener.keep(self)
 
     def hold(self, on: bool) -> None:
         if on:
@@ -175,18 +176,14 @@ class Listener(ABC):
 
     kind: socket.SocketKind
 
-    def __init__(self) -> None:
-        self.crowded_out: int = 0  # links that made room for newcomers
-
-    def crowd_out(self, link: ClientLink, why: str) -> None:
-        """Close a link to make room for a newcomer."""
-        self.crowded_out += 1
-        link.close(why)
+    def __init__(self, owner: LinkOwner) -> None:
+        self.places: Places[ClientLink] = Places(owner.max_links)
+        self._owner = owner
 
     @property
-    @abstractmethod
     def all_links(self) -> list[ClientLink]:
         """The links that are open."""
+        return list(self.places)
 
     @abstractmethod
     async def serve(self, sock: socket.socket) -> None:
@@ -213,19 +210,16 @@ class TcpListener(Listener):
     kind = socket.SOCK_STREAM
 
     def __init__(self, owner: LinkOwner) -> None:
-        super().__init__()
-        self.links: dict[_TcpLink, None] = {}  # the one without a session for longest stands first
+        super().__init__(owner)
         self.down: bool = True
-        """Whether connections that were accepted before are too late."""
-        self._owner = owner
-        self._acceptor = Acceptor(
-            lambda: _TcpLink(self, self._owner), _log, name="smartcam.emulator"
+        """True if connections that were accepted before are too late."""
+        self._acceptor: Acceptor[ClientLink] = Acceptor(
+            lambda: _TcpLink(self, self._owner),
+            self.places,
+            _log,
+            name="smartcam.emulator",
+            reserve=RESERVED_BY_CAMERAS,
         )
-
-    @property
-    def all_links(self) -> list[ClientLink]:
-        """The links that are open."""
-        return list(self.links)
 
     async def serve(self, sock: socket.socket) -> None:
         """Serve a bound socket that listens."""
@@ -248,13 +242,23 @@ class TcpListener(Listener):
         await self._acceptor.wait_closed()
         await super().wait_closed()
 
-    def enter(self, link: _TcpLink) -> None:
-        """Take a new connection; where there are too many, another one makes room."""
-        self.links[link] = None
-        if len(self.links) > self._owner.max_links:
-            one = next(one for one in self.links if not self._owner.serves(one))
-            why = f"{self._owner.max_links} others are open, it was without a session for longest"
-            self.crowd_out(one, why)
+    def enter(self, link: _TcpLink) -> str:
+        """Take a new connection; return "", or why there is no room for it."""
+        self.places.most = self._owner.max_links
+        return self._acceptor.enter(link, link.address)
+
+    def leave(self, link: _TcpLink) -> None:
+        """Forget a connection that has ended; harmless when said twice."""
+        self._acceptor.leave(link)
+
+    def unseated(self, link: _TcpLink) -> None:
+        """Take that a client has given the session back: it is the last to make room."""
+        self._acceptor.move_back(link)
+        self._acceptor.expect(link, HANDSHAKE_TIMEOUT, "no session")
+
+    def keep(self, link: _TcpLink) -> None:
+        """Have no time limit for a connection that a fault lets hang."""
+        self._acceptor.expect(link, None, "")
 
 
 # ---------------------------------------------------------------------- UDP
@@ -287,12 +291,12 @@ class _UdpLink(ClientLink):
             self._faulty.heal()
 
     def shut_off(self) -> None:
-        """The port is closed for a time: what is said is lost."""
+        """Shut the port for a time: whatever is said is lost."""
         faulty = self._enter_faulty()
         faulty.muted = faulty.muted or REFUSED
 
     def let_in(self) -> None:
-        """The port is open again."""
+        """Open the port again."""
         if self._faulty is not None and self._faulty.muted == REFUSED:
             self._faulty.muted = None
 
@@ -304,7 +308,7 @@ class _UdpLink(ClientLink):
         if not self.closed:
             self._leave()
             _log.debug("= %s: forgotten: %s", self.peer, reason)
-            self._listener.links.pop(self._address, None)
+            self._listener.forget(self._address)
             self._owner.lost(self)
 
 
@@ -314,15 +318,9 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
     kind = socket.SOCK_DGRAM
 
     def __init__(self, owner: LinkOwner) -> None:
-        super().__init__()
-        self.links: dict[Any, _UdpLink] = {}  # the one that was heard last stands last
-        self._owner = owner
+        super().__init__(owner)
+        self.links: dict[Any, _UdpLink] = {}  # by address
         self._transport: asyncio.DatagramTransport | None = None
-
-    @property
-    def all_links(self) -> list[ClientLink]:
-        """The links that are open."""
-        return list(self.links.values())
 
     async def serve(self, sock: socket.socket) -> None:
         """Serve a bound socket."""
@@ -356,12 +354,23 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
         """Pass it to the link of its address; too many links drop the one silent for longest."""
         if self._transport is None:
             return  # the port is shut, the loop had this one already
-        link = self.links.pop(addr, None) or _UdpLink(self, self._owner, addr)
-        self.links[addr] = link
-        if len(self.links) > self._owner.max_links:
-            old = next(old for old in self.all_links if not self._owner.serves(old))
-            self.crowd_out(old, "idle")
+        now = asyncio.get_running_loop().time()
+        link = self.links.get(addr)
+        if link is None:
+            link = _UdpLink(self, self._owner, addr)
+            self.places.most = self._owner.max_links
+            if self.places.enter(link, str(addr[0]), now):
+                return  # everybody has a session
+            self.links[addr] = link
+        else:
+            self.places.move_back(link, now)
         link.datagram_received(data)
+
+    def forget(self, address: Any) -> None:
+        """Forget the client of an address."""
+        link = self.links.pop(address, None)
+        if link is not None:
+            self.places.leave(link)
 
     def error_received(self, exc: Exception) -> None:
         """Nobody reads the answers at a peer any more; the camera does not notice."""

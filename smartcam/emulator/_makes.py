@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from smartcam._suggestions import did_you_mean
 from smartcam.emulator._wire_camera import WireCamera
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
-from smartcam.protocols._base import load_protocol
+from smartcam.protocols._inside import load_protocol
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:

@@ -9,13 +9,12 @@ import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from smartcam._accepting import BACKLOG
+
 if TYPE_CHECKING:
     from smartcam.emulator._links import Listener
 
 _log = logging.getLogger("smartcam.emulator")
-
-BACKLOG = 32
-"""Connections that the system keeps until they are accepted."""
 
 _RETRY = 0.2  # seconds between tries to get the port back
 

@@ -11,7 +11,7 @@ import math
 import random
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.exceptions import ConfigurationError
+from smartcam._arguments import check_flag, check_number, check_seed, wrong_argument
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,7 +21,7 @@ TABLE_SIZE = (0.30, 0.25)
 
 
 class TablePose(NamedTuple):
-    """Where a piece lies: x right, y away, metres; theta counter-clockwise, radians."""
+    """The place of a piece: x right, y away, metres; theta counter-clockwise, radians."""
 
     x: float
     y: float
@@ -29,7 +29,7 @@ class TablePose(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """What the camera saw of one piece."""
+    """The observation of one piece by the camera."""
 
     name: str  # of the piece
     u: float  # pixels to the right
@@ -50,7 +50,11 @@ PIECES: Mapping[str, TablePose] = {
 """The pieces and where they lie at first; no two touch, none reaches over the table's edge."""
 
 _ARM = 0.02
-"""Metres: half the length of a piece. Pixel noise at this distance turns it."""
+"""Half the length of a piece, metres; pixel noise at this distance turns the piece."""
+
+
+MAX_PIXELS = 1e9
+"""Pixels that a scale, an offset and noise may have at most, as a number that is none is found."""
 
 
 class TableScene:
@@ -78,16 +82,18 @@ class TableScene:
         seed: int = 0,
         y_down: bool = False,
     ) -> None:
-        if not (scale > 0 and math.isfinite(scale)):
-            raise ConfigurationError(f"scene: scale must be positive, got {scale}")
-        if not (pixel_noise >= 0 and math.isfinite(pixel_noise)):
-            raise ConfigurationError(f"scene: pixel_noise must not be negative, got {pixel_noise}")
-        self.scale = scale
-        self.offset = offset
-        self.rotation = rotation
-        self.pixel_noise = pixel_noise
-        self.seed = seed
-        self.y_down = y_down
+        if not isinstance(offset, tuple) or len(offset) != 2:
+            raise wrong_argument("offset", "a pixel's u and v", offset, "scene")
+        most = MAX_PIXELS
+        self.scale: float = check_number(scale, "scale", 0, most, "scene", above=True)
+        self.offset: tuple[float, float] = (
+            check_number(offset[0], "offset", -most, most, "scene"),
+            check_number(offset[1], "offset", -most, most, "scene"),
+        )
+        self.rotation: float = check_number(rotation, "rotation", -most, most, "scene")
+        self.pixel_noise: float = check_number(pixel_noise, "pixel_noise", 0, most, "scene")
+        self.seed: int = check_seed(seed, "scene")
+        self.y_down: bool = check_flag(y_down, "y_down", "scene")
         self.pieces: dict[str, TablePose] = dict(PIECES)
         """Name to ground truth; change it and the next measurement sees the change."""
         self._random = random.Random(seed)  # noqa: S311  noise, not a secret

@@ -1,4 +1,4 @@
-"""What went over the wire: the emulator's log, and waiting for something to appear in it."""
+"""The emulator's log of what went over the wire, and waits for an entry to appear in it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, overload
 
 from smartcam.emulator._tally import Tally
 from smartcam.exceptions import RemoteProtocolError, ResponseTimeoutError
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols import Frame
 from smartcam.protocols.messages import Message, Sender, UnknownMessage
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class LogEntry(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What was heard as a line without its end, or said as it was; of cameras that speak so."""
+        """Text of a camera that speaks lines; what was heard is without its line end."""
         text = bytes.fromhex(self.hex).decode("latin-1")
         return text.rstrip("\r\n\0") if self.direction == "in" else text
 
@@ -82,10 +82,10 @@ class Visit(NamedTuple):
     """A TCP connection that has ended.
 
     Attributes:
-        time: of the emulator's clock when it ended, seconds.
+        time: seconds of the emulator's clock when the connection ended.
         peer: address and port of the client.
-        ended_by: which side closed it first.
-        reset: whether it ended by a reset, and not in order.
+        ended_by: the side that closed the connection first.
+        reset: True if the connection ended by a reset, and not in order.
     """
 
     time: float

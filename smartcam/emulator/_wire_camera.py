@@ -1,4 +1,4 @@
-"""What emulated cameras have in common, whatever they speak: port, links, faults, timeline, log.
+"""The base of emulated cameras, whatever they speak: port, links, faults, timeline, log.
 
 Everything that happens is a *step*: bring the device's time up, do it, deliver, set one timer for
 the device's next event.
@@ -7,10 +7,20 @@ the device's next event.
 from __future__ import annotations
 
 import logging
+import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from smartcam._arguments import (
+    check_integer,
+    check_kind,
+    check_port,
+    check_seconds,
+    check_seed,
+    check_text,
+    wrong_argument,
+)
 from smartcam._server import Server
 from smartcam.emulator._clock import Clock, OneTimer, RealClock
 from smartcam.emulator._links import TcpListener, UdpListener
@@ -22,9 +32,8 @@ from smartcam.emulator.faults._device_effects import Stage, act, kinds_of
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
+from smartcam.protocols import Frame, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
-from smartcam.protocols._framed.framing import Frame
 
 if TYPE_CHECKING:
     from collections import deque
@@ -96,19 +105,19 @@ class WireCamera(Server):
     """An emulated camera of any make on a real port; what it says is its subclass' matter.
 
     Args:
-        spoken: the words on the wire.
-        device: what is behind it; faults call its operator's methods.
+        spoken: codec of the messages on the wire.
+        device: the camera behind the wire, whose operator's methods faults call.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         transport: ``"tcp"`` or ``"udp"``.
         dialect: name of the wire dialect.
-        name: for logs.
-        clock: its time.
-        seed: of all that is left to chance.
-        timeline: what happens by itself, and when.
+        name: name of the camera in logs.
+        clock: clock that the camera runs by.
+        seed: seed of all random numbers.
+        timeline: events that happen by themselves, with their times.
 
     Raises:
-        ConfigurationError: it cannot do what the timeline wants.
+        ConfigurationError: the camera cannot do what the timeline wants.
     """
 
     max_links: int = MAX_LINKS
@@ -117,11 +126,12 @@ class WireCamera(Server):
     """Bytes kept for a client that does not read, or held back by faults; more end its
     connection."""
     takes: ClassVar[frozenset[str]] = frozenset()
-    """What it takes of ``scenario``, ``dialect``, ``transport``, ``seed``, ``web``, ``replay``."""
+    """The options among ``scenario``, ``dialect``, ``transport``, ``seed``, ``web`` and ``replay``
+    that the camera takes."""
     device: Any
-    """What is behind the wire."""
+    """The device behind the wire."""
     states: ClassVar[frozenset[DeviceState]] = frozenset()
-    """What it can enter, for a timeline."""
+    """The states that the camera can enter, for a timeline."""
 
     def __init__(
         self,
@@ -138,12 +148,18 @@ class WireCamera(Server):
         timeline: Sequence[Cue],
         applications: Container[int] = (),
     ) -> None:
+        who = "emulator"
+        host = check_text(host, "host", who, least=1, most=300)
+        port = check_port(port, who)
+        name = check_text(name, "name", who, most=200)
+        if clock is not None:
+            check_kind(clock, Clock, "clock", "a Clock", who)
         self.host: str = host
         self.transport: Literal["tcp", "udp"] = transport
         self.dialect: str = dialect
         self.name: str = name
         self.clock: Clock = clock if clock is not None else RealClock()
-        self.seed: int = seed
+        self.seed: int = check_seed(seed, who)
         self.fault_kinds: frozenset[str] = kinds_of(device)
         self.codec: WireCodec = spoken
         self._cues = timeline
@@ -217,7 +233,7 @@ class WireCamera(Server):
 
     @property
     def has_session(self) -> bool:
-        """Whether a client has a session."""
+        """True while a client has a session."""
         return bool(self.sessions)
 
     @property
@@ -226,13 +242,18 @@ class WireCamera(Server):
         return None
 
     @property
+    def table(self) -> TableScene | None:
+        """The table that its pages show; None where it looks at none."""
+        return self.scene
+
+    @property
     def clock_time(self) -> datetime | None:
-        """What its own clock shows; None for a camera without."""
+        """Time that the camera's own clock shows; None for a camera without a clock."""
         return None
 
     @property
     def last_report(self) -> LastReport | None:
-        """What the last run reported, whether anybody heard it or not; None where none is kept."""
+        """The last run's report, whether anybody heard it or not; None where none is kept."""
         return None
 
     def application_of(self, message: m.ResultContainer) -> Application | None:
@@ -240,7 +261,7 @@ class WireCamera(Server):
         return None
 
     def shown(self) -> dict[str, Any]:
-        """Return what its page shows of its state; a camera adds and replaces what it has."""
+        """Return the state that the camera's page shows; a subclass replaces some entries."""
         return {
             "mode": "running" if self._started else "stopped",
             "status": Status(0),
@@ -276,7 +297,7 @@ class WireCamera(Server):
     @property
     def crowded_out(self) -> int:
         """Clients without a session that were sent away because too many were connected."""
-        return self._listener.crowded_out
+        return self._listener.places.crowded_out
 
     @property
     def faults(self) -> list[Fault]:
@@ -290,12 +311,12 @@ class WireCamera(Server):
 
     @property
     def is_random(self) -> bool:
-        """Whether chance has a part in the timeline."""
+        """True if chance has a part in the timeline."""
         return any(cue.is_random for cue in self._cues)
 
     @property
     def cues_done(self) -> list[int]:
-        """How often each cue of the timeline has happened since the start."""
+        """Number of times that each cue of the timeline has happened since the start."""
         return self._timeline.done
 
     @property
@@ -326,6 +347,12 @@ class WireCamera(Server):
 
         Cancellation: safe.
         """
+        if not isinstance(what, type):
+            what = check_integer(what, "what", 0, 0xFFFFFFFF, "wait_received")
+        elif not issubclass(what, m.Message):
+            raise wrong_argument("what", "a message's id or type", what, "wait_received")
+        count = check_integer(count, "count", 0, who="wait_received")
+        timeout = check_seconds(timeout, "timeout", "wait_received")
         await self._traffic.wait_received(what, count=count, timeout=timeout)
 
     # ------------------------------------------------------------------ life
@@ -371,6 +398,12 @@ class WireCamera(Server):
             self._port.shut()
             await self._port.wait_closed()
 
+    def __del__(self) -> None:
+        # the event loop has it until it is stopped; so nobody has it when that is gone, too
+        if vars(self).get("_started", False):
+            text = f"emulated camera at {self.url} was not stopped"
+            warnings.warn(text, ResourceWarning, source=self, stacklevel=2)
+
     # ------------------------------------------------------------------ faults
 
     def inject(self, *faults: BaseFault | Mapping[str, Any]) -> None:
@@ -398,7 +431,7 @@ class WireCamera(Server):
         Raises:
             ConfigurationError: no cue has it.
         """
-        self._timeline.command(name)
+        self._timeline.command(check_text(name, "name", "command", most=200))
 
     def clear_faults(self) -> None:
         """Forget the faults that wait, and end those that last.
@@ -431,7 +464,7 @@ class WireCamera(Server):
         )
 
     def _entered(self, state: DeviceState) -> None:
-        """The device has entered a state: what it said before is not changed by what follows."""
+        """Note that the device has entered a state, after everything that it said before."""
         self._collect()
         self._timeline.entered(state)
 
@@ -461,26 +494,26 @@ class WireCamera(Server):
 
     @abstractmethod
     def received(self, link: ClientLink, message: m.Message) -> None:
-        """A link received a message."""
+        """Take a message of a link."""
 
     @abstractmethod
     def serves(self, link: ClientLink) -> bool:
-        """Whether the link has a session."""
+        """Return True if the link has a session."""
 
     @abstractmethod
     def lost(self, link: ClientLink) -> None:
-        """A link is gone; harmless when said twice."""
+        """Forget a link that is gone; a second call does nothing."""
 
     def arrived(self, link: ClientLink) -> None:
-        """A connection was made."""
+        """Note that a connection was made."""
 
     def parted(self, link: ClientLink, *, by_client: bool, reset: bool) -> None:
-        """A connection has ended."""
+        """Note that a connection has ended."""
         by: Literal["client", "camera"] = "client" if by_client else "camera"
         self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        """A machine saw a frame, or bytes that make none."""
+        """Note a frame that a machine saw, or bytes that make none."""
         self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
         if _log.isEnabledFor(logging.DEBUG):
             self._show_last()
@@ -488,7 +521,7 @@ class WireCamera(Server):
             self._traffic.count(what)
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
-        """What faults made of a message has passed, or is lost."""
+        """Note in the log a message that passed or is lost, as faults have made it."""
         faults = ", ".join(message.faults) or None
         self._note(link.peer, sender, message.what, faults, message.wire)
 
@@ -545,13 +578,13 @@ class WireCamera(Server):
         """Deliver what came of a step, and set the timer."""
 
     def _deliver_at_once(self) -> None:
-        """Say what a fault made the device say; it wakes no other fault."""
+        """Send the messages that a fault made the device send; they trigger no other fault."""
 
     def _began(self) -> None:
-        """It is started; the first step is to come."""
+        """Follow the start; the first step is to come."""
 
     def _ends(self) -> None:
-        """It stops; links are still there."""
+        """Precede the stop; links are still there."""
 
     def _end_device_faults(self) -> None:
         """End the faults of the device that last."""

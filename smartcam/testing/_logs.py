@@ -16,7 +16,14 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeAlias, overload
 
-from smartcam.emulator.faults._base import MESSAGE_NAMES, known_name
+from smartcam._arguments import (
+    check_flag,
+    check_integer,
+    check_seconds,
+    check_text,
+    wrong_argument,
+)
+from smartcam.emulator._inside import MESSAGE_NAMES, known_name
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
@@ -24,7 +31,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from smartcam.emulator._traffic import LogEntry, Visit
+    from smartcam.emulator import LogEntry, Visit
 
 Expected: TypeAlias = "type[m.Message] | m.Message | str | int"
 """A message type or its name, a message with all its fields, or a message id."""
@@ -35,8 +42,8 @@ ALLOWED_WHILE_BUSY: tuple[type[m.Message], ...] = (
     m.GetStatus,
     m.Disconnect,
 )
-"""What a client may say while the camera is BUSY: it asks for nothing that takes the camera's time
-(inferred)."""
+"""Messages that a client may send while the camera is BUSY: they ask for nothing that takes the
+camera's time (inferred)."""
 
 SHOWN = 40
 """Entries of the log that a failure shows: the last ones."""
@@ -46,7 +53,7 @@ PAUSE = 0.005
 
 
 class CameraLog(Sequence["LogEntry"]):
-    """What went over the wire of an emulated camera, oldest first; looked at anew each time.
+    """The log of an emulated camera's traffic, oldest first; looked at anew each time.
 
     Args:
         read: returns the entries.
@@ -92,12 +99,12 @@ class CameraLog(Sequence["LogEntry"]):
 
     @property
     def received(self) -> list[m.Message]:
-        """What clients have sent, as far as it makes messages."""
+        """Messages that clients have sent; bytes that make none are left out."""
         return _messages(self._read(), "in")
 
     @property
     def said(self) -> list[m.Message]:
-        """What the camera has said."""
+        """Messages that the camera has sent."""
         return _messages(self._read(), "out")
 
     # ------------------------------------------------------------------ expectations
@@ -116,6 +123,8 @@ class CameraLog(Sequence["LogEntry"]):
             ConfigurationError: no message is called so.
         """
         __tracebackhide__ = True
+        only = check_flag(only, "only", "expect")
+        timeout = check_seconds(timeout, "timeout", "expect")
         wanted = [_known(one) for one in expected]
         self._until(lambda entries: _in_order(entries, wanted, only=only), timeout, whole=only)
 
@@ -136,6 +145,11 @@ class CameraLog(Sequence["LogEntry"]):
             AssertionError: something else was sent.
         """
         __tracebackhide__ = True
+        grace = check_seconds(grace, "grace", "expect_nothing_while_busy")
+        timeout = check_seconds(timeout, "timeout", "expect_nothing_while_busy")
+        for one in also:
+            if not (isinstance(one, type) and issubclass(one, m.Message)):
+                raise wrong_argument("also", "types of messages", one)
         allowed = (*ALLOWED_WHILE_BUSY, *also)
         self._until(lambda entries: _busy_talk(entries, allowed, grace), timeout, whole=True)
 
@@ -151,6 +165,7 @@ class CameraLog(Sequence["LogEntry"]):
             AssertionError: one did not, or is still connected.
         """
         __tracebackhide__ = True
+        timeout = check_seconds(timeout, "timeout", "expect_disconnect_before_close")
         self._until(self._unfinished, timeout, whole=True)
 
     def expect_no_errors(self) -> None:
@@ -206,8 +221,13 @@ def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:
 
 
 def _known(expected: Expected) -> Expected:
-    if not isinstance(expected, str):
+    if isinstance(expected, type) and issubclass(expected, m.Message):
         return expected
+    if isinstance(expected, m.Message):
+        return expected
+    if not isinstance(expected, str):
+        return check_integer(expected, "expected", 0, 0xFFFFFFFF)
+    expected = check_text(expected, "expected", most=200)
     try:
         return MESSAGE_NAMES[known_name(expected)]
     except ValueError as exc:

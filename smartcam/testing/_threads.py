@@ -14,9 +14,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
+from smartcam._arguments import check_callable, check_flag, check_seconds, check_text
 from smartcam._loop_thread import CALL_TIMEOUT, LoopThread
 from smartcam.emulator import EmulatedCamera, EmulatedFleet, ManualClock
-from smartcam.emulator._makes import check_options, emulated_class
+from smartcam.emulator._inside import check_options, emulated_class
 from smartcam.exceptions import ConfigurationError, UnsupportedError
 from smartcam.testing._logs import CameraLog
 
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from typing import Self
 
     from smartcam.emulator import Device, FiredFault, Scenario, TableScene, Visit, WireCamera
+    from smartcam.emulator._inside import BaseFault
     from smartcam.emulator.faults import Fault
-    from smartcam.emulator.faults._base import BaseFault
     from smartcam.protocols.messages import Message
 
 T = TypeVar("T")
@@ -63,7 +64,7 @@ class _InLoop:
         if self._owns_thread:
             self._thread.start()
         try:
-            self._thread.wait(self._hosted.start())
+            self._thread.call(self._hosted.start, CALL_TIMEOUT)
         except BaseException:
             self.stop()
             raise
@@ -71,7 +72,7 @@ class _InLoop:
     def stop(self) -> None:
         """Stop it; the log can still be read. Harmless when done twice."""
         try:
-            self._thread.wait(self._hosted.stop())
+            self._thread.call(self._hosted.stop, CALL_TIMEOUT)
         except ConfigurationError:
             return  # it does not run
         finally:
@@ -97,9 +98,9 @@ class ThreadedCamera(_InLoop):
     What only a BVS camera has (``scene``, ``scenario``, ``wait_received`` of ids) is there for one.
 
     Args:
-        protocol: what it speaks: the name of a protocol that brings an emulated camera.
-        manual_clock: its time stands still until :meth:`advance` moves it.
-        options: those of :class:`~smartcam.emulator.EmulatedCamera`, or of the class that the
+        protocol: name of a protocol that brings an emulated camera.
+        manual_clock: True if the camera's time stands still until :meth:`advance` moves it.
+        options: options of :class:`~smartcam.emulator.EmulatedCamera`, or of the class that the
             protocol brings.
 
     Attributes:
@@ -113,6 +114,8 @@ class ThreadedCamera(_InLoop):
     def __init__(
         self, *, protocol: str = "bvs", manual_clock: bool = False, **options: Any
     ) -> None:
+        protocol = check_text(protocol, "protocol", "ThreadedCamera", least=1, most=100)
+        manual_clock = check_flag(manual_clock, "manual_clock", "ThreadedCamera")
         kind: Any = emulated_class(protocol)
         check_options(kind, options)
         emulator: WireCamera = kind(clock=ManualClock() if manual_clock else None, **options)
@@ -177,7 +180,7 @@ class ThreadedCamera(_InLoop):
 
     @property
     def scenario(self) -> Scenario:
-        """What it was made of."""
+        """Scenario that the camera was made of."""
         return self._bvs("scenario").scenario
 
     @property
@@ -192,7 +195,7 @@ class ThreadedCamera(_InLoop):
 
     @property
     def has_session(self) -> bool:
-        """Whether a client has the session."""
+        """True while a client has the session."""
         return self._look(lambda: self._emulator.has_session)
 
     @property
@@ -222,7 +225,7 @@ class ThreadedCamera(_InLoop):
 
     @property
     def cues_done(self) -> list[int]:
-        """How often each cue of its timeline has happened."""
+        """Number of times that each cue of the timeline has happened."""
         return self._look(lambda: self._emulator.cues_done)
 
     # ------------------------------------------------------------------ what it does
@@ -256,7 +259,7 @@ class ThreadedCamera(_InLoop):
 
     def run(self, function: Callable[..., T]) -> T:
         """Call ``function`` with the emulated camera, in its thread."""
-        return self._thread.run(function, self._emulator)
+        return self._thread.run(check_callable(function, "function", "run"), self._emulator)
 
     def wait_received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
@@ -268,13 +271,16 @@ class ThreadedCamera(_InLoop):
         Raises:
             ResponseTimeoutError: they did not come in time.
         """
-        work = self._emulator.wait_received(what, count=count, timeout=timeout)
-        self._thread.wait(work, timeout + CALL_TIMEOUT)
+        timeout = check_seconds(timeout, "timeout", "wait_received")
+        self._thread.call(
+            lambda: self._emulator.wait_received(what, count=count, timeout=timeout),
+            timeout + CALL_TIMEOUT,
+        )
 
     async def received(
         self, what: int | type[Message], *, count: int = 1, timeout: float = 5.0
     ) -> None:
-        """As :meth:`wait_received`, in a coroutine of asyncio or, with anyio, of trio.
+        """Wait as :meth:`wait_received` does, in a coroutine of asyncio or, with anyio, of trio.
 
         Raises:
             ResponseTimeoutError: they did not come in time.
@@ -311,7 +317,7 @@ class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
 
     Args:
         scenarios: the path of a scenario file, or scenarios.
-        options: those of :class:`~smartcam.emulator.EmulatedFleet`.
+        options: options of :class:`~smartcam.emulator.EmulatedFleet`.
 
     Raises:
         ConfigurationError: something given is wrong.

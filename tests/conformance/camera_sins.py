@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 from smartcam.emulator import _client_link as client_link
 from smartcam.models import Status
+from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.framing import Frame
 
 Emulator = Any  # its inside is changed here
 

@@ -101,11 +101,11 @@ def emulated(
     emulator = EmulatedCamera(**given)
     if sin is not None:
         sin(emulator)
-    thread.wait(emulator.start())
+    thread.call(emulator.start)
     try:
         yield emulator
     finally:
-        thread.wait(emulator.stop())
+        thread.call(emulator.stop)
 
 
 def judge_case(thread: LoopThread, case: Case) -> CameraReport:

@@ -308,7 +308,7 @@ def test_judge_item_interrupted_puts_application_and_run_mode_back(
         camera = CameraUnderTest(short_options(emulator.url))
         with pytest.raises(KeyboardInterrupt):
             judge_item(camera, item)
-        thread.wait(emulator.wait_received(m.Disconnect, count=2, timeout=60), timeout=120)
+        thread.call(lambda: emulator.wait_received(m.Disconnect, count=2, timeout=60), timeout=120)
         assert emulator.device.active_application == APPLICATION
         assert emulator.device.running == (running or dialect == "bid")
         assert not emulator.has_session
@@ -320,7 +320,7 @@ def test_judge_camera_that_dies_says_what_could_not_be_put_back(thread: LoopThre
     def dies(camera: CameraUnderTest) -> None:
         with camera.session() as client:
             camera.stop(client)
-            thread.wait(emulator.stop())
+            thread.call(emulator.stop)
             client.fence()
 
     item = Check(name="dies", about="", sources={"": "x, y"}, run=dies)
@@ -376,11 +376,11 @@ def test_allow_read_names_what_may_be_done(text: str, names: list[str]) -> None:
 @pytest.mark.parametrize(
     ("fields", "text"),
     [
-        ({"timeout": 0}, "timeout is 0: expected seconds, more than 0 and at most 3600"),
-        ({"quiet": float("nan")}, "quiet is nan: expected seconds, more than 0"),
-        ({"application": 0}, "application is 0: expected an id, 1 or more"),
+        ({"timeout": 0}, "timeout: expected seconds, above 0 to 3600, got 0"),
+        ({"quiet": float("nan")}, "quiet: expected seconds, above 0 to 3600, got nan"),
+        ({"application": 0}, "application: expected an integer, 1 to 4294967295, got 0"),
         ({"application": 3, "other_application": 3}, "both applications are 3: name another one"),
-        ({"sequence_offset": -1}, "sequence_offset is -1: expected 0 to 65535"),
+        ({"sequence_offset": -1}, "sequence_offset: expected an integer, 0 to 65535, got -1"),
         ({"input_data": bytes(65_537)}, "input_data has 65537 bytes: 65536 at most"),
     ],
 )

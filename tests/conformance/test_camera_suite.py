@@ -86,7 +86,7 @@ def in_package(folder: pytest.Pytester, *arguments: str) -> tuple[str, int]:
 def test_suite_without_a_camera_skips_and_says_what_to_type(folder: pytest.Pytester) -> None:
     printed, code = in_package(folder)
     assert code == 0
-    assert "[64] " in printed
+    assert "[65] " in printed
     assert (
         "no camera was named: pytest --pyargs smartcam.conformance.camera "
         "--camera-url bvs://HOST" in printed
@@ -215,13 +215,16 @@ def test_suite_that_is_broken_off_leaves_the_camera_as_it_was(
             *("--pyargs", "smartcam.conformance.camera", "--camera-url", emulator.url),
             *("--camera-quiet", "60", "-k", "second-stop"),
         )
-        thread.wait(emulator.wait_received(m.Stop, count=2, timeout=PATIENCE), timeout=2 * PATIENCE)
+        thread.call(
+            lambda: emulator.wait_received(m.Stop, count=2, timeout=PATIENCE), timeout=2 * PATIENCE
+        )
         assert not thread.run(lambda: emulator.device.running)
         process.send_signal(signal.SIGINT)
         printed, _ = process.communicate(timeout=PATIENCE)
         assert process.returncode == pytest.ExitCode.INTERRUPTED
         assert "found with application 5, in run mode; left so" in printed
         assert thread.run(lambda: emulator.device.running)
-        thread.wait(
-            emulator.wait_received(m.Disconnect, count=3, timeout=PATIENCE), timeout=2 * PATIENCE
+        thread.call(
+            lambda: emulator.wait_received(m.Disconnect, count=3, timeout=PATIENCE),
+            timeout=2 * PATIENCE,
         )

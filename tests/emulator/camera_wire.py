@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import socket
-from collections.abc import Callable
 from typing import Self
 
 from smartcam.emulator import Device, EmulatedCamera
 from smartcam.models import Status
 from smartcam.protocols import messages as m
+from tests.emulator.stream_client import TIMEOUT, StreamClient
 
 MAGIC = bytes.fromhex("50535642")
 THESIS_MAGIC = bytes.fromhex("42565350")
@@ -52,8 +52,6 @@ RESULT_3 = bytes.fromhex(  # derived
     "50535642 19000000 20000000 03000000 ff 02000000 0000cb42 000050c0 4142430000000000"
 )
 
-TIMEOUT = 5.0
-
 
 def thesis(frame: bytes) -> bytes:
     """Return a handbook frame as the thesis writes it: other magic, the length counts the id."""
@@ -61,56 +59,13 @@ def thesis(frame: bytes) -> bytes:
     return THESIS_MAGIC + length.to_bytes(4, "little") + frame[8:]
 
 
-async def until(condition: Callable[[], bool]) -> None:
-    """Let the loop turn until ``condition`` holds."""
-    async with asyncio.timeout(TIMEOUT):
-        while not condition():  # noqa: ASYNC110  what is waited for has no event to set
-            await asyncio.sleep(0)
-
-
-class TcpClient:
+class TcpClient(StreamClient):
     """A plain TCP client."""
-
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader = reader
-        self.writer = writer
-
-    @classmethod
-    async def open(cls, emulator: EmulatedCamera) -> Self:
-        async with asyncio.timeout(TIMEOUT):
-            return cls(*await asyncio.open_connection(emulator.host, emulator.port))
-
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        self.writer.transport.abort()
-        # the transport lets go of its socket in the loop's next round
-        await asyncio.sleep(0)
-
-    def send(self, *frames: bytes) -> None:
-        self.writer.write(b"".join(frames))
-
-    async def expect(self, *frames: bytes) -> None:
-        """Read exactly these bytes."""
-        for expected in frames:
-            async with asyncio.timeout(TIMEOUT):
-                got = await self.reader.readexactly(len(expected))
-            assert got.hex(" ") == expected.hex(" ")
 
     async def expect_nothing_but(self, request: bytes, answer: bytes) -> None:
         """See that nothing was on its way: the next bytes answer ``request``."""
         self.send(request)
         await self.expect(answer)
-
-    async def expect_end(self) -> None:
-        """See that the camera closes the connection and says nothing more."""
-        async with asyncio.timeout(TIMEOUT):
-            try:
-                rest = await self.reader.read()
-            except ConnectionResetError:
-                rest = b""
-        assert rest == b""
 
 
 class RawClient:

@@ -7,10 +7,11 @@ from typing import Any
 import pytest
 
 from smartcam.emulator import ManualClock, faults
-from smartcam.emulator.faults._delay_line import DelayLine, Ending, Transmission
+from smartcam.emulator._inside import DelayLine, Ending, Transmission
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults, cut, cut_datagram
-from smartcam.protocols._bvs import HANDBOOK, THESIS
-from smartcam.protocols._framed.framing import Frame, Framer
+from smartcam.protocols import Frame
+from smartcam.protocols._bvs import THESIS
+from smartcam.protocols._inside import HANDBOOK, Framer
 
 
 class Line:

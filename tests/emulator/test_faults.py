@@ -9,13 +9,15 @@ import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from smartcam.emulator import EmulatedCamera, ManualClock, faults
+from smartcam.emulator._inside import MESSAGE_NAMES, BaseFault, DeviceFault
 from smartcam.emulator.faults import _matching as matching
-from smartcam.emulator.faults._base import MESSAGE_NAMES, BaseFault, DeviceFault, WireFault
+from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.exceptions import ConfigurationError
+from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import HANDBOOK, MESSAGES
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._bvs import MESSAGES
+from smartcam.protocols._inside import HANDBOOK
 
 EXAMPLES: list[dict[str, Any]] = [
     {"kind": "delay", "seconds": 0.5, "overtaken": True},

@@ -10,11 +10,12 @@ import pytest
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
 from smartcam.emulator._client_link import SecondClientSession
 from smartcam.models import Status
+from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import HANDBOOK
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
-from tests.emulator.camera_wire import RawClient, UdpClient, heard, until
+from tests.emulator.camera_wire import RawClient, UdpClient, heard
+from tests.handmade import until
 
 HELLO = (wire.CONNECTED, wire.WAITING)
 

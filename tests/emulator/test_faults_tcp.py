@@ -12,7 +12,8 @@ import pytest
 from smartcam.emulator import EmulatedCamera, ManualClock, faults
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
-from tests.emulator.camera_wire import RawClient, until
+from tests.emulator.camera_wire import RawClient
+from tests.handmade import until
 
 
 @pytest.fixture
@@ -101,7 +102,7 @@ async def test_delay_of_the_clients_message_is_before_the_camera_hears_it(
     assert await session.receive() == wire.WAITING + wire.ACTIVE_1
     assert [(e.time, e.fault) for e in emulator.log if e.message == m.Start()] == [(2.0, "delay")]
     listener: Any = emulator._listener
-    assert [link._faulty for link in listener.links] == [None]
+    assert [link._faulty for link in listener.all_links] == [None]
 
 
 async def test_delay_of_the_clients_message_overtaken(
@@ -129,7 +130,7 @@ async def test_delay_of_the_clients_message_delays_the_end_behind_it(
         assert not emulator.device.running
         return
     listener: Any = emulator._listener
-    (link,) = listener.links
+    (link,) = listener.all_links
     session.socket.shutdown(socket.SHUT_WR)
     await until(lambda: link._end_waits)
     clock.advance(2)
@@ -172,7 +173,7 @@ async def test_split_without_a_pause_is_two_writes(
     emulator: EmulatedCamera, session: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     listener: Any = emulator._listener
-    (link,) = listener.links
+    (link,) = listener.all_links
     written: list[bytes] = []
     write = link._transport.write
 
@@ -416,7 +417,7 @@ async def test_close_is_orderly_with_unread_bytes_and_waits_for_the_client(
 async def test_close_waits_for_the_client_no_longer_than_the_farewell(
     emulator: EmulatedCamera, session: RawClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("smartcam.emulator._links.FAREWELL", 0.05)
+    monkeypatch.setattr("smartcam.emulator._links.CLOSE_TIMEOUT", 0.05)
     emulator.inject(faults.Close(on="QueryAnswer"))
     session.send(wire.QUERY)
     await session.expect_fin()
@@ -683,7 +684,7 @@ async def test_faults_given_in_the_middle_of_a_frame_leave_that_frame(
     emulator: EmulatedCamera, session: RawClient
 ) -> None:
     listener: Any = emulator._listener
-    (link,) = listener.links
+    (link,) = listener.all_links
     session.send(wire.QUERY[:7])
     await until(lambda: link.machine.buffered == 7)
     emulator.inject(faults.Drop(on="Query"), faults.Drop(on="GetClock"))
@@ -697,7 +698,7 @@ async def test_short_way_is_taken_again_when_no_fault_waits(
     emulator: EmulatedCamera, session: RawClient
 ) -> None:
     listener: Any = emulator._listener
-    (link,) = listener.links
+    (link,) = listener.all_links
     emulator.inject(faults.Drop(on="Query", nth=2))
     session.send(wire.QUERY, wire.QUERY[:5])
     await session.expect(wire.ACTIVE_1)

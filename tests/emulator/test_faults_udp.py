@@ -11,7 +11,8 @@ import pytest
 from smartcam.emulator import EmulatedCamera, ManualClock, faults
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
-from tests.emulator.camera_wire import UdpClient, until
+from tests.emulator.camera_wire import UdpClient
+from tests.handmade import until
 
 
 @pytest.fixture

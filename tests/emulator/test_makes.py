@@ -9,10 +9,10 @@ import pytest
 
 import smartcam.sync
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight, Scenario
-from smartcam.emulator._generators import _FOUND, find_generator
-from smartcam.emulator._makes import check_options, emulated_class
+from smartcam.emulator._generators import _FOUND
+from smartcam.emulator._inside import check_options, emulated_class, find_generator
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
-from smartcam.protocols._bvs import BVS
+from smartcam.protocols import BVS
 from smartcam.registry import GENERATORS, PROTOCOLS
 from smartcam.testing import ThreadedCamera
 

@@ -19,18 +19,18 @@ from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults
 from smartcam.models import Status
+from smartcam.protocols import Frame, Machine, Role
+from smartcam.protocols import Transport as CarriedBy
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role
-from smartcam.protocols._base import Transport as CarriedBy
-from smartcam.protocols._bvs import HANDBOOK, MESSAGES, THESIS
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols._bvs import MESSAGES, THESIS
+from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
-from tests.emulator.camera_wire import RawClient, UdpClient, until
+from tests.emulator.camera_wire import RawClient, UdpClient
+from tests.handmade import until
 
 if TYPE_CHECKING:
-    from smartcam.emulator._client_link import ClientLink, Trace
-    from smartcam.emulator._clock import Clock
+    from smartcam.emulator._client_link import Trace
+    from smartcam.emulator._inside import ClientLink, Clock
 
 ECHO = Application(
     id=4, layout="s: string[2], b: bool", input="s: string[2], b: bool", generator="input"
@@ -244,9 +244,19 @@ class Owner:
         pass
 
 
+class OpenHouse(TcpListener):
+    """Has room for everybody, and no event loop."""
+
+    def enter(self, link: _TcpLink) -> str:
+        return ""
+
+    def leave(self, link: _TcpLink) -> None:
+        pass
+
+
 def open_link() -> tuple[_TcpLink, Owner]:
     owner = Owner()
-    listener = TcpListener(owner)
+    listener = OpenHouse(owner)
     listener.down = False
     link = _TcpLink(listener, owner)
     link.connection_made(Transport())

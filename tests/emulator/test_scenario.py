@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pydantic import ValidationError
@@ -118,10 +117,7 @@ def test_file_that_is_no_text(tmp_path: Path) -> None:
 
 
 def test_without_pyyaml_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> Any:
-        raise ImportError(name)
-
-    monkeypatch.setattr(importlib, "import_module", missing)
+    monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\[yaml\]"') as caught:
         load_scenario(BOLTS)
     assert caught.value.extra == "yaml"

@@ -13,10 +13,11 @@ import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
 from smartcam.emulator._client_link import MAX_INPUT
-from smartcam.emulator._links import LEAST_READ, MOST_READ
+from smartcam.emulator._links import FIRST_READ_BYTES, MAX_READ_BYTES
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
-from tests.emulator.camera_wire import TcpClient, until
+from tests.emulator.camera_wire import TcpClient
+from tests.handmade import until
 
 
 @pytest.fixture
@@ -215,7 +216,7 @@ async def test_tcp_answers_of_one_step_come_in_one_segment(
 
 async def test_tcp_has_no_delay(session: TcpClient, emulator: EmulatedCamera) -> None:
     listener: Any = emulator._listener
-    (link,) = listener.links
+    (link,) = listener.all_links
     sock = link._transport.get_extra_info("socket")
     assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
@@ -403,8 +404,8 @@ async def test_tcp_client_without_a_session_holds_one_frame_at_most(
     half = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
     half += bytes(MAX_INPUT - 1)
     client.send(bomb, bytes(3 * MAX_INPUT), half)
-    await until(lambda: len(listener.links) == 1)
-    (link,) = listener.links
+    await until(lambda: len(listener.all_links) == 1)
+    (link,) = listener.all_links
     await until(lambda: link.machine.buffered == len(half))
     client.send(b"!")  # which makes it a whole one
     await emulator.wait_received(0x21)
@@ -414,7 +415,7 @@ async def test_tcp_client_without_a_session_holds_one_frame_at_most(
 async def test_tcp_more_requests_than_a_read_takes_are_all_answered_in_order(
     session: TcpClient,
 ) -> None:
-    count = 3 * LEAST_READ // len(wire.QUERY)
+    count = 3 * FIRST_READ_BYTES // len(wire.QUERY)
     session.send(wire.QUERY * count, wire.GET_CLOCK)
     await session.expect(wire.ACTIVE_1 * count, wire.CLOCK_0)
 
@@ -422,7 +423,7 @@ async def test_tcp_more_requests_than_a_read_takes_are_all_answered_in_order(
 async def test_tcp_idle_connection_has_a_small_buffer_also_after_a_long_input(
     emulator: EmulatedCamera, session: TcpClient
 ) -> None:
-    (link,) = cast("Any", emulator._listener).links
+    (link,) = cast("Any", emulator._listener).all_links
     sizes = {len(link._room)}
     data = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
     for count in range(1, 4):
@@ -430,20 +431,22 @@ async def test_tcp_idle_connection_has_a_small_buffer_also_after_a_long_input(
         await emulator.wait_received(0x21, count=count)
         sizes.add(len(link._room))
         await session.expect_nothing_but(wire.GET_CLOCK, wire.CLOCK_0)
-    assert len(link._room) == LEAST_READ
-    assert max(sizes) <= MOST_READ
+    assert len(link._room) == FIRST_READ_BYTES
+    assert max(sizes) <= MAX_READ_BYTES
 
 
-@pytest.mark.parametrize("sizes", [[1], [LEAST_READ - 1, LEAST_READ, LEAST_READ + 1], [5000, 3]])
+@pytest.mark.parametrize(
+    "sizes", [[1], [FIRST_READ_BYTES - 1, FIRST_READ_BYTES, FIRST_READ_BYTES + 1], [5000, 3]]
+)
 async def test_tcp_buffer_gives_what_was_written_into_it(
     emulator: EmulatedCamera, session: TcpClient, sizes: list[int]
 ) -> None:
-    (link,) = cast("Any", emulator._listener).links
+    (link,) = cast("Any", emulator._listener).all_links
     rest = wire.QUERY * 500
     while rest:  # as a loop does it: a read fills the buffer as far as there is anything
         for size in sizes:
             room = link.get_buffer(-1)
-            assert LEAST_READ <= len(room) <= MOST_READ
+            assert FIRST_READ_BYTES <= len(room) <= MAX_READ_BYTES
             count = min(size, len(room), len(rest))
             room[:count], rest = rest[:count], rest[count:]
             link.buffer_updated(count)

@@ -10,9 +10,9 @@ from smartcam.emulator import EmulatedCamera, LogEntry
 from smartcam.emulator._client_link import MAX_INPUT
 from smartcam.emulator._traffic import MAX_BYTES, MAX_ENTRIES, MAX_IDS, Log, TrafficLog
 from smartcam.exceptions import FrameError, ResponseTimeoutError
+from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import HANDBOOK
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient
 

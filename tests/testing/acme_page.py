@@ -24,8 +24,8 @@ def _file(name: str) -> str:
 
 MODULE = _file("acme_camera.py")
 """The module in one file."""
-TESTS = _file("test_acme.py")
-"""Its tests."""
+TESTS = (ROOT / "examples/smartcam-acme/tests/test_acme.py").read_text(encoding="utf-8")
+"""Its tests, of which the page shows a part."""
 
 _made = types.ModuleType("acme_camera")
 exec(compile(MODULE, str(PAGE), "exec", dont_inherit=True), vars(_made))  # noqa: S102

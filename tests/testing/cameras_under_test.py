@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from smartcam.emulator import EmulatedCamera
-from smartcam.emulator._insight.camera import EmulatedInSight
+from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.testing import COUNTER, ECHO, FREE, OTHER, SLOW, SLOW_TIME, CameraKind, LiveCamera
 
 FREE_RATE = 200.0
@@ -66,12 +66,20 @@ class _BvsSite(LiveCamera):
 
 
 def _bvs(
-    name: str, transport: Literal["tcp", "udp"], dialect: str, quirks: dict[str, Any]
+    name: str,
+    transport: Literal["tcp", "udp"],
+    dialect: str,
+    quirks: dict[str, Any],
+    *,
+    alone: bool = False,
 ) -> CameraKind:
+    """Return a kind of camera; ``alone``: it has ``COUNTER`` and nothing else."""
+    applications = _APPLICATIONS[:1] if alone else _APPLICATIONS
+
     @contextlib.asynccontextmanager
     async def put_up() -> AsyncIterator[LiveCamera]:
         async with EmulatedCamera(
-            _APPLICATIONS,
+            applications,
             transport=transport,
             dialect=dialect,
             quirks=quirks,
@@ -80,7 +88,9 @@ def _bvs(
         ) as emulator:
             yield _BvsSite(emulator)
 
-    return CameraKind(name=f"{name} over {transport}", open=put_up, datagrams=transport == "udp")
+    kind = CameraKind(name=f"{name} over {transport}", open=put_up, datagrams=transport == "udp")
+    ids = frozenset(one["id"] for one in applications)
+    return dataclasses.replace(kind, applications=ids)
 
 
 # ---------------------------------------------------------------------- In-Sight
@@ -164,6 +174,7 @@ BVS_WORLDS = tuple(
     for name, dialect, quirks in _DIALECTS
     for transport in _TRANSPORTS
 )
+LONELY_WORLDS = (_bvs("one application", "tcp", "handbook", {}, alone=True),)
 INSIGHT_WORLDS = (
     CameraKind(
         name="In-Sight native mode",

@@ -6,13 +6,14 @@ import asyncio
 import contextlib
 import socket
 import struct
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Any, NamedTuple
 
 import pytest
 
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy._rules import Rule
+from smartcam.testing.proxy import Rule
+from tests.handmade import until
 
 HOST = "127.0.0.1"
 SHORT = 0.05
@@ -22,13 +23,6 @@ OFFSETS = [0, 5, len(MESSAGE)]
 """Points: before the first byte, in the middle, behind the last."""
 PLACES = [0, 5, len(MESSAGE) - 1]
 """Bytes: the first, one in the middle, the last."""
-
-
-async def until(condition: Callable[[], object], seconds: float = 5) -> None:
-    """Let the loop run until something is true."""
-    async with asyncio.timeout(seconds):
-        while not condition():  # noqa: ASYNC110 - whatever the condition is
-            await asyncio.sleep(0)
 
 
 class End(asyncio.Protocol):

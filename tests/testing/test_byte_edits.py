@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.testing.proxy._byte_edits import BOTH_STALL, CUT, RESET, STALL, Edit, Editor
-from smartcam.testing.proxy._rules import (
+from smartcam.testing.proxy import (
     CoalesceBytes,
     Cut,
     Drip,
@@ -19,12 +18,12 @@ from smartcam.testing.proxy._rules import (
     DuplicateBytes,
     Flip,
     InsertBytes,
-    PointRule,
-    RangeRule,
     ResetConnection,
     SplitBytes,
     Stall,
 )
+from smartcam.testing.proxy._byte_edits import BOTH_STALL, CUT, RESET, STALL, Edit, Editor
+from smartcam.testing.proxy._rules import PointRule, RangeRule
 
 DATA = b"0123456789"
 

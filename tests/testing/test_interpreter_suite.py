@@ -14,11 +14,11 @@ import pytest
 from smartcam.exceptions import InterpretationError
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader
 from smartcam.interpreters._basic import RecordInterpreter, TableInterpreter
-from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 from smartcam.registry import INTERPRETERS
-from smartcam.testing._suites.interpreters import ContainerSample, InterpreterSuite
+from smartcam.testing import ContainerSample, InterpreterSuite
 from tests import ROOT
 
 pytest_plugins = ["pytester"]

@@ -12,7 +12,7 @@ import pytest
 import smartcam
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
-from smartcam.testing._threads import ThreadedCamera
+from smartcam.testing import ThreadedCamera
 from tests.processes import PATIENCE, wait_until
 
 pytestmark = pytest.mark.real_time

@@ -18,13 +18,17 @@ from smartcam.exceptions import SmartCamError
 from smartcam.models import Status
 from smartcam.testing import CameraKind, CameraSuite, LiveCamera
 from smartcam.testing._suites.protocols.client_checks import in_a_loop
-from tests.testing.cameras_under_test import BVS_WORLDS, INSIGHT_WORLDS
+from tests.testing.cameras_under_test import BVS_WORLDS, INSIGHT_WORLDS, LONELY_WORLDS
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.widest]
 
 
 class TestBvs(CameraSuite):
     camera_kinds = BVS_WORLDS
+
+
+class TestOneApplication(CameraSuite):
+    camera_kinds = LONELY_WORLDS
 
 
 class TestInSight(CameraSuite):

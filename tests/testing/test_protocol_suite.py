@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
+from smartcam.protocols import BVS, INSIGHT, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport
-from smartcam.protocols._bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols._insight.dialect import INSIGHT
-from smartcam.protocols._insight.machine import ONLINE
-from smartcam.testing import WireSuite
-from smartcam.testing._suites.protocols.conversations import Came, Conversation, Sent, Step
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._inside import HANDBOOK, ONLINE
+from smartcam.testing import Came, Conversation, Sent, WireSuite
+from smartcam.testing._suites.protocols.conversations import Step
 from tests import ROOT
 from tests.protocols.insight_lines import BITMAP, GREETING, IMAGE_LINES
 from tests.testing.acme_page import MODULE, TESTS, acme_is_known
@@ -25,7 +24,7 @@ from tests.testing.acme_page import MODULE, TESTS, acme_is_known
 if TYPE_CHECKING:
     import pytest
 
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
 
 pytest_plugins = ["pytester"]
 
@@ -186,7 +185,6 @@ OPTIONS = ("-p", "no:cacheprovider", "-rs", "-o", "asyncio_default_fixture_loop_
 
 def test_page_shows_the_example_word_by_word() -> None:
     assert (EXAMPLE / "acme_camera.py").read_text(encoding="utf-8") == MODULE
-    assert (EXAMPLE / "tests" / "test_acme.py").read_text(encoding="utf-8") == TESTS
 
 
 def test_camera_of_the_page_takes_about_forty_lines() -> None:

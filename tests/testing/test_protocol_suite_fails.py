@@ -13,15 +13,20 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, FrameError, LocalProtocolError
 from smartcam.models import Capabilities, Status
+from smartcam.protocols import (
+    CodeMeaning,
+    Frame,
+    FramedDialect,
+    Protocol,
+    State,
+    Transport,
+    Verdict,
+)
+from smartcam.protocols import LineDialect as Dialect
+from smartcam.protocols import LineMachine as Machine
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import CodeMeaning, Protocol, Transport, Verdict
-from smartcam.protocols._bvs import HANDBOOK
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import State
-from smartcam.protocols._lines import LineDialect as Dialect
-from smartcam.protocols._lines import LineMachine as Machine
-from smartcam.protocols._lines import _AskedLine
+from smartcam.protocols._inside import HANDBOOK
+from smartcam.protocols._lines import _OpenRequest
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 from smartcam.testing._suites.protocols.words import ABILITIES
 from tests.testing.acme_page import acme, acme_is_known
@@ -63,6 +68,12 @@ def fails(check: str, protocol: Protocol, **arguments: Any) -> str:
     except (AssertionError, pytest.fail.Exception, ConfigurationError) as error:
         return str(error)
     raise AssertionError(f"{check} found nothing")
+
+
+def test_failure_says_what_was_expected_in_words() -> None:
+    said = fails("test_protocol_describes_itself", changed(schemes={}))
+    assert said.startswith("expected: protocol describes itself. ")
+    assert "\nfound otherwise: schemes: expected at least one" in said
 
 
 # ---------------------------------------------------------------------- dialects
@@ -233,17 +244,17 @@ class Talkative(Machine):
 
 
 class Nonsense(Machine):
-    def _read(self, line: str) -> m.Message:
+    def _read(self, line: str) -> None:
         try:
-            return super()._read(line)
+            super()._read(line)
         except FrameError:
-            return m.Trigger()
+            self._events.append(m.Trigger())
 
 
 class Verbose(Machine):
-    def _read(self, line: str) -> m.Message:
+    def _read(self, line: str) -> None:
         try:
-            return super()._read(line)
+            super()._read(line)
         except FrameError:
             raise FrameError("what? " * 200) from None
 
@@ -281,18 +292,23 @@ class KeepsFailed(Machine):
 class Willing(Machine):
     """Sends whatever the state is."""
 
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
         if isinstance(message, m.Query):
             self._outbox.append(b"PROGRAM\n")
             row = self.dialect.row(m.Query)
             assert row is not None
-            self._asked.append(_AskedLine(row, row.line))
+            script = self.dialect.script(row, message)
+            self._asked.append(_OpenRequest(row, script, next(script), said=True))
         else:
             super().send(message, answered=answered)
 
 
 class Touchy(Machine):
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
         if self.state is State.IDLE and isinstance(message, m.Disconnect):
             raise LocalProtocolError("not yet")
         super().send(message, answered=answered)
@@ -301,33 +317,40 @@ class Touchy(Machine):
 class Obliging(Machine):
     """Takes what it has not."""
 
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
         if not isinstance(message, m.Reboot):
             super().send(message, answered=answered)
 
 
 class Impatient(Machine):
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
-        asked, self._asked = self._asked, type(self._asked)()
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
+        asked, self._asked = self._asked, []
         try:
             super().send(message, answered=answered)
         finally:
-            self._asked.extendleft(reversed(asked))
+            self._asked[:0] = asked
 
 
 class Credulous(Machine):
     """Knows an answer by its looks."""
 
-    def _read(self, line: str) -> m.Message:
+    def _read(self, line: str) -> None:
         if line.isdecimal() and not self._asked:
-            return m.QueryAnswer(application=int(line))
-        return super()._read(line)
+            self._events.append(m.QueryAnswer(application=int(line)))
+        else:
+            super()._read(line)
 
 
 class Restless(Machine):
     """Speaks after Disconnect."""
 
-    def send(self, message: m.Message, *, answered: bool | None = None) -> None:
+    def send(
+        self, message: m.Message, *, answered: bool | None = None, again: bool = False
+    ) -> None:
         if not isinstance(message, m.Disconnect):
             super().send(message, answered=answered)
 

@@ -13,16 +13,13 @@ import smartcam
 from smartcam import ConfigurationError, ConnectFailedError, TriggerTimeoutError
 from smartcam.emulator import EmulatedCamera
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import _log as log
-from smartcam.testing.proxy._log import Entry
-from smartcam.testing.proxy._rules import (
-    MAX_COPY,
-    MAX_HOLD,
+from smartcam.testing.proxy import (
     CoalesceBytes,
     Cut,
     DelayBytes,
     Drip,
     DuplicateBytes,
+    Entry,
     Flip,
     InsertBytes,
     Late,
@@ -33,6 +30,8 @@ from smartcam.testing.proxy._rules import (
     SplitBytes,
     Stall,
 )
+from smartcam.testing.proxy import _log as log
+from smartcam.testing.proxy._rules import MAX_COPY, MAX_HOLD
 from tests.testing.proxykit import HOST, MESSAGE, SHORT, client, linked, target
 
 if TYPE_CHECKING:

@@ -17,17 +17,14 @@ import pytest
 
 from smartcam.emulator._clock import NANOSECONDS
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import _directions as directions
-from smartcam.testing.proxy import _tcp as tcp
-from smartcam.testing.proxy._log import Entry
-from smartcam.testing.proxy._rules import (
+from smartcam.testing.proxy import (
     CoalesceBytes,
     Cut,
     DelayBytes,
-    Direction,
     Drip,
     DropBytes,
     DuplicateBytes,
+    Entry,
     Flip,
     InsertBytes,
     Rate,
@@ -36,6 +33,10 @@ from smartcam.testing.proxy._rules import (
     SplitBytes,
     Stall,
 )
+from smartcam.testing.proxy import _directions as directions
+from smartcam.testing.proxy import _tcp as tcp
+from smartcam.testing.proxy._rules import Direction
+from tests.handmade import until
 from tests.testing.proxykit import (
     HOST,
     MESSAGE,
@@ -48,7 +49,6 @@ from tests.testing.proxykit import (
     raw_client,
     rest_of,
     target,
-    until,
 )
 
 BEHIND = b"abc"
@@ -197,11 +197,27 @@ async def test_many_connections_keep_their_bytes_apart() -> None:
 
 async def test_connections_beyond_the_limit_are_reset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "MAX_CONNECTIONS", 1)
-    async with linked() as (proxy, _, _):
+    async with linked() as (proxy, end, camera):
+        end.write(b"a")
+        await camera.wait_data(b"a")
+        camera.write(b"b")
+        await end.wait_data(b"b")
         with raw_client(proxy.port) as raw:
             assert await rest_of(raw) == (b"", "RST")
-        assert proxy.log[-1] == Entry("too many", 2)
+        assert proxy.log[-1] == Entry("turned away", 2)
         assert proxy.open_connections == 1
+
+
+async def test_connection_that_was_not_answered_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "MAX_CONNECTIONS", 1)
+    async with target(echo=True) as camera, LinkProxy(HOST, camera.port) as proxy:
+        with raw_client(proxy.port) as raw:
+            await proxy.wait_for("connect")
+            async with client(proxy.port) as newcomer:
+                assert await rest_of(raw) == (b"", "RST")
+                newcomer.write(b"a")
+                await newcomer.wait_data(b"a")
+            assert Entry("turned away", 1) in proxy.log
 
 
 async def test_large_transfers_both_ways_at_once_are_intact() -> None:

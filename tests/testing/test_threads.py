@@ -16,7 +16,7 @@ from smartcam._loop_thread import LoopThread
 from smartcam.emulator import EmulatedCamera, Scenario, faults
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from smartcam.protocols.messages import Connect, Query, Trigger
-from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
+from smartcam.testing import ThreadedCamera, ThreadedFleet
 
 pytestmark = pytest.mark.real_time
 
@@ -173,8 +173,8 @@ def test_call_that_does_not_return_is_given_up(monkeypatch: pytest.MonkeyPatch) 
 
     try:
         with pytest.raises(ResponseTimeoutError, match=r"smartcam.slow did not answer within 0.05"):
-            thread.wait(for_ever(), 0.05)
+            thread.call(for_ever, 0.05)
         with pytest.raises(TimeoutError, match="its own"):
-            thread.wait(too_late())
+            thread.call(too_late)
     finally:
         thread.stop()

@@ -12,10 +12,11 @@ import pytest
 
 from smartcam import ConfigurationError
 from smartcam.testing import LinkProxy
+from smartcam.testing.proxy import Entry, Late, Lose, Reorder, Repeat, Rule
 from smartcam.testing.proxy import _udp as udp
-from smartcam.testing.proxy._log import Entry
-from smartcam.testing.proxy._rules import Direction, Late, Lose, Reorder, Repeat, Rule
-from tests.testing.proxykit import HOST, SHORT, Mailbox, mailbox, until
+from smartcam.testing.proxy._rules import Direction
+from tests.handmade import until
+from tests.testing.proxykit import HOST, SHORT, Mailbox, mailbox
 
 FIVE = [b"1", b"2", b"3", b"4", b"5"]
 
@@ -220,17 +221,35 @@ async def test_ended_client_is_a_new_one_when_it_speaks_again(end: str) -> None:
         assert len(camera.peers) == proxy.counts["connect"] == 2
 
 
-async def test_too_many_clients_forget_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_client_that_was_answered_lately_keeps_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(udp, "MAX_CLIENTS", 1)
     async with linked() as (proxy, client, _), mailbox(proxy.port) as other:
-        for box in (client, other):
-            box.send(b"a")
-            await receives(box, [b"a"])
+        client.send(b"a")
+        await receives(client, [b"a"])
+        other.send(b"b")
+        await proxy.wait_for("turned away")
+        client.send(b"c")
+        await receives(client, [b"a", b"c"])
+        await asyncio.sleep(udp.ANSWERED_GRACE)
+        other.send(b"d")
+        await receives(other, [b"d"])
+        assert proxy.open_connections == 1
+
+
+async def test_client_that_was_never_answered_makes_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "MAX_CLIENTS", 1)
+    async with linked(echo=False) as (proxy, client, camera), mailbox(proxy.port) as other:
+        client.send(b"a")
+        await receives(camera, [b"a"])
+        other.send(b"b")
+        await receives(camera, [b"a", b"b"])
         assert proxy.open_connections == 1
 
 
 async def test_datagrams_held_back_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(udp, "MAX_WAITING", 2)
+    monkeypatch.setattr(udp, "MAX_WAITING_DATAGRAMS", 2)
     async with linked(Late(seconds=SHORT)) as (proxy, client, _):
         client.send(*FIVE)
         await proxy.wait_for("full", 3)

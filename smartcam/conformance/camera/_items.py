@@ -33,10 +33,10 @@ def _is_late(item: Item) -> tuple[bool, bool]:
 
 
 ITEMS: tuple[Item, ...] = tuple(sorted(_DECLARED, key=_is_late))
-"""Everything."""
+"""All checks and questions, in the order in which they are judged."""
 
 CHECKS: tuple[Check, ...] = tuple(item for item in ITEMS if isinstance(item, Check))
-"""The checks among them."""
+"""The checks among the items."""
 
 QUESTIONS: tuple[Question, ...] = tuple(item for item in ITEMS if isinstance(item, Question))
-"""The questions among them."""
+"""The questions among the items."""

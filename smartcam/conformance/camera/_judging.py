@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import check_all, check_kind, check_text
 from smartcam.conformance.camera._items import ITEMS
+from smartcam.conformance.camera._options import ConformanceOptions
 from smartcam.conformance.camera._raw_client import EndedError
 from smartcam.conformance.camera._report import CameraReport
 from smartcam.conformance.camera._results import (
@@ -23,10 +25,9 @@ from smartcam.exceptions import ConfigurationError
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from smartcam.conformance.camera._options import ConformanceOptions
 
 CONNECT_CHECK = "connect-is-answered"
-"""The check that says so where there is no camera at all; the others are not observed then."""
+"""The check that fails where there is no camera at all; the others are not observed then."""
 
 
 def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> CameraReport:
@@ -37,13 +38,17 @@ def judge(options: ConformanceOptions, names: Iterable[str] | None = None) -> Ca
     exception, such as Ctrl-C, ends it.
 
     Args:
-        options: what is asked for.
-        names: of the checks and questions; None for all.
+        options: options of the examination.
+        names: names of the checks and questions; None for all.
 
     Raises:
         ConfigurationError: the address cannot work, or a name is unknown.
     """
-    wanted = None if names is None else set(names)
+    check_kind(options, ConformanceOptions, "options", "ConformanceOptions", "judge")
+    wanted = None
+    if names is not None:
+        given = check_all(names, "names", "names of checks", "judge")
+        wanted = {check_text(name, "names", "judge") for name in given}
     unknown = sorted((wanted or set()) - {item.name for item in ITEMS})
     if unknown:
         raise ConfigurationError(f"there is no check or question {unknown[0]!r}")

@@ -1,4 +1,4 @@
-"""What is done to the camera once and looked at by several checks: inspections, switches, a reboot.
+"""Observe once what several checks look at: inspections, switches, a reboot.
 
 Each is made at most once for a camera, so that a part on the machine is not inspected twenty times.
 """
@@ -14,7 +14,7 @@ from smartcam.conformance.camera._raw_client import EndedError, RawClient
 from smartcam.conformance.camera._results import Differs, NotObserved, Undescribed
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -164,11 +164,11 @@ def inspection_time(camera: CameraUnderTest) -> float:
 
 
 def no_id(camera: CameraUnderTest) -> bool:
-    """Return whether result containers begin without the application's id: perhaps in ``b16``.
+    """Return True if result containers lack the application's id in front, as in some ``b16``.
 
     Raises:
         NotObserved: as :func:`inspection_time`.
-        Undescribed: some have it.
+        Undescribed: some containers begin with the id and others do not.
     """
     inspection_time(camera)  # there are results
     if camera.dialect != "b16":
@@ -291,7 +291,7 @@ def switch(camera: CameraUnderTest) -> Switch:
 
 
 def _wait_not_busy(camera: CameraUnderTest, client: RawClient, mark: int) -> None:
-    """Where a status with BUSY came, wait for the one without it."""
+    """Wait for a status without BUSY if the last one had it."""
     busy = camera.wire.bits.busy
     words = camera.wire.statuses(client.heard[mark:])
     if busy and any(one & busy for one in words) and words[-1] & busy:
@@ -352,7 +352,7 @@ def _wait_gone(camera: CameraUnderTest, client: RawClient) -> None:
 
 
 def _answers(camera: CameraUnderTest) -> bool:
-    """Whether a Connect is answered now."""
+    """Return True if a Connect is answered now."""
     try:
         with camera.link() as client:
             client.answer(m.Connect(), within=max(camera.options.quiet, REBOOT_POLL))

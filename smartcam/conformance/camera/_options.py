@@ -1,4 +1,4 @@
-"""What is asked for: the camera, what may be done to it, how long to wait."""
+"""The options of a judgement: the camera, the actions allowed, the times to wait."""
 
 from __future__ import annotations
 
@@ -6,6 +6,14 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import (
+    MAX_APPLICATION_ID,
+    check_bytes,
+    check_integer,
+    check_kind,
+    check_number,
+    check_text,
+)
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -20,7 +28,7 @@ side)."""
 
 
 class Allow(enum.Flag):
-    """What may be done to a camera.
+    """The actions that are allowed on a camera.
 
     ``RUN``, ``TRIGGER`` and ``SWITCH`` are allowed unless it is said otherwise: what they change is
     put back. The others leave something behind.
@@ -73,17 +81,17 @@ class Allow(enum.Flag):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConformanceOptions:
-    """What is asked for. Times are seconds.
+    """The options of a judgement. Times are seconds.
 
     Attributes:
         url: the camera's address; a dialect that it does not name is found out.
         application: id of the one that may be triggered, None for the one that is active.
         other_application: id of one that may be loaded beside it, None for none.
-        allow: what may be done to the camera.
-        timeout: how long an answer, a status or a result may take.
-        quiet: how long nothing comes where the camera is silent.
-        switch_timeout: how long it may take to load an application.
-        reboot_timeout: how long a restart may take.
+        allow: actions that are allowed at the camera.
+        timeout: longest time for an answer, a status or a result.
+        quiet: time without a message for which a silent camera is listened to.
+        switch_timeout: longest time for loading an application.
+        reboot_timeout: longest time for a restart.
         sequence_offset: where in the application's results the int32 stands that is the sequence
             number, counted behind the application's id; None where it is not in them.
         input_data: bytes that the application takes as input data, None where it takes none.
@@ -104,23 +112,25 @@ class ConformanceOptions:
     input_data: bytes | None = None
 
     def __post_init__(self) -> None:
+        check_text(self.url, "url", least=1)
+        check_kind(self.allow, Allow, "allow", "flags of Allow")
         for name in ("timeout", "quiet", "switch_timeout", "reboot_timeout"):
-            value = getattr(self, name)
-            if not 0 < value <= MAX_SECONDS:
-                raise ConfigurationError(
-                    f"{name} is {value!r}: expected seconds, more than 0 and at most "
-                    f"{MAX_SECONDS:g}"
-                )
-        for name in ("application", "other_application"):
-            value = getattr(self, name)
-            if value is not None and not 1 <= value <= 0xFFFFFFFF:
-                raise ConfigurationError(f"{name} is {value!r}: expected an id, 1 or more")
+            seconds = check_number(
+                getattr(self, name), name, 0, MAX_SECONDS, above=True, unit="seconds"
+            )
+            object.__setattr__(self, name, seconds)
+        for name, least, most in (
+            ("application", 1, MAX_APPLICATION_ID),
+            ("other_application", 1, MAX_APPLICATION_ID),
+            ("sequence_offset", 0, 0xFFFF),
+        ):
+            if getattr(self, name) is not None:
+                number = check_integer(getattr(self, name), name, least, most)
+                object.__setattr__(self, name, number)
         if self.other_application is not None and self.other_application == self.application:
             raise ConfigurationError(f"both applications are {self.application}: name another one")
-        if self.sequence_offset is not None and not 0 <= self.sequence_offset <= 0xFFFF:
-            raise ConfigurationError(
-                f"sequence_offset is {self.sequence_offset!r}: expected 0 to 65535"
-            )
+        if self.input_data is not None:
+            object.__setattr__(self, "input_data", check_bytes(self.input_data, "input_data"))
         if self.input_data is not None and len(self.input_data) > MAX_INPUT_DATA:
             raise ConfigurationError(
                 f"input_data has {len(self.input_data)} bytes: {MAX_INPUT_DATA} at most"
@@ -145,4 +155,4 @@ READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
     "--camera-sequence-offset": ("sequence_offset", int),
     "--camera-input": ("input_data", _read_hex),
 }
-"""Which field an option of the command line is, and what reads it."""
+"""Field of each option of the command line, and the function that reads the option."""

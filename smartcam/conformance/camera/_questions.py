@@ -28,7 +28,7 @@ from smartcam.conformance.camera._results import (
 from smartcam.conformance.camera._setting_checks import next_number
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from smartcam.conformance.camera._raw_client import RawClient
@@ -45,7 +45,7 @@ _OPEN = {"": "no document, open"}
 
 @question("SC-A28, SC-C40, T 3.1.1, published", documents=("C1", "C7"))
 def dialect(camera: CameraUnderTest) -> str:
-    """Which dialect the camera speaks, over what."""
+    """Dialect that the camera speaks, and its transport."""
     with camera.session():
         return f"{camera.dialect} over {camera.transport.upper()}"
 
@@ -113,8 +113,22 @@ def busy_while_processing(camera: CameraUnderTest) -> bool:
 
 
 @question(_OPEN, needs=Allow.TRIGGER, dialects=SMART)
+def hidden_triggers(camera: CameraUnderTest) -> bool:
+    """Waiting for Trigger stays set during an inspection."""
+    seen = set[bool]()
+    for one in inspections(camera):
+        fell, result, _ = one.places()
+        if result is None:
+            raise NotObserved("no result came")
+        seen.add(fell is None)
+    if len(seen) > 1:
+        raise Undescribed("the same each time", "it falls in some inspections only")
+    return seen.pop()
+
+
+@question(_OPEN, needs=Allow.TRIGGER, dialects=SMART)
 def overtriggered_time(camera: CameraUnderTest) -> float:
-    """How long Overtriggered stays set, seconds."""
+    """Time for which Overtriggered stays set, seconds."""
     seen = overtrigger(camera)
     if seen.rose_at is None:
         raise NotObserved("no trigger was reported as dropped")
@@ -137,7 +151,7 @@ def overtriggered_when_stopped(camera: CameraUnderTest) -> bool:
 
 @question(_OPEN, needs=Allow.RUN | Allow.TRIGGER, dialects=SMART)
 def stop_during_inspection(camera: CameraUnderTest) -> str:
-    """What comes of an inspection that Stop falls into."""
+    """Outcome of an inspection that Stop falls into."""
     takes = inspection_time(camera)
     with camera.session() as client:
         camera.ready(client)
@@ -160,7 +174,7 @@ def push_status(camera: CameraUnderTest) -> bool:
 
 @question("ID-a 227 against ID-b 216, published", dialects=("bid",), documents=("C4",))
 def ready_bit(camera: CameraUnderTest) -> str:
-    """Which bit of the status is Ready."""
+    """Bit of the status that is Ready."""
     with camera.session() as client:
         camera.once_waiting(client)
         word = client.look()
@@ -191,7 +205,7 @@ def switch_answer(camera: CameraUnderTest) -> str:
 
 @question(_OPEN, needs=Allow.RUN | Allow.SWITCH, dialects=SMART)
 def switch_while_running(camera: CameraUnderTest) -> str:
-    """What becomes of a switch while the application runs."""
+    """Outcome of a switch while the application runs."""
     with camera.session() as client:
         camera.load(client, camera.application)
         camera.start(client)
@@ -251,7 +265,7 @@ def big_endian_number(camera: CameraUnderTest) -> bool:
 
 @question(_OPEN, needs=Allow.INPUT | Allow.TRIGGER, dialects=SMART)
 def input_queue_depth(camera: CameraUnderTest) -> int:
-    """How many input containers are kept."""
+    """Number of input containers that are kept."""
     data = camera.options.input_data
     if data is None:
         raise NotObserved("it is not known what input data the application takes: --camera-input")
@@ -300,7 +314,7 @@ def _inspect(camera: CameraUnderTest, client: RawClient) -> None:
 
 @question("ID-a 58 against ID-a 227, published", dialects=("bid",), documents=("C3",))
 def disconnect_answer(camera: CameraUnderTest) -> str:
-    """Whether Disconnect is answered."""
+    """Answer to Disconnect, if there is one."""
     with camera.session() as client:
         client.fence()
         mark = len(client.heard)
@@ -316,7 +330,7 @@ def disconnect_answer(camera: CameraUnderTest) -> str:
 
 @question("ID-a 52 against ID-b 206, published", dialects=("bid",), documents=("C5",))
 def bad_message(camera: CameraUnderTest) -> str:
-    """Whether unknown ids and wrong lengths are answered with a code."""
+    """Answers to unknown ids and wrong lengths: a code, or none."""
     with camera.session() as client:
         client.fence()
         mark = len(client.heard)
@@ -339,7 +353,7 @@ def bad_message(camera: CameraUnderTest) -> str:
 
 @question(_OPEN, transports=("tcp",))
 def second_client(camera: CameraUnderTest) -> str:
-    """What a second TCP client's Connect meets."""
+    """Answer to a second TCP client's Connect."""
     with camera.session() as first, contextlib.ExitStack() as stack:
         try:
             second = stack.enter_context(camera.link())
@@ -366,7 +380,7 @@ def second_client(camera: CameraUnderTest) -> str:
 
 @question(_OPEN, dialects=("handbook", "thesis"), transports=("tcp",))
 def bad_frame(camera: CameraUnderTest) -> str:
-    """How a TCP stream goes on after bytes that are no frame."""
+    """Course of a TCP stream after bytes that are no frame."""
     longest = camera.wire.dialect.header.max_payload
     found = {
         "a wrong magic number": _after(camera, wrong_magic(camera)),
@@ -409,5 +423,5 @@ def _after(camera: CameraUnderTest, data: bytes) -> str:
 
 @question("MV31, published", needs=Allow.REBOOT, dialects=SMART)
 def reboot_time(camera: CameraUnderTest) -> float:
-    """How long a restart keeps the camera off the network, seconds."""
+    """Time for which a restart keeps the camera off the network, seconds."""
     return round(downtime(camera).seconds, 2)

@@ -12,7 +12,7 @@ from smartcam.conformance.camera._results import Differs, NotObserved
 from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
 from smartcam.exceptions import hex_excerpt
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from collections import deque
@@ -213,9 +213,9 @@ class RawClient:
         """Return the first frame that fits, of those that came behind ``mark`` or come now.
 
         Args:
-            fits: its id, or whether it is the one.
+            fits: id of the wanted message, or a function that is true for the wanted frame.
             within: seconds from now.
-            expected: what a difference says.
+            expected: text of the difference, where no such frame comes.
             mark: a length of :attr:`heard`; default: only what comes now.
 
         Raises:

@@ -1,4 +1,4 @@
-"""What came of it: for people, as YAML for a scenario, and as JSON."""
+"""Report a judgement: for people, as YAML for a scenario, and as JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import smartcam
 from smartcam.conformance.camera._results import CameraFinding, Check, CheckOutcome, Question
-from smartcam.emulator._bvs.quirks import Quirks
+from smartcam.emulator import Quirks
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ SAME_TIME = 0.2
 """Part by which a measured time may differ from a quirk's default and still be the same."""
 
 SAME_SECONDS = 0.02
-"""Seconds by which it may."""
+"""Seconds by which a measured time may differ so."""
 
 
 class CameraReport:
@@ -31,7 +31,7 @@ class CameraReport:
 
     Attributes:
         camera: the camera.
-        findings: what came of each check and question, in order.
+        findings: findings of each check and question, in order.
     """
 
     def __init__(self, camera: CameraUnderTest) -> None:
@@ -80,7 +80,7 @@ class CameraReport:
     # ------------------------------------------------------------------ as text
 
     def text(self) -> str:
-        """Return it for people."""
+        """Return the report as text for people."""
         lines = [*self._head(), *self._differences(), *self._answers(), *self._unseen()]
         return "\n".join([*lines, "", *self.yaml().splitlines(), ""])
 
@@ -161,7 +161,7 @@ class CameraReport:
     # ------------------------------------------------------------------ as JSON
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
+        """Return the report as JSON has it."""
         camera, before = self.camera, self.camera.before
         return {
             "smartcam": smartcam.__version__,

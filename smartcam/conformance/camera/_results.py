@@ -1,4 +1,4 @@
-"""What a check or a question is, and what comes of one.
+"""The checks and questions about a camera, and their outcomes.
 
 A *check* holds the camera against something that is documented, and fails where it differs. A
 *question* is open in the documents; its answer is a value, mostly one of
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.conformance._dialects import EVERY_DIALECT
 from smartcam.conformance.camera._options import Allow
-from smartcam.emulator._bvs.quirks import Quirks
+from smartcam.emulator import Quirks
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -44,7 +44,7 @@ class NotObserved(Exception):  # noqa: N818 - it is a verdict on the experiment
 
 
 class CheckOutcome(enum.Enum):
-    """What comes of a check or a question."""
+    """The outcome of a check or a question."""
 
     AS_DOCUMENTED = "as documented"
     DIFFERS = "differs"
@@ -134,7 +134,7 @@ def _described(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraFinding:
-    """What came of a check or a question."""
+    """A check or a question with its outcome."""
 
     item: Item
     outcome: CheckOutcome
@@ -149,11 +149,11 @@ class CameraFinding:
 
     @property
     def failed(self) -> bool:
-        """Whether the camera is not the documented one here."""
+        """True if the camera is not the documented one here."""
         return self.outcome in {CheckOutcome.DIFFERS, CheckOutcome.UNDESCRIBED}
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as JSON has it."""
+        """Return the finding as JSON has it."""
         row: dict[str, Any] = {
             "name": self.item.name,
             "about": self.item.about,

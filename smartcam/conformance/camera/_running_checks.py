@@ -16,7 +16,7 @@ from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._results import Differs, NotObserved, check
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest

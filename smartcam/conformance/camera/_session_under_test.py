@@ -12,11 +12,10 @@ from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._raw_client import MAX_TRAIL, EndedError, RawClient
 from smartcam.conformance.camera._results import Differs, NotObserved
 from smartcam.conformance.camera._wire import RawDialect
-from smartcam.doctor import _probing as probing
+from smartcam.doctor._inside import trials as probe_trials
 from smartcam.exceptions import ConfigurationError
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import load_protocol
-from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._inside import MessageId, load_protocol
 from smartcam.settings import parse_address
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
     from smartcam.conformance.camera._options import ConformanceOptions
     from smartcam.conformance.camera._wire import Heard
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
     from smartcam.settings import Address
 
 T = TypeVar("T")
@@ -37,11 +36,11 @@ DETECTION_TIMEOUT = 10.0
 """Seconds in which the dialect is found out."""
 
 RESTORE_TRIES = 2
-"""Sessions in which the state of before is put back."""
+"""Sessions tried for putting back the state of before."""
 
 
 class StateBefore(NamedTuple):
-    """What is put back."""
+    """The camera's state that is put back."""
 
     application: int  # id of the active one
     running: bool  # in run mode
@@ -78,12 +77,12 @@ class CameraUnderTest:
 
     @property
     def transport(self) -> str:
-        """What carries the frames: ``tcp`` or ``udp``."""
+        """Transport of the frames: ``tcp`` or ``udp``."""
         return "udp" if self._address.scheme.endswith("+udp") else "tcp"
 
     @property
     def address(self) -> Address:
-        """Where the camera is; the dialect is pinned once it is known."""
+        """Address of the camera; the dialect is pinned once it is known."""
         if self._wire is None:
             return self._address
         dialect = self._wire.dialect
@@ -265,7 +264,7 @@ class CameraUnderTest:
         return numbers[at]
 
     def running(self, client: RawClient) -> bool:
-        """Return whether the camera is in run mode; a BVS ID always is."""
+        """Return True if the camera is in run mode; a BVS ID always is."""
         return self.wire.is_bid or bool(client.look() & self.wire.bits.running)
 
     @property
@@ -415,7 +414,7 @@ async def _probe(address: Address) -> Address | str:
     """Return the address with its dialect, or what came of each try."""
     tried: list[str] = []
     found: Address | str | None = None
-    async with contextlib.aclosing(probing.trials(address, timeout=DETECTION_TIMEOUT)) as trials:
+    async with contextlib.aclosing(probe_trials(address, timeout=DETECTION_TIMEOUT)) as trials:
         async for trial in trials:
             if trial.address.scheme != address.scheme:
                 break

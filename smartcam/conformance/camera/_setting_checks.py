@@ -12,7 +12,7 @@ from smartcam.conformance.camera._options import Allow
 from smartcam.conformance.camera._results import Differs, NotObserved, check
 from smartcam.conformance.camera._wire import of_kind
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MessageId
+from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from smartcam.conformance.camera._raw_client import RawClient
@@ -23,10 +23,10 @@ UNKNOWN_APPLICATION = 0xFFFD
 """An id that no application has, in all probability; it fits 16 bits."""
 
 SECONDS_APART = timedelta(seconds=3)
-"""How far a clock may be off right after it was set: what the way and the next full second take."""
+"""Time by which a clock may be off right after it was set: the way, and the next full second."""
 
 A_DATE = datetime(2016, 6, 25, 10, 11, 12, tzinfo=UTC)
-"""The one of the published examples (MV30, ID-b 218). The camera has no time zone."""
+"""The date of the published examples (MV30, ID-b 218). The camera has no time zone."""
 
 
 # ---------------------------------------------------------------------- switching

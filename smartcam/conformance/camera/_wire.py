@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.exceptions import hex_excerpt
-from smartcam.protocols._bvs import MessageId
-from smartcam.protocols._framed.framing import Frame as LibraryFrame
+from smartcam.protocols import Frame as LibraryFrame
+from smartcam.protocols._inside import MessageId
 from smartcam.protocols.messages import Sender
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
     from smartcam.protocols.messages import Message
 
 MAX_BODY = 1 << 20
@@ -30,7 +30,7 @@ _REFUSALS = frozenset({(0x10,), (0x13,), (0x16,), (0x1A,)})
 
 
 class BadBytesError(Exception):
-    """What came is no frame of this dialect; the text says why."""
+    """The bytes that came are no frame of this dialect; the text says why."""
 
 
 class Heard(NamedTuple):
@@ -48,7 +48,7 @@ def of_kind(frames: Iterable[Heard], message_id: int) -> list[Heard]:
 
 @dataclass(frozen=True, slots=True)
 class Bits:
-    """What a status word says, as masks; 0 where no bit says it.
+    """Masks of a status word's bits by meaning; 0 where no bit has it.
 
     Source: SC-A30, SC-B33 (published) for smart cameras; ID-b 210 and the example of ID-a 227
     (published and derived) for BVS ID.
@@ -69,7 +69,7 @@ BITS: Mapping[str, Bits] = {
     "b16": _SMART_BITS,
     "bid": Bits(waiting=0x001, overtriggered=0x100, ready=0x20),
 }
-"""By dialect."""
+"""Status bits by dialect."""
 
 
 class RawDialect:
@@ -82,12 +82,12 @@ class RawDialect:
 
     @property
     def magic(self) -> bytes:
-        """What a frame begins with, nothing in the dialects with 16 bits."""
+        """Beginning of a frame, nothing in the dialects with 16 bits."""
         return self.dialect.header.magic
 
     @property
     def is_bid(self) -> bool:
-        """Whether it is the dialect of BVS ID."""
+        """True if the dialect is that of BVS ID."""
         return self.dialect.name == "bid"
 
     # ------------------------------------------------------------------ out

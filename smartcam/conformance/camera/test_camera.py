@@ -1,4 +1,4 @@
-"""What ``pytest --pyargs smartcam.conformance.camera`` runs."""
+"""The tests that ``pytest --pyargs smartcam.conformance.camera`` runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is judged: a rule in a scene, how much it matters, and where the camera's side stands.
+"""The rules for a client: the scene, the weight, and the state of the camera's side.
 
 Sources are the keys of the list in ``docs/sources.md``.
 """
@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 
 
 class Grade(enum.Enum):
-    """How much a check matters."""
+    """The weight of a check."""
 
     MUST = "must"
     """Without it the client is wrong: a test fails."""
     SHOULD = "should"
-    """It is better so; what the documents leave open, or what costs something: reported only."""
+    """The client is better with it; the documents leave it open, or it costs something: only
+    reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +43,7 @@ class ClientCheck:
     dialects: tuple[str, ...] = EVERY_DIALECT  # those it is about
 
     def applies(self, dialect: str, transport: str) -> bool:
-        """Whether it is about such a camera."""
+        """Return True if the check is about such a camera."""
         scene = self.scene
         return (
             dialect in self.dialects and dialect in scene.dialects and transport in scene.transports

@@ -1,4 +1,4 @@
-"""What was found of a client, for people: in a failed test, and at the end of a run."""
+"""Report on a client to people: in a failed test, and at the end of a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ClientFinding(NamedTuple):
-    """What a client did against a rule."""
+    """A breach of a rule by a client."""
 
     check: str
     grade: str  # ``must`` or ``should``
@@ -30,7 +30,7 @@ class ClientFinding(NamedTuple):
     said: str  # what the client printed
 
     def __str__(self) -> str:
-        """Return it as lines."""
+        """Return the finding as lines."""
         lines = [
             f"{self.check} ({self.grade}; {self.camera}): {self.wrong}",
             f"  task: {self.task}; camera: {self.scene}",
@@ -44,7 +44,7 @@ class ClientFinding(NamedTuple):
         return "\n".join(lines)
 
     def as_json(self) -> str:
-        """Return it as one line of JSON."""
+        """Return the finding as one line of JSON."""
         return json.dumps(self._asdict())
 
     @classmethod

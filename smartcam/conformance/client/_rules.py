@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.conformance.client._runs import ClientRun, Said
 
 GRACE = 0.05
-"""Seconds that a status takes to the client at most: what it says meanwhile it says without it."""
+"""Seconds that a status takes to the client at most: until then the client cannot know of it."""
 
 
 def _wrong_results(run: ClientRun) -> str | None:
@@ -122,7 +122,10 @@ def disconnects(run: ClientRun) -> str | None:
 
 
 def asks_one_at_a_time(run: ClientRun) -> str | None:
-    """The client has one request of a kind open at a time: answers do not say whose they are."""
+    """The client has one request of a kind open at a time: answers do not say whose they are.
+
+    A trigger may stand between two Queries, or two Get status: their answers come in order.
+    """
     open_requests: set[tuple[str, type[m.Message]]] = set()
     for one in run.said:
         message = one.message
@@ -131,7 +134,9 @@ def asks_one_at_a_time(run: ClientRun) -> str | None:
             if key in open_requests:
                 return f"{_name(one)} came although the one before was not answered yet"
             open_requests.add(key)
-        elif message is not None:
+        if isinstance(message, m.Trigger):  # which may stand between two questions
+            open_requests -= {(one.peer, m.QueryAnswer), (one.peer, m.StatusReport)}
+        elif message is not None and one.sender is Sender.CAMERA:
             open_requests.discard((one.peer, type(message)))
     return None
 
@@ -201,7 +206,7 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
 
 
 def _is_command(one: Said) -> bool:
-    """Whether it makes the camera do something; questions and the session's end do not."""
+    """Return True if a message is a command; questions and the session's end are none."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
     return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
 

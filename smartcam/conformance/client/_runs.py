@@ -7,10 +7,11 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
+from smartcam._arguments import check_kind, check_seconds
 from smartcam.conformance.client._scenes import APPLICATIONS, Scene, read_container
 from smartcam.conformance.client._tasks import Client, Outcome, Task
 from smartcam.emulator import EmulatedCamera
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols import Frame
 from smartcam.protocols.messages import ResultContainer, Sender, StatusReport
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
     from smartcam.emulator import LogEntry
     from smartcam.models import Status
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
     from smartcam.protocols.messages import Message
 
 SETTLING = 0.3
@@ -41,7 +42,7 @@ class Said(NamedTuple):
     lost: bool = False  # it did not pass
 
     def __str__(self) -> str:
-        """Return it as a line: seconds, direction, message, bytes."""
+        """Return the message as a line: seconds, direction, message, bytes."""
         mark = ">" if self.sender is Sender.CLIENT else "<"
         note = f"  (ignored: {self.error})" if self.error else "  (lost)" if self.lost else ""
         data = self.hex if len(self.hex) <= 120 else self.hex[:120] + "..."
@@ -55,9 +56,9 @@ class ClientRun:
     Attributes:
         scene: the camera.
         task: the task.
-        dialect: as it was spoken.
-        outcome: what the client says.
-        said: what went over the wire, in the order in which the camera saw it.
+        dialect: name of the dialect that was spoken.
+        outcome: outcome as the client reports it.
+        said: messages on the wire, in the order in which the camera saw them.
         timeout: seconds that the client had.
     """
 
@@ -112,7 +113,7 @@ async def perform(
     Args:
         client: the client.
         scene: the camera and the task.
-        dialect: what the camera speaks.
+        dialect: name of the dialect that the camera speaks.
         transport: ``tcp`` or ``udp``.
         timeout: seconds that the client has.
 
@@ -121,6 +122,9 @@ async def perform(
 
     Cancellation: camera and client are ended.
     """
+    check_kind(client, Client, "client", "a client", "perform")
+    check_kind(scene, Scene, "scene", "a Scene", "perform")
+    timeout = check_seconds(timeout, "timeout", "perform", above=True)
     async with EmulatedCamera(
         APPLICATIONS,
         builtins=False,

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam.conformance._dialects import EVERY_DIALECT, SMART
 from smartcam.emulator import faults as f
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.conformance.client._tasks import Verb
-    from smartcam.emulator._generators import Run
-    from smartcam.emulator.faults._base import BaseFault
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.emulator import Run
+    from smartcam.emulator._inside import BaseFault
+    from smartcam.protocols import FramedDialect
 
 APPLICATION, OTHER, FREE_RUNNING, MISSING = 21, 3, 9, 99
 """The application that is loaded at first, one to switch to, one that sends results by itself, and
@@ -29,7 +29,7 @@ LONG = 1.0
 """Seconds of BUSY behind a switch's answer: a client that starts slowly must come into it, too."""
 
 STATUS_GO = 0x280
-"""Running and Waiting for Trigger."""
+"""Status with Running and Waiting for Trigger."""
 
 _CONTAINER = struct.Struct("<ii")
 
@@ -66,7 +66,7 @@ APPLICATIONS: tuple[dict[str, Any], ...] = (
     _application(OTHER),
     _application(FREE_RUNNING, rate=50.0, processing_time=0.005),
 )
-"""What is stored on the camera."""
+"""Applications that are stored on the camera."""
 
 
 def _none(dialect: FramedDialect) -> Sequence[BaseFault]:
@@ -78,17 +78,17 @@ class Scene:
     """A camera, and what a client shall do with it.
 
     Attributes:
-        name: of the scene.
-        about: what is special about it, for people.
-        verb: of the task.
-        number: of the task.
-        active: the application that is loaded at first.
-        running: whether it is in run mode.
+        name: name of the scene.
+        about: text on what is special about the scene, for people.
+        verb: verb of the task.
+        number: number of the task.
+        active: application that is loaded at first.
+        running: whether the camera is in run mode at first.
         faults: the trouble, in a dialect.
-        quirks: of the camera.
+        quirks: quirks of the camera.
         stale: turns of the application that the client did not trigger.
-        dialects: in which it makes sense.
-        transports: over which it makes sense.
+        dialects: dialects in which the scene makes sense.
+        transports: transports over which the scene makes sense.
     """
 
     name: str
@@ -105,12 +105,12 @@ class Scene:
 
     @property
     def wanted(self) -> int:
-        """How many results the task is about."""
+        """Number of results that the task is about."""
         return 1 if self.verb == "switch" else self.number or 1
 
     @property
     def application(self) -> int:
-        """Whose results they are."""
+        """Id of the application that the results come from."""
         return self.number or 0 if self.verb == "switch" else self.active
 
 

@@ -13,7 +13,7 @@ from smartcam.conformance.client._report import judge
 from smartcam.conformance.client._runs import ClientRun, perform
 from smartcam.conformance.client._tasks import Client, CommandClient, FunctionClient
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._bvs import BVS
+from smartcam.protocols import BVS
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Sequence
@@ -27,7 +27,7 @@ _RUNS: pytest.StashKey[dict[tuple[type, str, str, str], ClientRun]] = pytest.Sta
 
 
 class ClientOptions(NamedTuple):
-    """What the options say of the client."""
+    """The options that describe the client."""
 
     command: str | None = None  # ``--client-command``, None where it is not given
     dialects: tuple[str, ...] | None = None  # ``--client-dialect``, names with commas between them
@@ -75,8 +75,8 @@ class ClientConformance:
     Attributes:
         command: program and arguments, see :class:`~smartcam.conformance.client.CommandClient`;
             ``--client-command`` where it is None.
-        dialects: those that the client speaks.
-        transports: those that it can.
+        dialects: names of the dialects that the client speaks.
+        transports: names of the transports that the client can use.
         timeout: seconds that a task may take. A client's own time-outs must end within it.
     """
 

@@ -1,4 +1,4 @@
-"""What a client is asked to do, and the ways to have it done: a command, or a Python function.
+"""The tasks for a client, and the ways to run one: a command, or a Python function.
 
 A command gets the task as arguments and prints one line for each result: the bytes of the result
 container behind the application's id as hex, or a JSON object that has them as ``data`` or ``raw``.
@@ -21,6 +21,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, cast
 
+from smartcam._arguments import check_all, check_callable, check_path, check_text
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -38,14 +39,14 @@ SHOWN = 2000
 """Characters of a command's output that a report shows."""
 
 DYING = 2.0
-"""Seconds that a client which was told to end has for it."""
+"""Seconds in which a client has to end that was told to."""
 
 Verb = Literal["trigger", "switch", "watch"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """What a client shall do; each one in a session of its own.
+    """A task for a client; each one is done in a session of its own.
 
     - ``trigger [N]``: connect, trigger the active application once, or N times one after the other,
       print each result, disconnect.
@@ -54,13 +55,13 @@ class Task:
     - ``watch N``: connect, print the next N results that come by themselves, disconnect.
 
     Attributes:
-        verb: which of these.
+        verb: the first word of the task.
         number: N or ID; None for one trigger.
         url: the camera's address as smartcam has it, its dialect pinned.
-        host: where it is.
-        port: its port.
+        host: name or address of the camera's host.
+        port: number of the camera's port.
         transport: ``tcp`` or ``udp``.
-        dialect: which one it speaks.
+        dialect: name of the dialect that the camera speaks.
     """
 
     verb: Verb
@@ -77,20 +78,20 @@ class Task:
         return [self.verb, *([] if self.number is None else [str(self.number)])]
 
     def __str__(self) -> str:
-        """Return it as a command gets it."""
+        """Return the task in the words that a command gets."""
         return " ".join(self.words)
 
 
 class Outcome(NamedTuple):
-    """What a client has made of a task.
+    """The outcome of a task at a client.
 
     Attributes:
-        results: those that it gave, in order.
-        error: what it said of its failure; None where it says that all is well.
-        ended: whether it came to an end in time.
-        supported: whether it can do such a task at all.
-        seconds: how long it took.
-        said: what else it printed, shortened.
+        results: data of the results that the client gave, in order.
+        error: the client's words on its failure; None where the client reports success.
+        ended: whether the client came to an end in time.
+        supported: whether the client can do such a task at all.
+        seconds: duration of the task.
+        said: further output of the client, shortened.
     """
 
     results: tuple[bytes, ...] = ()
@@ -130,7 +131,7 @@ class FunctionClient(Client):
     """
 
     def __init__(self, function: Perform) -> None:
-        self._function = function
+        self._function = check_callable(function, "function", "client")
 
     async def perform(self, task: Task, timeout: float) -> Outcome:
         """Have a task done, see :meth:`Client.perform`.
@@ -215,11 +216,18 @@ class CommandClient(Client):
     """
 
     def __init__(self, command: str | Sequence[str], cwd: str | None = None) -> None:
-        try:
-            self._template = shlex.split(command) if isinstance(command, str) else list(command)
-        except ValueError as exc:
-            raise ConfigurationError(f"client command {command!r}: {exc}") from exc
-        self._cwd = cwd
+        if isinstance(command, str):
+            text = check_text(command, "client command")
+            try:
+                words = shlex.split(text)
+            except ValueError as exc:
+                raise ConfigurationError(f"client command {text!r}: {exc}") from exc
+        else:
+            expected = "a text, or the program and its arguments"
+            given = check_all(command, "client command", expected)
+            words = [check_text(one, "client command") for one in given]
+        self._template = words
+        self._cwd = None if cwd is None else str(check_path(cwd, "cwd", "client command"))
         text = " ".join(self._template)
         if "{task}" not in text or not ("{url}" in text or "{port}" in text):
             raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""What ``pytest --pyargs smartcam.conformance.client --client-command ...`` runs."""
+"""The tests that ``pytest --pyargs smartcam.conformance.client --client-command ...`` runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How cameras behave that speak different dialects, as data."""
+"""The behaviour of cameras that speak different dialects, as data."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import ResultCode
+from smartcam.protocols._inside import ResultCode
 
 if TYPE_CHECKING:
     from smartcam.emulator._bvs.quirks import Quirks
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Behaviour:
-    """What a camera does beside answering what is asked."""
+    """The behaviour of a camera beyond its answers to requests."""
 
     coded: bool = False  # its answers tell a result code
     acknowledges: bool = False  # every request is answered with one
@@ -33,7 +33,7 @@ class Behaviour:
 
 
 SMART_CAMERA = Behaviour()
-"""BVS SC, in every dialect but ``bid``."""
+"""The behaviour of a BVS SC, in every dialect but ``bid``."""
 
 
 def behaviour_of(dialect: FramedDialect, quirks: Quirks) -> Behaviour:

@@ -13,8 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 LOST_CLOCK = datetime(1970, 1, 1, tzinfo=UTC)
-"""What the clock shows after a restart: it is lost (published for a sibling, the value inferred).
-The camera's clock has no time zone; UTC stands here because a time of ours needs one."""
+"""Time that the clock shows after a restart (loss published for a sibling, value inferred).
+
+The camera's clock has no time zone; UTC stands here because our times need one.
+"""
 
 _UNITS = ("year", "month", "day", "hour", "minute", "second")
 
@@ -69,6 +71,11 @@ class InputQueue:
     def __len__(self) -> int:
         return len(self._queue)
 
+    @property
+    def was_given(self) -> bool:
+        """True if there was a container since everything was forgotten."""
+        return bool(self._queue) or self._last is not None
+
     def put(self, values: Mapping[str, Any]) -> bool:
         """Queue a container; False if the oldest was dropped for it."""
         fits = len(self._queue) < self._depth
@@ -95,7 +102,7 @@ class InputQueue:
 
 @dataclass(slots=True)
 class RunChange:
-    """What faults change of one inspection."""
+    """The changes that faults make to one inspection."""
 
     late: int = 0  # how much longer it takes, nanoseconds
     silent: bool = False  # it sends nothing

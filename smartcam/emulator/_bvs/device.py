@@ -18,16 +18,26 @@ import logging
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._arguments import (
+    check_application,
+    check_flag,
+    check_integer,
+    check_kind,
+    check_seconds,
+    check_seconds_or_none,
+)
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.emulator._bvs.behaviour import SMART_CAMERA, Behaviour
 from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK, CalendarClock, InputQueue, RunChange
 from smartcam.emulator._bvs.quirks import Quirks
 from smartcam.emulator._clock import NANOSECONDS, nanoseconds
+from smartcam.emulator._inspected import InspectedApplication, InspectionOrder
 from smartcam.emulator._scenario.states import DeviceState, risen_states
 from smartcam.emulator._scene import TableScene
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.models import Status
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import ResultCode
+from smartcam.protocols._inside import ResultCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -35,15 +45,19 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam.emulator._application import Application
+    from smartcam.emulator._generators import Values
+    from smartcam.emulator._inspected import Inspector
     from smartcam.models import ByteOrder
 
 _log = logging.getLogger("smartcam.emulator")
 
 PROTOCOL_VERSION = 1
-"""What Connect is answered with (SC manual p. 29, published)."""
+"""The answer to Connect (SC manual p. 29, published)."""
 
 OPERATOR_CONDITIONS = Status.OVERHEAT | Status.SYSTEM_ERROR
 """Bits that nothing in the model sets: :meth:`Device.set_condition` does."""
+
+_DATA = "data"  # the only value of input data that the device does not read
 
 _NUMBERS = 1 << 32  # sequence numbers are UINT32
 
@@ -58,7 +72,7 @@ _INPUT_CONTAINER = Status.INPUT_CONTAINER.value
 
 
 class Mode(enum.Enum):
-    """What the camera is doing."""
+    """The activity of the camera."""
 
     STOPPED = "stopped"
     RUNNING = "running"
@@ -90,11 +104,15 @@ class _Inspection(NamedTuple):
 
 
 class LastReport(NamedTuple):
-    """What a run reported, whether anybody heard it or not."""
+    """The report of a run, whether anybody heard it or not."""
 
     time: float  # seconds
     byte_order: ByteOrder
     result: m.ResultContainer
+
+
+MAX_EXTRA = 1000
+"""Copies of one run's container that a fault may send at most."""
 
 
 class Device:
@@ -152,6 +170,7 @@ class Device:
         self._endian = 0
         self._next_number = 0
         self._processing = False
+        self._inspector: Inspector | None = None  # while it has a run
         self._held_busy = False
         self._trigger_drops = 0  # triggers still to be dropped
         self._change = RunChange()  # of the inspection under way, else of the next
@@ -176,27 +195,27 @@ class Device:
 
     @property
     def mode(self) -> Mode:
-        """What it is doing."""
+        """Mode of the device, such as stopped or running."""
         return self._mode
 
     @property
     def running(self) -> bool:
-        """Whether it is in run mode."""
+        """True in run mode."""
         return self._mode is Mode.RUNNING
 
     @property
     def processing(self) -> bool:
-        """Whether an inspection is under way."""
+        """True while an inspection is under way."""
         return self._processing
 
     @property
     def rebooting(self) -> bool:
-        """Whether it is off the network because it restarts."""
+        """True while the device is off the network because it restarts."""
         return self._mode is Mode.REBOOTING
 
     @property
     def connected(self) -> bool:
-        """Whether a client has a session."""
+        """True while a client has a session."""
         return self._session
 
     @property
@@ -221,7 +240,7 @@ class Device:
 
     @property
     def clock_time(self) -> datetime:
-        """What its clock shows; the zone means nothing."""
+        """Time that the device's clock shows; the zone means nothing."""
         return self._clock.read(self._now)
 
     @property
@@ -244,6 +263,7 @@ class Device:
             word |= _RUNNING
             if self._processing:
                 word |= _BUSY if self.quirks.busy_while_processing else 0
+                word |= _WAITING if self.quirks.hidden_triggers else 0
             elif self._active.triggered and self._takes_runs:
                 word |= _WAITING
         return word
@@ -318,8 +338,7 @@ class Device:
         Raises:
             ConfigurationError: a negative time.
         """
-        if not dt >= 0:
-            raise ConfigurationError(f"device: the time goes forwards, got {dt} s")
+        dt = check_seconds(dt, "dt", "device")
         self._advance(self._now + nanoseconds(dt))
 
     def next_event_in(self) -> float | None:
@@ -354,7 +373,7 @@ class Device:
         It is stopped for that, whatever the quirks say about a client's switch.
 
         Args:
-            application: its id.
+            application: id of the application to load.
             running: enter run mode when it is loaded.
 
         Returns:
@@ -363,6 +382,8 @@ class Device:
         Raises:
             ConfigurationError: no application has that id.
         """
+        application = check_application(application, who="device")
+        running = check_flag(running, "running", "device")
         target = self._applications[self._known(application)]
         with self.around():
             if self._mode in {Mode.SWITCHING, Mode.REBOOTING}:
@@ -377,6 +398,7 @@ class Device:
         Args:
             seconds: until it is up again; None: what the quirk ``reboot_time`` says.
         """
+        seconds = check_seconds_or_none(seconds, "seconds", "device")
         with self.around():
             self._reboot(seconds)
 
@@ -389,6 +411,8 @@ class Device:
         Raises:
             ConfigurationError: another bit; those follow from what the camera does.
         """
+        condition = check_kind(condition, Status, "condition", "a Status", "device")
+        on = check_flag(on, "on", "device")
         if condition & ~OPERATOR_CONDITIONS:
             raise ConfigurationError(
                 f"device: only {OPERATOR_CONDITIONS} can be set, got {condition}"
@@ -405,6 +429,7 @@ class Device:
 
         Other values are reported as they are and build little endian.
         """
+        endian = check_integer(endian, "endian", 0, 0xFFFFFFFF, "device")
         with self.around():
             self._endian = endian
             self._report()
@@ -417,6 +442,7 @@ class Device:
         Args:
             seconds: how long; None: until a reboot or :meth:`end_faults`.
         """
+        seconds = check_seconds_or_none(seconds, "seconds", "device")
         with self.around():
             if self._mode is Mode.REBOOTING:
                 return
@@ -429,21 +455,24 @@ class Device:
 
     def drop_triggers(self, count: int) -> None:
         """Drop so many triggers as if the last image were still analysed."""
-        self._trigger_drops += count
+        self._trigger_drops += check_integer(count, "count", 0, who="device")
 
     def change_run(self, *, late: float = 0.0, silent: bool = False, extra: int = 0) -> None:
         """Change the inspection under way, else the next that begins.
 
         Args:
-            late: seconds that it takes longer.
-            silent: it sends nothing.
-            extra: how often its container comes beside the first time.
+            late: seconds by which the inspection takes longer.
+            silent: True for an inspection that sends nothing.
+            extra: number of times that its container is repeated after the first one.
         """
+        late = check_seconds(late, "late", "device")
+        silent = check_flag(silent, "silent", "device")
+        extra = check_integer(extra, "extra", 0, MAX_EXTRA, "device")
         with self.around():
             self._change.late += nanoseconds(late)
             self._change.silent |= silent
             self._change.extra += extra
-            if self._processing:
+            if _Event.INSPECTED in self._events:
                 when, action = self._events[_Event.INSPECTED]
                 self._events[_Event.INSPECTED] = (when + nanoseconds(late), action)
 
@@ -509,7 +538,7 @@ class Device:
             self._say(answer(code=code))
 
     def _complain(self, message_id: int, code: int) -> None:
-        """Say what is wrong with a message; a smart camera ignores it (SC manual p. 28)."""
+        """Answer a bad message with its result code, except as a smart camera (SC manual p. 28)."""
         if self.behaviour.tells_bad_messages:
             self._say(m.UnknownMessage(message_id=message_id, payload=code.to_bytes(2, "little")))
 
@@ -600,7 +629,7 @@ class Device:
             return
         self.disconnect()
         self._set_mode(Mode.REBOOTING)
-        self._processing = False
+        self._void_run()
         self._events = {}
         self._forget_faults()
         duration = self.quirks.reboot_time if seconds is None else seconds
@@ -691,7 +720,7 @@ class Device:
         if not self._takes_runs or self._processing:  # the last one is late
             return
         self._begin_run()
-        if not self._change.late:
+        if not self._change.late and _Event.INSPECTED in self._events:
             # a run never reaches into the next, however both were rounded
             (ends, action), (following, _) = (
                 self._events[_Event.INSPECTED],
@@ -707,15 +736,33 @@ class Device:
         self._runs += 1
         self._processing = True
         self._enter(DeviceState.INSPECTING)
-        ends = self._now + nanoseconds(self._active.processing_time) + change.late
-        self._events[_Event.INSPECTED] = (ends, functools.partial(self._finish_run, run))
+        if isinstance(self._active, InspectedApplication):
+            self._inspect(self._active, run)
+        else:
+            ends = self._now + nanoseconds(self._active.processing_time) + change.late
+            self._events[_Event.INSPECTED] = (ends, functools.partial(self._finish_run, run))
         self._report()
 
-    def _finish_run(self, run: _Inspection) -> None:
+    def _inspect(self, application: InspectedApplication, run: _Inspection) -> None:
+        """Have a picture inspected for a run, which ends when that is done."""
+        data = b"" if run.input is None else run.input[_DATA]
+        order = InspectionOrder(application.id, run.number, data)
+        self._inspector = application.inspector
+        application.inspector.begin(order, lambda: None, functools.partial(self._inspected, run))
+
+    def _inspected(self, run: _Inspection, found: Values | None) -> None:
+        """Take what an inspector has found; a fault may make the run's end late."""
+        self._inspector = None
+        with self.around():
+            finish = functools.partial(self._finish_run, run, found)
+            self._events[_Event.INSPECTED] = (self._now + run.change.late, finish)
+            self._advance(self._now)
+
+    def _finish_run(self, run: _Inspection, found: Values | None = None) -> None:
         """Send the result, then Waiting for Trigger rises again (the order is a quirk)."""
         self._processing = False
         self._change = RunChange()
-        result = self._result(run)
+        result = self._result(run, found)
         if self.quirks.waiting_before_result:
             self._report()
         if result is not None and not run.change.silent:
@@ -724,30 +771,38 @@ class Device:
                 self._say(result)
         self._report()
 
-    def _result(self, run: _Inspection) -> m.ResultContainer | None:
+    def _result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
         """Return the result; one that comes again and again is built once."""
         if self._period is None:
-            return self._build_result(run)
+            return self._build_result(run, found)
         key = (run.turn % self._period, self._byte_order)
         result = self._containers.get(key)
         if result is None:
-            result = self._build_result(run)
+            result = self._build_result(run, found)
             if result is not None:
                 self._containers[key] = result
         return result
 
-    def _build_result(self, run: _Inspection) -> m.ResultContainer | None:
+    def _build_result(self, run: _Inspection, found: Values | None) -> m.ResultContainer | None:
         application = self._active
+        order = self._byte_order
         try:
-            data = application.container(
-                number=run.number,
-                turn=run.turn,
-                time=run.time,
-                scene=self.scene,
-                values=run.input,
-                byte_order=self._byte_order,
-            )
-        except Exception:  # noqa: BLE001  a generator is somebody's code; the camera goes on
+            if not isinstance(application, InspectedApplication):
+                data = application.container(
+                    number=run.number,
+                    turn=run.turn,
+                    time=run.time,
+                    scene=self.scene,
+                    values=run.input,
+                    byte_order=order,
+                )
+            elif found is not None:
+                data = application.container_of(found, number=run.number, byte_order=order)
+            else:
+                data = None  # the inspection failed
+        except ENDS_PROGRAM:
+            raise
+        except BaseException:  # noqa: BLE001  a generator is somebody's code; the camera goes on
             _log.exception("! application %d, run %d: no result", application.id, run.number)
             return None
         return None if data is None else m.ResultContainer(application=application.id, data=data)
@@ -758,26 +813,42 @@ class Device:
             self._change = RunChange()
         self._processing = False
         self._events.pop(_Event.INSPECTED, None)
+        inspector, self._inspector = self._inspector, None
+        if inspector is not None:
+            inspector.cancel()
 
     # ------------------------------------------------------------------ input data
 
     def _take_input(self, data: bytes) -> bool:
         """Queue a container; one that does not fit the layout is dropped (inferred): False."""
-        layout = self._active.input_layout
-        if layout is None or self._mode is Mode.SWITCHING:
+        values = None if self._mode is Mode.SWITCHING else self._read_input(data)
+        if values is None:
             return False
-        try:
-            values: Any = layout.parse(data, self._byte_order)
-        except InterpretationError as exc:
-            _log.debug("= input data dropped: %s", exc)
-            return False
-        if not self._inputs.put(values._asdict()):
+        if not self._inputs.put(values):
             self._in_step(fits=False)
             self._report()
         return True
 
+    def _read_input(self, data: bytes) -> Mapping[str, Any] | None:
+        """Return the values of input data; None where the application takes none such."""
+        if isinstance(self._active, InspectedApplication):
+            return {_DATA: data}
+        layout = self._active.input_layout
+        if layout is None:
+            return None
+        try:
+            values: Any = layout.parse(data, self._byte_order)
+        except InterpretationError as exc:
+            _log.debug("= input data dropped: %s", exc)
+            return None
+        found: Mapping[str, Any] = values._asdict()
+        return found
+
     def _next_input(self) -> Mapping[str, Any] | None:
-        if self._active.input_layout is None:
+        inspected = isinstance(self._active, InspectedApplication)
+        if inspected and not self._inputs.was_given:
+            return None  # a program may have no use for any
+        if not inspected and self._active.input_layout is None:
             return None
         values, fits = self._inputs.take()
         self._in_step(fits=fits)

@@ -1,4 +1,4 @@
-"""What is not known about real cameras, as options.
+"""The open questions about real cameras, as options.
 
 Each field is one open question: its default is what the emulator does, its description says why and
 how well that is founded. Grades: *published* in a manual of this product or a sibling, *inferred*,
@@ -48,6 +48,15 @@ class Quirks(EmulatorData):
         description=(
             "Whether BUSY is set during an inspection. Published only for the time of a switch "
             "(SC manual p. 33); during an inspection unknown (off: recommended)."
+        ),
+    )
+    hidden_triggers: bool = Field(
+        default=False,
+        description=(
+            "Whether Waiting for Trigger stays set during an inspection, so that the status does "
+            "not tell of a trigger that is taken. A status comes after every change (SC manual "
+            "p. 29, published), and this bit says that the camera waits (off: published). A client "
+            "is told of it by `shows_triggers=no` in the URL."
         ),
     )
     bad_frame: Literal["skip", "close"] = Field(

@@ -13,9 +13,18 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
+from smartcam._arguments import (
+    check_all,
+    check_application_or_name,
+    check_flag,
+    check_integer,
+    check_seconds,
+    check_text,
+    check_texts,
+)
 from smartcam.emulator._camera import SHOWN
 from smartcam.emulator._clock import nanoseconds
-from smartcam.emulator._insight.commands import InSightCommands, InSightQuirks
+from smartcam.emulator._insight.commands import InSightCommands, InSightQuirks, image_answer
 from smartcam.emulator._insight.connection import MAX_SESSIONS, ROWS, WRITE_LIMIT, TelnetClient
 from smartcam.emulator._insight.device import InSightDevice
 from smartcam.emulator._insight.job import BUILTIN_JOBS
@@ -25,9 +34,8 @@ from smartcam.emulator._scenario.states import DeviceState
 from smartcam.emulator._tally import Tally
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from smartcam.models import Status
-from smartcam.protocols._insight import words
-from smartcam.protocols._insight.dialect import INSIGHT
-from smartcam.protocols._insight.machine import ONLINE
+from smartcam.protocols import INSIGHT
+from smartcam.protocols._inside import ONLINE, words
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
@@ -42,10 +50,10 @@ if TYPE_CHECKING:
     from smartcam.emulator._line_camera import LineClient
     from smartcam.emulator._line_codec import LineServer, SaidLine
     from smartcam.emulator._scenario.scenario import Scenario
-    from smartcam.protocols._base import Protocol
+    from smartcam.protocols import Protocol
 
 MAX_ORDERED = 1000
-"""Answers that may be ordered in advance."""
+"""Answers that may be ordered in advance at most."""
 
 
 class _Ordered(NamedTuple):
@@ -62,23 +70,23 @@ class EmulatedInSight(LineCamera):
     published, how many is not.
 
     Args:
-        jobs: those on it: :class:`Job` or mappings of its fields.
+        jobs: jobs stored on the camera: :class:`Job` or mappings of its fields.
         users: password of each user; published is that a new camera has ``admin`` without one.
-        model: named in the first line it says.
+        model: name of the camera model, in the first line that the camera sends.
         active: file, or id, of the job that is loaded at first; default the first of the jobs,
             without any an empty one that was never saved.
         online: whether it is online at first.
-        image: what it sees: an 8 bit grey image; default a pattern.
+        image: the 8 bit grey image that the camera sees; default a pattern.
         evaluations: answers to ``EV``: expression to the text that is sent; others fail.
         info: what ``GI`` tells, instead of the emulator's own.
         quirks: what is not known of real cameras: :class:`InSightQuirks` or a mapping.
-        options: those of :class:`~smartcam.emulator.LineCamera`.
+        options: options of :class:`~smartcam.emulator.LineCamera`.
 
     Attributes:
         device: the camera behind the wire, for looking; to make it do something, use the methods
             of the emulator.
         refuse_login: refuse every user.
-        silent: hear commands and do them, but say nothing.
+        silent: hear commands and do them, but send no answer.
 
     Raises:
         ConfigurationError: something given is wrong.
@@ -107,6 +115,16 @@ class EmulatedInSight(LineCamera):
         quirks: InSightQuirks | Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
+        who = "emulator"
+        online = check_flag(online, "online", who)
+        model = check_text(model, "model", who, least=1, most=100)
+        if active is not None:
+            active = check_application_or_name(active, "active", who)
+        jobs = check_all(jobs, "jobs", "a list of jobs", who)
+        users, evaluations, info = (
+            None if given is None else check_texts(given, what, who)
+            for what, given in (("users", users), ("evaluations", evaluations), ("info", info))
+        )
         self.device = InSightDevice(jobs, active=active, online=online, image=image)
         self.refuse_login: bool = False
         self.silent: bool = False
@@ -116,7 +134,7 @@ class EmulatedInSight(LineCamera):
             self.device,
             evaluations=evaluations,
             info=info,
-            quirks=validated(InSightQuirks, quirks or {}, "quirks"),
+            quirks=validated(InSightQuirks, {} if quirks is None else quirks, "quirks"),
         )
         self._ordered: deque[_Ordered] = deque()
         self._heard: Tally[str] = Tally()
@@ -155,7 +173,7 @@ class EmulatedInSight(LineCamera):
         return [job.id for job in self.device.jobs.values() if job.id is not None]
 
     def shown(self) -> dict[str, Any]:
-        """Return what its page shows of its state."""
+        """Return the state of the camera that its page shows."""
         device, job = self.device, self.device.job
         jobs = [one for one in device.jobs.values() if one.id is not None]
         return {
@@ -185,7 +203,7 @@ class EmulatedInSight(LineCamera):
 
     @property
     def online(self) -> bool:
-        """Whether it is online."""
+        """True while the camera is online."""
         return self.device.online
 
     @property
@@ -208,14 +226,19 @@ class EmulatedInSight(LineCamera):
         """Address and port of all clients that are connected."""
         return [one.peer for one in self._by_number()]
 
+    @classmethod
+    def image_answer(cls, image: NDArray[np.uint8]) -> bytes:
+        """Return the answer to ``RI`` for a picture, (H, W)."""
+        return image_answer(image)
+
     # ------------------------------------------------------------------ the operator
 
     def set_online(self, online: bool) -> None:
         """Go online, or be held offline by hand or an input: then ``SO1`` is answered with -5."""
-        self.device.set_online(online)
+        self.device.set_online(check_flag(online, "online", "emulator"))
 
     def set_image(self, image: NDArray[np.uint8]) -> None:
-        """Have it see another image.
+        """Let the camera see another image.
 
         Raises:
             ConfigurationError: it is no 8 bit grey image.
@@ -230,12 +253,12 @@ class EmulatedInSight(LineCamera):
         """Load a job by hand, at once and in either mode; a run under way ends without a result.
 
         Args:
-            job: its file name or id.
+            job: file name or id of the job.
 
         Raises:
             ConfigurationError: there is none, or another one is being loaded.
         """
-        self.device.load(job)
+        self.device.load(check_application_or_name(job, "job", "emulator"))
 
     def answer_next(self, code: int, *, command: str | None = None) -> None:
         """Answer a command with a status code instead of doing it; the oldest order goes first.
@@ -247,6 +270,9 @@ class EmulatedInSight(LineCamera):
         Raises:
             ConfigurationError: 1000 answers are ordered already.
         """
+        code = check_integer(code, "code", -(1 << 31), (1 << 31) - 1, "emulator")
+        if command is not None:
+            command = check_text(command, "command", "emulator", least=1, most=100)
         if len(self._ordered) >= MAX_ORDERED:
             raise ConfigurationError(f"{MAX_ORDERED} answers are ordered already")
         self._ordered.append(_Ordered(code, None if command is None else command.upper()))
@@ -263,7 +289,7 @@ class EmulatedInSight(LineCamera):
         emulator's clock is.
 
         Args:
-            command: its two letters.
+            command: the two letters of the command.
             count: how often, what came before this call included.
             timeout: seconds.
 
@@ -272,7 +298,9 @@ class EmulatedInSight(LineCamera):
 
         Cancellation: safe.
         """
-        mnemonic = command.upper()
+        mnemonic = check_text(command, "command", "wait_heard", least=1, most=100).upper()
+        count = check_integer(count, "count", 0, who="wait_heard")
+        timeout = check_seconds(timeout, "timeout", "wait_heard")
         try:
             await self._heard.wait(mnemonic, count, timeout)
         except TimeoutError as exc:
@@ -311,7 +339,7 @@ class EmulatedInSight(LineCamera):
             client.take(line)
 
     def serves(self, link: ClientLink) -> bool:
-        """Whether the client on it is logged in."""
+        """Return True if the client on the link is logged in."""
         client = self._clients.get(link)
         return isinstance(client, TelnetClient) and client.logged_in
 
@@ -326,7 +354,7 @@ class EmulatedInSight(LineCamera):
         return text.encode(words.ENCODING) + words.LINE_END + words.USER_PROMPT
 
     def admits(self, user: str, password: str) -> bool:
-        """Return whether a login is right; user names are case sensitive (manual, published)."""
+        """Return True if a login is right; user names are case sensitive (manual, published)."""
         known = self._users.get(user)
         return known is not None and known == password and not self.refuse_login
 

@@ -1,26 +1,32 @@
-"""What the emulated In-Sight camera answers to a line, to the byte."""
+"""Answer a line as the emulated In-Sight camera does, to the byte."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import re
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from pydantic import Field
 
 from smartcam.emulator._data import EmulatorData
-from smartcam.emulator._insight.image import bitmap
+from smartcam.emulator._insight.image import bitmap, check_image
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._insight import words
-from smartcam.protocols._insight.words import StatusCode
+from smartcam.protocols._inside import StatusCode, words
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from smartcam.emulator._insight.device import InSightDevice
+
+_log = logging.getLogger("smartcam.emulator")
 
 
 class InSightQuirks(EmulatorData):
-    """What is not known of real cameras."""
+    """Choices for behaviour of real cameras that is not known."""
 
     event_answer: Literal["code", "sized"] = Field(
         default="code",
@@ -189,10 +195,56 @@ class InSightCommands:
         return _coded(StatusCode.FAILED) if text is None else _sized(text)
 
     def _read_image(self, _argument: str, respond: Respond) -> None:
-        data = bitmap(self._device.image)
-        digits, lines = words.hex_lines(data)
-        respond(_found(digits if self.quirks.image_size == "digits" else len(data)), more=True)
-        self._device.after(self.quirks.transfer_pause, lambda: respond(lines))
+        device = self._device
+        if device.sight is None:
+            self._send_image(coded_image(device.image), respond)
+            return
+        # one that a sensor took is large: it is written in a thread
+        writing = asyncio.get_running_loop().run_in_executor(None, _seen_image, device.sight)
+
+        def written(done: asyncio.Future[CodedImage | None]) -> None:
+            if not done.cancelled():
+                with device.around():
+                    self._send_image(done.result(), respond)
+
+        writing.add_done_callback(written)
+
+    def _send_image(self, image: CodedImage | None, respond: Respond) -> None:
+        if image is None:
+            respond(_coded(StatusCode.FAILED))
+            return
+        digits = self.quirks.image_size == "digits"
+        respond(_found(image.digits if digits else image.size), more=True)
+        self._device.after(self.quirks.transfer_pause, lambda: respond(image.lines))
+
+
+class CodedImage(NamedTuple):
+    """An image as lines of hexadecimal digits.
+
+    Attributes:
+        size: bytes of the bitmap file.
+        digits: hexadecimal digits.
+        lines: the lines, with their ends.
+    """
+
+    size: int
+    digits: int
+    lines: bytes
+
+
+def coded_image(image: NDArray[np.uint8]) -> CodedImage:
+    """Return an image as the camera sends it."""
+    data = bitmap(image)
+    return CodedImage(len(data), *words.hex_lines(data))
+
+
+def _seen_image(sight: Callable[[], Any]) -> CodedImage | None:
+    """Return the image of the last run; None where that is no image of such a camera."""
+    try:
+        return coded_image(check_image(sight()))
+    except ConfigurationError as exc:
+        _log.warning("! no image is sent: %s", exc)
+        return None
 
 
 _INFO = {
@@ -206,6 +258,12 @@ _INFO = {
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,10}")
 _NUMBER = re.compile(r"[+-]?([0-9]{1,20}(\.[0-9]{0,20})?|\.[0-9]{1,20})([eE][+-]?[0-9]{1,2})?")
+
+
+def image_answer(image: NDArray[np.uint8]) -> bytes:
+    """Return the whole answer to ``RI`` for a picture, (H, W)."""
+    digits, lines = words.hex_lines(bitmap(image))
+    return _found(digits) + lines
 
 
 def _line(text: str) -> bytes:

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 from smartcam.emulator._line_camera import LineClient
 from smartcam.models import Status
+from smartcam.protocols import LineRow
 from smartcam.protocols import messages as m
-from smartcam.protocols._insight import words
-from smartcam.protocols._insight.machine import ONLINE
-from smartcam.protocols._lines import LineRow
+from smartcam.protocols._inside import ONLINE, words
 
 if TYPE_CHECKING:
     from smartcam.emulator._client_link import ClientLink
@@ -66,7 +65,7 @@ ROWS = (
 
 
 class _LoginState(enum.Enum):
-    """How far a client has come."""
+    """The progress of a client's login."""
 
     USER = "user"
     PASSWORD = "password"  # noqa: S105 - a state
@@ -91,7 +90,7 @@ class TelnetClient(LineClient):
 
     @property
     def logged_in(self) -> bool:
-        """Whether its commands are done."""
+        """True once the client is logged in, so that its commands are done."""
         return self._state is _LoginState.COMMANDS
 
     def take(self, line: str) -> None:

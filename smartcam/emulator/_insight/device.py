@@ -14,9 +14,17 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from smartcam.emulator._clock import nanoseconds
 from smartcam.emulator._insight.image import check_image, grey_pattern
-from smartcam.emulator._insight.job import CellValue, Control, Job, make_job, shown
+from smartcam.emulator._insight.job import (
+    CellValue,
+    Control,
+    InspectedJob,
+    Job,
+    make_job,
+    shown,
+)
+from smartcam.emulator._inspected import InspectionOrder
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._insight.words import TRIGGER_EVENT, StatusCode
+from smartcam.protocols._inside import TRIGGER_EVENT, StatusCode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -25,9 +33,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from smartcam.emulator._generators import Values
+    from smartcam.emulator._inspected import Inspector
+
     Told: TypeAlias = Callable[[StatusCode], None]
 
 _log = logging.getLogger("smartcam.emulator")
+
+_MAX_NUMBER = 0xFFFFFFFF  # of a run, as other cameras number them
 
 
 class _PendingEvent:
@@ -38,7 +51,7 @@ class _PendingEvent:
         self._told = told
 
     def tell(self, code: StatusCode) -> None:
-        """Tell how it went; only the first call does."""
+        """Report the outcome of the event; every call after the first does nothing."""
         told, self._told = self._told, None
         if told is not None:
             told(code)
@@ -73,6 +86,8 @@ class InSightDevice:
         self.job: Job | None = next(iter(self.jobs.values()), None)
         # a context around what an operator does, where something is to follow
         self.around: Callable[[], AbstractContextManager[object]] = nullcontext
+        # returns the image of the last run, where an inspector takes the pictures
+        self.sight: Callable[[], Any] | None = None
         self.runs: int = 0  # acquisitions with a result since it was made
         self._image: NDArray[np.uint8] = grey_pattern() if image is None else check_image(image)
         self._now = 0
@@ -81,6 +96,8 @@ class InSightDevice:
         self._wanted_online = online  # by clients
         self._allowed_online = True  # by the operator or an input
         self._loading = False
+        self._blind = False  # what its pictures come from is lost
+        self._inspector: Inspector | None = None  # while it has a run
         self._run: _PendingEvent | None = None
         self._turn = 0  # acquisitions since the job was loaded
         self._cells: dict[str, str] = {}
@@ -93,29 +110,29 @@ class InSightDevice:
 
     @property
     def online(self) -> bool:
-        """Whether it is online: wanted by clients, and not held offline (manual, published)."""
+        """True if clients want the camera online and nothing holds it offline (published)."""
         return self._wanted_online and self._allowed_online
 
     @property
     def mode(self) -> Literal["running", "stopped", "switching"]:
-        """How it stands, in the words of other cameras: online, offline, or a job is loaded."""
+        """Mode in the words of other cameras: online, offline, or a job is loaded."""
         if self._loading:
             return "switching"
         return "running" if self.online else "stopped"
 
     @property
     def busy(self) -> bool:
-        """Whether a run or the loading of a job is under way."""
+        """True while a run or the loading of a job is under way."""
         return self._loading or self._run is not None
 
     @property
     def cells(self) -> Mapping[str, str]:
-        """What the cells show, by ``A012`` or by name in lower case; none while a job is loaded."""
+        """Contents of the cells, by ``A012`` or by lower-case name; none while a job is loaded."""
         return {} if self._loading else dict(self._cells)
 
     @property
     def image(self) -> NDArray[np.uint8]:
-        """What it sees. Setting it raises ConfigurationError for what is no 8 bit grey image."""
+        """The image that the camera sees; one that is not 8 bit grey is a ConfigurationError."""
         return self._image
 
     @image.setter
@@ -143,7 +160,7 @@ class InSightDevice:
 
     @property
     def due(self) -> int | None:
-        """When something happens next by itself, nanoseconds; None if nothing will."""
+        """Time of the next event that comes by itself, nanoseconds; None if there will be none."""
         return self._agenda[0][0] if self._agenda else None
 
     def advance_to(self, now: int) -> None:
@@ -198,6 +215,16 @@ class InSightDevice:
             self._break_run()
             self.job = found
             self._begin_job()
+
+    def set_blind(self, blind: bool) -> None:
+        """Note that no pictures come, or that they come again.
+
+        Without pictures the run under way fails, and so does every trigger.
+        """
+        with self.around():
+            self._blind = blind
+            if blind:
+                self._break_run()
 
     def switch_application(self, application: int, *, running: bool = False) -> bool:
         """Load the job of an id by hand, and go online or not; False while one is loaded.
@@ -281,9 +308,12 @@ class InSightDevice:
     def _begin_run(self, event: int, told: Told | None, *, at_image: bool) -> bool:
         job = _UNSAVED if self.job is None else self.job
         acquires = event == TRIGGER_EVENT
-        if not self.online or self.busy or (acquires and not job.triggered):
+        if not self.online or self.busy or (acquires and (self._blind or not job.triggered)):
             return False
         run = self._run = _PendingEvent(told)
+        if acquires and isinstance(job, InspectedJob):
+            self._inspect(job, run, at_image=at_image)
+            return True
 
         def seen() -> None:
             if run.over:
@@ -303,12 +333,39 @@ class InSightDevice:
         self.after(job.acquisition_time if acquires else 0.0, seen)
         return True
 
+    def _inspect(self, job: InspectedJob, run: _PendingEvent, *, at_image: bool) -> None:
+        """Have a picture inspected for a run."""
+
+        def seen() -> None:
+            with self.around():
+                if at_image and not run.over:
+                    run.tell(StatusCode.DONE)
+
+        def done(found: Values | None) -> None:
+            with self.around():
+                if run.over:
+                    return
+                self._run = self._inspector = None
+                self._count_run()
+                job.take(self._cells, found)
+                run.end(StatusCode.DONE)
+
+        self._inspector = job.inspector
+        number = self.runs & _MAX_NUMBER
+        job.inspector.begin(InspectionOrder(job.application, number, b""), seen, done)
+
     def _finish_acquisition(self, job: Job) -> None:
-        self.runs += 1
-        self._turn += 1
+        self._count_run()
         job.update_cells(self._cells, self._turn)
 
+    def _count_run(self) -> None:
+        self.runs += 1
+        self._turn += 1
+
     def _break_run(self) -> None:
+        inspector, self._inspector = self._inspector, None
+        if inspector is not None:
+            inspector.cancel()
         run, self._run = self._run, None
         if run is not None:
             run.end(StatusCode.FAILED)
@@ -320,9 +377,14 @@ class InSightDevice:
         generation, period = self._generation, 1 / job.rate
 
         def turn() -> None:
-            if generation == self._generation:
+            if generation != self._generation:
+                return
+            if not isinstance(job, InspectedJob):
                 self._finish_acquisition(job)
-                self.after(period, turn)
+            elif not (self.busy or self._blind):  # the last run is late, or there is no picture
+                run = self._run = _PendingEvent(None)
+                self._inspect(job, run, at_image=False)
+            self.after(period, turn)
 
         self.after(period, turn)
 

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from smartcam._arguments import wrong_argument
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_PIXELS = 1 << 23
-"""Of an image; larger ones are refused. The camera's sensors have up to 5 megapixels."""
+"""Pixels of an image at most; larger ones are refused. Real sensors have up to 5 megapixels."""
 
 _FILE_HEADER = struct.Struct("<2sIHHI")
 _INFO_HEADER = struct.Struct("<IiiHHIIiiII")
@@ -33,7 +34,10 @@ def check_image(image: Any) -> NDArray[np.uint8]:
     Raises:
         ConfigurationError: it is none, is empty, or has more than 8 megapixels.
     """
-    array: NDArray[Any] = np.asarray(image)
+    try:
+        array: NDArray[Any] = np.asarray(image)
+    except Exception as exc:
+        raise wrong_argument("image", "a table of uint8", image) from exc
     if array.dtype != np.uint8 or array.ndim != 2:
         raise ConfigurationError(
             f"an image is a table of uint8, got {array.ndim} axes of {array.dtype}"

@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from numbers import Real
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
+from smartcam._forks import cached_property
+from smartcam._user_code import ENDS_PROGRAM
 from smartcam.emulator._data import EmulatorData, Seconds
+from smartcam.emulator._generators import Values  # noqa: TC001 - beside pydantic's models
+from smartcam.emulator._inspected import Inspector
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._insight import words
+from smartcam.protocols._inside import words
 from smartcam.settings import validated
 
 _log = logging.getLogger("smartcam.emulator")
 
 EXTENSIONS = (".job", ".jobx")
-"""Of job files: of older and of newer cameras (manual, published)."""
+"""The extensions of job files: the one of older, then the one of newer cameras (published)."""
 
 MAX_CELL_TEXT = 1024
 """Characters of a cell's text; a bound of the emulator."""
 
 CellValue: TypeAlias = bool | int | float | str
-"""What a cell may hold. The spreadsheet knows numbers and texts; a bool is the number 0 or 1."""
+"""A value that a cell may hold. The spreadsheet knows numbers and texts; a bool is the number 0 or
+1."""
 
 _Name = Annotated[str, Field(min_length=1, max_length=255)]
 
@@ -47,7 +51,7 @@ class Control(EmulatorData):
     )
 
     def admits(self, value: CellValue) -> bool:
-        """Return whether the value lies within its bounds and fits a line, with the kind's type."""
+        """Return True if a value has the cell's type, lies within its bounds and fits a line."""
         if isinstance(value, str):
             fits = len(value) <= self.max_length and (value == "" or _printable(value))
             return self.kind == "string" and fits
@@ -72,7 +76,7 @@ class Control(EmulatorData):
 
 
 CellSource: TypeAlias = Control | CellValue | list[CellValue] | Callable[[int], CellValue]
-"""Where a cell's value comes from: a control, a constant, a list (a value an acquisition, over and
+"""The source of a cell's value: a control, a constant, a list (a value an acquisition, over and
 over), or a function of the run's number, which is 1 for the first since the job was loaded."""
 
 
@@ -119,11 +123,11 @@ class Job(EmulatorData):
 
     @property
     def triggered(self) -> bool:
-        """Whether it waits for triggers: only then do ``SE8`` and ``SW8`` work (published)."""
+        """True if the job waits for triggers: only then do ``SE8`` and ``SW8`` work (published)."""
         return self.rate is None
 
     def is_called(self, name: str) -> bool:
-        """Return whether ``name`` is its file's, with the extension or without."""
+        """Return True if ``name`` is the name of the job's file, with the extension or without."""
         return name == self.file or any(name + end == self.file for end in EXTENSIONS)
 
     @cached_property
@@ -153,7 +157,9 @@ class Job(EmulatorData):
     def _call(self, key: str, function: Callable[[int], Any], run: int) -> str:
         try:
             return shown(function(run))
-        except Exception as exc:  # noqa: BLE001 - a cell that fails shows it, as on the camera
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:  # noqa: BLE001 - a cell that fails shows it, as on the camera
             _log.warning("! job %s: cell %s failed in run %d: %r", self.file, key, run, exc)
             return words.ERROR_VALUE
 
@@ -193,6 +199,50 @@ class Job(EmulatorData):
                 except (TypeError, ValueError) as exc:
                     raise ValueError(f"cell {name}: {exc}") from exc
         return self
+
+
+class InspectedJob(Job):
+    """A job whose cells an inspector fills from a picture.
+
+    ``cells`` names them; each is in error until a run has given it a value. A list of records has
+    its values in ``NAME_1``, ``NAME_2``, ...
+    """
+
+    inspector: Inspector = Field(description="what inspects the pictures")
+    application: int = Field(description="id of the program for the inspector")
+
+    def fresh_cells(self) -> dict[str, str]:
+        """Return the cells' texts right after loading: all need a run."""
+        return dict.fromkeys(self.sources, words.ERROR_VALUE)
+
+    def take(self, cells: dict[str, str], found: Values | None) -> None:
+        """Put what was found into the cells; those without a value are in error."""
+        cells.update(self.fresh_cells())
+        for name, value in _named_values(found):
+            key = cell_key(name)
+            if key in self.sources:
+                cells[key] = self._show(key, value, 0)
+
+    def _show(self, key: str, source: Any, run: int) -> str:
+        try:
+            return shown(source)
+        except (TypeError, ValueError) as exc:
+            _log.warning("! job %s: cell %s: %s", self.file, key, exc)
+            return words.ERROR_VALUE
+
+
+def _named_values(found: Values | None) -> Iterator[tuple[str, Any]]:
+    """Yield values with the names of their cells."""
+    if isinstance(found, Mapping):
+        for name, value in found.items():
+            if isinstance(value, Sequence) and not isinstance(value, str):
+                yield from _named_values(value)
+            else:
+                yield name, value
+        return
+    for number, record in enumerate(found or (), start=1):
+        for name, value in _named_values(record):
+            yield f"{name}_{number}", value
 
 
 def cell_key(name: str) -> str:
@@ -242,7 +292,8 @@ def make_job(given: Job | Mapping[str, Any]) -> Job:
     """
     if isinstance(given, Job):
         return given
-    return validated(Job, given, f"job {given.get('file', '?')}")
+    file = given.get("file", "?") if isinstance(given, Mapping) else "?"
+    return validated(Job, given, f"job {file}")
 
 
 def _printable(text: str) -> bool:

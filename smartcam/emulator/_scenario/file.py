@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import check_text
 from smartcam.emulator._scenario.scenario import Mistake, Scenario, ScenarioFile
 from smartcam.exceptions import ConfigurationError
-from smartcam.layout._yaml_files import read_model
+from smartcam.layout._inside import read_model
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,6 +45,8 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
             line and field.
         MissingExtraError: PyYAML is not installed.
     """
+    if dialect is not None:
+        dialect = check_text(dialect, "dialect", "scenario")
 
     def each(file: ScenarioFile) -> tuple[Scenario, ...]:
         scenarios = file.each()

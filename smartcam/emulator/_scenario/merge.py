@@ -1,9 +1,10 @@
-"""What an emulated camera is made of: a scenario, and what was given beside it."""
+"""Put an emulated camera together: a scenario, and the options that were given beside it."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import check_all, check_text
 from smartcam._suggestions import did_you_mean
 from smartcam.emulator._application import Application, make_application
 from smartcam.emulator._bvs.quirks import Quirks
@@ -11,8 +12,7 @@ from smartcam.emulator._scenario.file import load_scenario
 from smartcam.emulator._scenario.scenario import Scenario
 from smartcam.emulator._scenario.timeline import Cue
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._base import Transport
-from smartcam.protocols._bvs import BVS
+from smartcam.protocols import BVS, Transport
 from smartcam.settings import validated
 
 if TYPE_CHECKING:
@@ -38,10 +38,13 @@ def make_plan(
     """
     changes = {key: value for key, value in given.items() if value is not None}
     for what, names in _KNOWN.items():
-        if what in changes and changes[what] not in names:
+        if what not in changes:
+            continue
+        word = changes[what] = check_text(changes[what], what, "emulator", most=100)
+        if word not in names:
             raise ConfigurationError(
-                f"emulator: {what} {changes[what]!r} is unknown; known are {', '.join(names)}"
-                f"{did_you_mean(str(changes[what]), names)}"
+                f"emulator: {what} {word!r} is unknown; known are {', '.join(names)}"
+                f"{did_you_mean(word, names)}"
             )
     if scenario is None:
         base = Scenario()
@@ -49,11 +52,13 @@ def make_plan(
         base = scenario
     else:
         base = load_scenario(scenario, dialect=changes.get("dialect"))
-    if isinstance(changes.get("quirks"), dict):
+    if "quirks" in changes:
         changes["quirks"] = validated(Quirks, changes["quirks"], "quirks")
-    added = [make_application(application) for application in applications]
+    given_ones = check_all(applications, "applications", "a list of applications", "emulator")
+    added = [make_application(application) for application in given_ones]
     ids = {application.id for application in added}
     changes["applications"] = (*added, *(a for a in base.applications if a.id not in ids))
+    timeline = check_all(timeline, "timeline", "a list of cues", "emulator")
     cues = (validated(Cue, one, f"cue {number}") for number, one in enumerate(timeline, start=1))
     changes["timeline"] = (*base.timeline, *cues)
     plan = base.model_copy(update=changes)

@@ -11,8 +11,8 @@ from smartcam.emulator._bvs.quirks import Quirks
 from smartcam.emulator._data import EmulatorData
 from smartcam.emulator._scenario.timeline import Cue
 from smartcam.exceptions import ConfigurationError, UnsupportedError
-from smartcam.protocols._base import load_protocol
-from smartcam.protocols._bvs import BVS, HANDBOOK
+from smartcam.protocols import BVS
+from smartcam.protocols._inside import HANDBOOK, load_protocol
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -97,7 +97,7 @@ class Scenario(EmulatorData):
 
     @property
     def is_random(self) -> bool:
-        """Whether chance has a part in the timeline."""
+        """True if chance has a part in the timeline."""
         return any(cue.is_random for cue in self.timeline)
 
     def mistake(self) -> Mistake | None:

@@ -1,4 +1,4 @@
-"""What an emulated camera can enter."""
+"""The states that an emulated camera can enter."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class DeviceState(enum.Enum):
-    """What a camera can enter: a mode, an inspection, a session, a bit of the status word."""
+    """The states that a camera can enter: a mode, an inspection, a session, a status bit."""
 
     STOPPED = "stopped"
     RUNNING = "running"

@@ -49,7 +49,7 @@ MAX_AT_ONCE = 1000
 with a warning."""
 
 MAX_FAULTS_OF_CUE = 100
-"""Faults of one cue: as many as anybody writes."""
+"""Faults of one cue at most, far more than anybody writes."""
 
 _MOMENTS = ("at", "entering", "command")
 
@@ -72,7 +72,7 @@ def _as_list(value: object) -> object:
 
 
 class Cue(EmulatorData):
-    """When something happens, and what.
+    """A moment, and what happens at it.
 
     At most one of ``at``, ``entering`` and ``command`` says when; with none of them it is when the
     emulator starts.
@@ -138,12 +138,12 @@ class Cue(EmulatorData):
 
     @property
     def is_random(self) -> bool:
-        """Whether chance has a part in it."""
+        """True if chance has a part in the cue."""
         return self.chance < 1 or self.spread > 0
 
     @property
     def limit(self) -> int | None:
-        """How often it applies, None for as often as it comes."""
+        """Number of times that the cue applies, None for as often as its moment comes."""
         if self.times is None and (self.every is not None or self.command is not None):
             return None
         return self.times or 1
@@ -160,7 +160,7 @@ class _CueState:
 
     @property
     def over(self) -> bool:
-        """Whether no later moment matters."""
+        """True if no later moment matters."""
         limit = self.cue.limit
         return limit is not None and self.seen >= self.cue.nth - 1 + limit
 
@@ -206,12 +206,12 @@ class Timeline:
 
     @property
     def watches(self) -> bool:
-        """Whether it wants to know of states."""
+        """True if the timeline wants to know of states."""
         return bool(self._entering)
 
     @property
     def done(self) -> list[int]:
-        """How often each cue has happened."""
+        """Number of times that each cue has happened."""
         return [row.done for row in self._rows]
 
     def start(self) -> None:
@@ -232,7 +232,7 @@ class Timeline:
         self._timer.set(None)
 
     def entered(self, state: DeviceState) -> None:
-        """The camera has entered a state."""
+        """Note that the camera has entered a state."""
         for row in self._entering:
             if row.cue.entering is state:
                 self._come(row)

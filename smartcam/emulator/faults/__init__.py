@@ -21,7 +21,7 @@ There is no chance in any of it: the same list and the same messages give the sa
 A fault that is new is a class here, with a ``kind``, in ``__all__`` and in one of the unions below.
 What it does is a row: of ``_CHANGES`` (what it makes of a message) or ``_REBUILDS`` (of all that go
 together) in ``_wire_effects.py``, or of ``_ACTIONS`` in ``_device_effects.py``. The tests then ask
-for a row in ``docs/emulator.md`` and the schema (``smartcam-emulator --schema``).
+for the schema (``smartcam-emulator --schema``); ``docs/emulator.md`` shows the docstrings.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from pydantic import (
     model_validator,
 )
 
+from smartcam._arguments import check_all
 from smartcam.emulator._data import Seconds
 from smartcam.emulator.faults._base import (
     MAX_BYTES,
@@ -501,9 +502,10 @@ class FiredFault(NamedTuple):
     """A fault that has happened.
 
     Attributes:
-        time: of the emulator's clock, seconds.
-        fault: which one, as it was given.
-        message: the message it applied to, as its sender meant it; None where it waited for none.
+        time: seconds of the emulator's clock.
+        fault: the fault, as it was given.
+        message: the message that the fault applied to, as its sender meant it; None where it
+            waited for none.
     """
 
     time: float
@@ -518,7 +520,8 @@ def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, 
         ConfigurationError: one is wrong; the text says which, counted from 1, and names the field.
     """
     made: list[Fault] = []
-    for number, one in enumerate(given, start=1):
+    faults = check_all(given, "faults", "a list of faults", "emulator")
+    for number, one in enumerate(faults, start=1):
         try:
             made.append(_ADAPTER.validate_python(one))
         except ValidationError as exc:

@@ -1,4 +1,4 @@
-"""What all faults have: which message they wait for."""
+"""The base of all faults: the message that a fault waits for."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pydantic import (
 )
 
 from smartcam.emulator._data import EmulatorData
+from smartcam.protocols import BVS
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import BVS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -81,11 +81,11 @@ class BaseFault(EmulatorData):
     """Base of all faults: which message it waits for."""
 
     default_sender: ClassVar[m.Sender]
-    """Whose messages are meant where neither name nor ``sender`` says so."""
+    """Sender of the messages that are meant where neither name nor ``sender`` says so."""
     senders: ClassVar[frozenset[m.Sender]] = frozenset(m.Sender)
-    """Whose messages it can wait for."""
+    """Senders whose messages the fault can wait for."""
     can_act_at_once: ClassVar[bool]
-    """Whether it acts at once where it is given nothing to wait for."""
+    """True if the fault acts at once where it is given nothing to wait for."""
 
     on: On = Field(
         default=None,
@@ -156,7 +156,7 @@ class BaseFault(EmulatorData):
 
     @property
     def speaker(self) -> m.Sender | None:
-        """Who sends the message it waits for, None where it acts at once."""
+        """Sender of the message that the fault waits for, None where it acts at once."""
         if isinstance(self.on, str):
             return MESSAGE_NAMES[self.on].sender
         if self.sender is not None:
@@ -164,7 +164,7 @@ class BaseFault(EmulatorData):
         return None if self.on is None and self.can_act_at_once else self.default_sender
 
     def fits(self, name: str, message_id: int) -> bool:
-        """Whether it waits for such a message of its speaker."""
+        """Return True if the fault waits for such a message of its speaker."""
         return self.on is None or self.on == name or self.on == message_id
 
 

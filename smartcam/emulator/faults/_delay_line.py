@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Ending(NamedTuple):
-    """What becomes of a connection."""
+    """The end of a connection: its kind, its cause, and its time if it is half open."""
 
     # what happens; ``eof`` is that the sender has ended
     how: Literal["close", "reset", "stall", "half_open", "eof"]
@@ -76,7 +76,7 @@ class _Waiting(Generic[T]):
 
     @property
     def when(self) -> int:
-        """When it passes if nothing more comes, nanoseconds."""
+        """Time at which the message passes if nothing more comes, nanoseconds."""
         return self.until if self.missing > 0 else self.due
 
     def pause(self, now: int, turns: int) -> None:

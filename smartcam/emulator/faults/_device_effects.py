@@ -1,4 +1,4 @@
-"""What device faults do to the camera."""
+"""Do to the camera's device what device faults say."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _CONDITIONS = {"system_error": Status.SYSTEM_ERROR, "overheat": Status.OVERHEAT}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stage:
-    """What faults act on."""
+    """The object that faults act on."""
 
     device: Any
     refuse: Callable[[float], None]  # closes the port for so many seconds
@@ -77,7 +77,7 @@ _NEEDS: Mapping[type[DeviceFault], str] = {
     f.MovePart: "scene",
     f.RemovePart: "scene",
 }
-"""What a device must have for a fault; those that are not here are done without it."""
+"""Methods that a device must have for a fault, by name; faults that are not here do without any."""
 
 
 def kinds_of(device: object) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""Which faults wait for what, which of them a message brings about, and which have happened."""
+"""Match faults with messages: which wait, which a message brings about, which have happened."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults import Fault
     from smartcam.emulator.faults._base import BaseFault
     from smartcam.emulator.faults._wire_effects import WireCodec
-    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols import Frame
 
 _log = logging.getLogger("smartcam.emulator")
 

@@ -1,4 +1,4 @@
-"""What faults make of one message: transmissions, to be passed on as they say. Pure."""
+"""Make of one message the transmissions that faults say; pure."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from smartcam.exceptions import FrameError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from smartcam.protocols import Frame, MessageRow
     from smartcam.protocols import messages as m
-    from smartcam.protocols._framed.dialect import MessageRow
-    from smartcam.protocols._framed.framing import Frame
 
 
 class WireFramer(Protocol):
@@ -23,7 +22,7 @@ class WireFramer(Protocol):
 
     @property
     def pending(self) -> bytes:
-        """What is unfinished."""
+        """Bytes of an unfinished frame."""
         ...
 
     def feed(self, data: bytes) -> None:
@@ -54,11 +53,11 @@ class WireCodec(Protocol):
     def __hash__(self) -> int: ...
 
     def framer(self, max_length: int) -> WireFramer:
-        """Return what cuts a client's bytes."""
+        """Return a new framer that cuts a client's bytes into frames."""
         ...
 
     def has(self, message_type: type[m.Message], /) -> bool:
-        """Return whether there is such a message."""
+        """Return True if the dialect has a message of this type."""
         ...
 
     def message_id(self, message: m.Message, /) -> int:

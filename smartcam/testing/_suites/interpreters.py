@@ -31,17 +31,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 import pytest
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, PluginError
-from smartcam.interpreters._base import Context, Interpreter, PlainInterpreter, Reader, resolve
+from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve
 from smartcam.layout import Layout
 from smartcam.models import Pose, jsonable
 from smartcam.registry import INTERPRETERS
+from smartcam.testing._suites.in_words import SaysWhatWasExpected
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from hypothesis.strategies import DataObject
 
-    from smartcam.interpreters._base import Spec
+    from smartcam.interpreters import Spec
 
 MAX_ERROR_TEXT = 500
 """Characters of an error's text: a container's bytes are in it, 64 of them at most."""
@@ -50,7 +51,7 @@ MAX_PLACES = 256
 """Places of a container at which one thing is tried, at most."""
 
 TRAILING = (b"\0", b"\xff", b"\0" * 3, b"A" * 4, b"\0" * 50, b"A" * 500)
-"""What may stand behind a container."""
+"""Bytes that may stand behind a container."""
 
 NOT_FINITE = tuple(
     struct.pack(order + code, number)
@@ -69,16 +70,17 @@ _ADDRESS = re.compile(r"<.* at 0x[0-9A-Fa-f]+>")
 
 @dataclass(frozen=True)
 class ContainerSample:
-    """A container and what it means.
+    """A container and the value that it stands for.
 
     Attributes:
-        data: its bytes behind the application id, numbers little endian.
-        value: what the interpreter makes of it; for an array its ``tolist()`` will do.
-        layout: what the user writes behind the interpreter's name, None for nothing.
-        big: the same container with big-endian numbers, the same bytes where it has none. It may be
-            left out where the interpreter has a layout, which says where numbers stand.
-        sequence: its sequence number.
-        name: for people.
+        data: bytes of the container behind the application id, with little-endian numbers.
+        value: value that the interpreter returns; for an array its ``tolist()`` will do.
+        layout: text that the user writes behind the interpreter's name, None for nothing.
+        big: bytes of the container with big-endian numbers, equal to ``data`` where it has no
+            numbers. It may be left out where the interpreter has a layout, which says where
+            numbers stand.
+        sequence: sequence number of the container.
+        name: name of the sample for people.
     """
 
     data: bytes
@@ -89,8 +91,8 @@ class ContainerSample:
     name: str = ""
 
 
-class InterpreterSuite:
-    """What holds for every interpreter.
+class InterpreterSuite(SaysWhatWasExpected):
+    """The tests that every interpreter has to pass.
 
     Attributes:
         spec: the interpreter as ``interpret_as`` takes it: a function, a class, an object, a name.
@@ -146,7 +148,7 @@ class InterpreterSuite:
             assert _like(value, sample.value), f"expected {sample.value!r}, got {value!r}"
 
     def test_sequence_number_is_as_expected(self, sample: ContainerSample) -> None:
-        """It is that of the layout's field, or None; of any bytes it is one or an error."""
+        """Check that it is that of the layout's field, or None, or an error."""
         interpreter = self.make(sample.layout)
         reader = _reader(interpreter, sample.data)
         found = interpreter.sequence(reader)
@@ -196,7 +198,7 @@ class InterpreterSuite:
         assert nameless is None, f"JSON has no word for {nameless and nameless[0]!r} in {value!r}"
 
     def test_big_endian_gives_the_same_value(self, sample: ContainerSample) -> None:
-        """The camera's status says which order it is: it stands in ``reader.context``."""
+        """Check both byte orders; the camera's status tells the order, in ``reader.context``."""
         interpreter = self.make(sample.layout)
         big = sample.big
         if big is None:
@@ -217,14 +219,14 @@ class InterpreterSuite:
             see(interpreter, data)
 
     def test_longer_container_is_a_value_or_told(self, sample: ContainerSample) -> None:
-        """What stands behind a container is no other kind of error either."""
+        """Check that bytes behind a container cause no other kind of error either."""
         interpreter = self.make(sample.layout)
         for more in TRAILING:
             see(interpreter, sample.data + more)
             see(interpreter, sample.data + sample.data + more)
 
     def test_any_bytes_are_a_value_or_told(self, sample: ContainerSample) -> None:
-        """The user may have named the wrong interpreter."""
+        """Check any bytes, since the user may have named the wrong interpreter."""
         from smartcam.testing._suites import strategies
 
         interpreter = self.make(sample.layout)
@@ -261,7 +263,7 @@ class InterpreterSuite:
     # ------------------------------------------------------------------ what it says of itself
 
     def test_containers_of_a_burst_are_read_as_one_by_one(self, sample: ContainerSample) -> None:
-        """A PlainInterpreter's ``read_all`` and ``interpret`` are no other than its ``read``."""
+        """Check that a PlainInterpreter's ``read_all`` and ``interpret`` do what ``read`` does."""
         interpreter = self.make(sample.layout)
         if not isinstance(interpreter, PlainInterpreter):
             return  # the client reads them one by one
@@ -412,7 +414,7 @@ def _mutable(value: object) -> list[object]:
 
 
 def _is_open(value: object) -> bool:
-    """Whether a value is a dataclass's object that can be changed."""
+    """Return True if a value is a dataclass's object that can be changed."""
     if not is_dataclass(value) or isinstance(value, type):
         return False
     return not cast("Any", value).__dataclass_params__.frozen
@@ -424,7 +426,7 @@ def _is_array(value: object) -> bool:
 
 
 def _like(value: Any, expected: Any) -> bool:
-    """Whether a value is what an author wrote down."""
+    """Return True if a value is what an author wrote down."""
     if _is_array(value):
         return _same(value, expected) if _is_array(expected) else value.tolist() == expected
     if isinstance(value, float) and isinstance(expected, float):
@@ -433,7 +435,7 @@ def _like(value: Any, expected: Any) -> bool:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two values are alike, types and numbers that are none included."""
+    """Return True if two values are alike, types and NaN included."""
     if type(one) is not type(other):
         return False
     if _is_array(one):

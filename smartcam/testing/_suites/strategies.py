@@ -1,4 +1,4 @@
-"""What Hypothesis draws for the suites: bytes, and places to cut them.
+"""Hypothesis strategies for the suites: bytes, and places to cut them.
 
 A check is called with each drawing by :func:`each_drawn`, which makes a test of its own of it: a
 method that several classes inherit cannot be one. The number of examples is the profile's.
@@ -9,16 +9,12 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import MissingExtraError
+from smartcam._extras import missing
 
 try:
     from hypothesis import HealthCheck, given, settings, strategies
 except ModuleNotFoundError as _exc:
-    raise MissingExtraError(
-        "smartcam's suites draw bytes with hypothesis, which is not installed: "
-        'pip install "smartcam[suites]"',
-        extra="suites",
-    ) from _exc
+    raise missing("hypothesis") from _exc
 
 st = strategies
 
@@ -48,7 +44,7 @@ def each_drawn(check: Callable[[DataObject], None]) -> None:
 
 
 def noise(samples: Sequence[bytes]) -> SearchStrategy[bytes]:
-    """Any bytes, and samples that are cut, repeated, or have a byte changed."""
+    """Draw any bytes, and samples that are cut, repeated, or have a byte changed."""
     some: SearchStrategy[bytes] = st.binary(max_size=MAX_NOISE)
     if not any(samples):
         return some

@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.emulator.faults._delay_line import Ending, Transmission
+from smartcam.emulator._inside import Ending, Transmission
 from smartcam.testing.proxy._rules import (
     CoalesceBytes,
     Cut,

@@ -12,8 +12,7 @@ import socket
 from random import Random
 from typing import TYPE_CHECKING
 
-from smartcam.emulator._clock import RealClock
-from smartcam.emulator.faults._delay_line import DelayLine, Ending
+from smartcam.emulator._inside import DelayLine, Ending, RealClock
 from smartcam.testing.proxy._byte_edits import Edit, Editor
 from smartcam.testing.proxy._rules import MAX_HOLD, DelayBytes, Direction, Rate
 
@@ -30,7 +29,7 @@ MAX_HELD = 1 << 18
 """Bytes that wait in one direction before the proxy reads no more: one chunk behind the limit and
 what rules insert come on top. It leaves room for what a rule may hold back."""
 
-TICK = 0.01
+WRITE_INTERVAL = 0.01
 """Seconds between two writes where the rate is limited."""
 
 TURNS = 2
@@ -167,7 +166,7 @@ class Pipe:
                 return True
             size = len(self._unsent)
             if self._rate is not None:
-                size = min(size, max(1, int(self._rate.bytes_per_second * TICK)))
+                size = min(size, max(1, int(self._rate.bytes_per_second * WRITE_INTERVAL)))
             written = self._write(self._unsent[:size])
             if not written:
                 return False
@@ -188,6 +187,7 @@ class Pipe:
         except OSError:
             self._connection.lost(self._direction, self._editor.position)
             return 0
+        self._connection.carried(self._direction)
         self._connection.log.passed.add(self._direction, written)
         return written
 

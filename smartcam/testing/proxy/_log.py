@@ -1,11 +1,11 @@
-"""What a link proxy really did: its log and its counts."""
+"""The log of what a link proxy really did, and its counts."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import NamedTuple
 
-from smartcam.emulator._tally import Tally
+from smartcam.emulator._inside import Tally
 
 MAX_ENTRIES = 10_000
 """Entries kept; the oldest go first. The counts go on."""
@@ -18,8 +18,8 @@ class Entry(NamedTuple):
         what: a rule's name in small letters, or ``connect``, ``eof`` (a side sends no more),
             ``lost`` (a side reset the connection), ``no target``, ``too many``, ``not accepted``,
             ``resume``, ``full`` and ``refused`` (a datagram that did not go out).
-        connection: its number, from 1; 0 where there is none.
-        direction: ``up`` or ``down``; empty where it is about both.
+        connection: number of the connection, from 1; 0 where the entry is about none.
+        direction: ``up`` or ``down``; empty where the entry is about both.
         at: offset in the sender's stream, or number of the datagram; None for what the proxy was
             told while it ran.
     """

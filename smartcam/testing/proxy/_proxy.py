@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from typing import Self
 
 HOST = "127.0.0.1"
-"""Where proxies listen: tests stay on the loopback."""
+"""Address on which proxies listen: tests stay on the loopback."""
 
 RELAYS: dict[str, type[StreamRelay | DatagramRelay]] = {"tcp": StreamRelay, "udp": DatagramRelay}
 
@@ -35,8 +35,8 @@ class LinkProxy:
     proactor of Windows. The methods may be called at any time while it is open; they act at once.
 
     Args:
-        target_host: where the camera is.
-        target_port: its port.
+        target_host: name or address of the camera.
+        target_port: port of the camera.
         transport: ``tcp`` or ``udp``.
         rules: what to do, see :mod:`smartcam.testing.proxy._rules`. They are looked at when a
             connection is made.
@@ -47,7 +47,7 @@ class LinkProxy:
     Attributes:
         rules: the list; changes hold for connections to come.
         host: where the proxy listens.
-        port: its port, 0 until it is open.
+        port: port that the proxy listens on, 0 until it is open.
         log: what happened, the oldest first; bounded.
         counts: how often each thing in the log happened, all of them counted.
         passed: what the proxy sent, by direction: bytes on TCP, datagrams on UDP.

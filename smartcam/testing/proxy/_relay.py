@@ -1,4 +1,4 @@
-"""What the TCP and the UDP half of the link proxy have in common: a port and who is connected."""
+"""The part that the link proxy's TCP and UDP halves share: a port, and who is connected."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Proxied(ABC):
-    """What goes from one client to the target and back."""
+    """The traffic of one client with the target."""
 
     def __init__(self, relay: Relay[Any], number: int) -> None:
         self.number = number  # of the connection, from 1
@@ -129,19 +129,21 @@ class Relay(ABC, Generic[C]):
 
     def _listen(self) -> None:
         if self._socket is not None:
-            if self.kind is socket.SOCK_STREAM:
-                self._socket.listen()
-            asyncio.get_running_loop().add_reader(self._socket, self._receive, self._socket)
+            self._watch(self._socket)
 
     def _shut(self) -> None:
         sock, self._socket = self._socket, None
         if sock is not None:
-            asyncio.get_running_loop().remove_reader(sock)
+            self._unwatch(sock)
             sock.close()
 
     @abstractmethod
-    def _receive(self, sock: socket.socket) -> None:
-        """Take what has come to the port."""
+    def _watch(self, sock: socket.socket) -> None:
+        """Take what comes to the port from now on."""
+
+    @abstractmethod
+    def _unwatch(self, sock: socket.socket) -> None:
+        """Take nothing more."""
 
     def _turn_away(self) -> None:
         """Have the system refuse what comes to the port."""

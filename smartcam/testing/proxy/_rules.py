@@ -1,4 +1,4 @@
-"""What a link proxy does to what passes it: small values, in one list.
+"""The rules of a link proxy for what passes it: small values, in one list.
 
 A rule is for one direction, ``up`` from client to camera or ``down`` from camera to client, and for
 one connection or for every one. On TCP there are two kinds of place:
@@ -39,7 +39,7 @@ MAX_HOLD = 1 << 16
 
 
 _Bound: TypeAlias = "tuple[str, Callable[[Any], bool]]"
-"""What a value must be, and whether one is."""
+"""Text on what a value must be, and the function that checks it."""
 
 _BOUNDS: Mapping[str, _Bound] = {
     "direction": ("direction must be 'up' or 'down'", lambda way: way in DIRECTIONS),
@@ -58,7 +58,7 @@ _BOUNDS: Mapping[str, _Bound] = {
     "copies": ("copies must be 1 to 100", lambda copies: 1 <= copies <= 100),
     "behind": ("behind must be 1 or more datagrams", lambda count: count >= 1),
 }
-"""What the fields of a rule must be."""
+"""Bounds of a rule's fields."""
 
 _POSITIVE: Mapping[str, _Bound] = {
     **_BOUNDS,
@@ -68,11 +68,12 @@ _POSITIVE: Mapping[str, _Bound] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """What all rules have.
+    """Base of all rules.
 
     Args:
-        direction: which way it looks at.
-        connection: number of the connection it is for, from 1; None is every one. On UDP each
+        direction: direction of the data that the rule applies to.
+        connection: number of the connection that the rule is for, from 1; None is every one. On
+            UDP each
             client address is a connection.
     """
 
@@ -92,7 +93,7 @@ class Rule:
                 _check(self, holds(getattr(self, one.name)), text)
 
     def concerns(self, connection: int, direction: Direction) -> bool:
-        """Whether the rule is for this direction of this connection."""
+        """Return True if the rule is for this direction of this connection."""
         return self.direction == direction and self.connection in {None, connection}
 
     def ahead(self, by: int) -> Self:
@@ -304,7 +305,7 @@ class DatagramRule(Rule):
     seed: int = 0
 
     def picks(self, number: int, chance: Random) -> bool:
-        """Whether the rule acts on a datagram."""
+        """Return True if the rule acts on a datagram."""
         if self.number is None:
             return chance.random() < self.probability
         return number == self.number

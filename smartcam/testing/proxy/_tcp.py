@@ -7,24 +7,29 @@ and there is no task; a connection owns at most one timer, and so does each of i
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import errno
+import logging
 import socket
 import struct
 from typing import TYPE_CHECKING, ClassVar
 
+from smartcam._accepting import BACKLOG, Acceptor, Places
 from smartcam.testing.proxy._directions import CHUNK, Pipe, end_sending
 from smartcam.testing.proxy._relay import Proxied, Relay
 from smartcam.testing.proxy._rules import DIRECTIONS, Direction, StreamRule
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Sequence
 
+    from smartcam.testing.proxy._log import LinkLog
     from smartcam.testing.proxy._rules import Rule
 
+_log = logging.getLogger("smartcam.testing")
+
 MAX_CONNECTIONS = 64
-"""Connections open at once; more are reset. A camera has one client."""
+"""Connections open at once; the one that was not answered for longest makes room."""
 
 CONNECT_TIMEOUT = 5.0
 """Seconds that the target has to take a connection."""
@@ -33,7 +38,7 @@ LINGER = 1.0
 """Seconds that a cut connection is still read after its FIN, so that it does not end in a RST."""
 
 CALLING = {0, errno.EINPROGRESS, errno.EWOULDBLOCK}
-"""What ``connect_ex`` says of a call that may succeed."""
+"""Results of ``connect_ex`` for a call that may succeed."""
 
 HARD_END = struct.pack("ii", 1, 0)
 """SO_LINGER of no time: closing sends RST."""
@@ -52,6 +57,7 @@ class ProxiedConnection(Proxied):
         self._pipes: dict[Direction, Pipe] = {}
         self._timer: asyncio.TimerHandle | None = None
         self._lingering: set[socket.socket] = set()
+        self._carried: set[Direction] = set()
         self._connecting = True
         for sock in (self._client, self._target):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -66,8 +72,22 @@ class ProxiedConnection(Proxied):
 
     # ------------------------------------------------------------------ what happens to it
 
+    @property
+    def settled(self) -> bool:
+        """True once bytes went both ways."""
+        return len(self._carried) == len(DIRECTIONS)
+
+    def turn_away(self, why: str) -> None:
+        """End it to make room, or because client and target did not speak in time."""
+        self.note("turned away")
+        self.reset()
+
+    def carried(self, direction: Direction) -> None:
+        """Take that bytes went in a direction."""
+        self._carried.add(direction)
+
     def lost(self, direction: Direction, at: int) -> None:
-        """A socket is broken; the other side is told so."""
+        """Tell the other side that a socket is broken."""
         self.note("lost", direction, at)
         self.reset()
 
@@ -167,7 +187,19 @@ class ProxiedConnection(Proxied):
         self._stop()
         self._client.close()
         self._target.close()
-        del self._relay.members[self.number]
+        self._relay.forget(self)
+
+
+class _RawAcceptor(Acceptor[ProxiedConnection]):
+    """Hands accepted sockets on as they are."""
+
+    def __init__(self, relay: StreamRelay, places: Places[ProxiedConnection]) -> None:
+        super().__init__(asyncio.Protocol, places, _log, name="smartcam.proxy")
+        self._relay = relay
+
+    def adopt(self, connection: socket.socket) -> None:
+        """Pair it with a socket to the target."""
+        self._relay.take(connection)
 
 
 class StreamRelay(Relay[ProxiedConnection]):
@@ -175,6 +207,13 @@ class StreamRelay(Relay[ProxiedConnection]):
 
     kind: ClassVar[socket.SocketKind] = socket.SOCK_STREAM
     rule_kind: ClassVar[type[Rule]] = StreamRule
+
+    def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
+        super().__init__(rules, log)
+        places: Places[ProxiedConnection] = Places(
+            MAX_CONNECTIONS, own="a client that was answered"
+        )
+        self._acceptor = _RawAcceptor(self, places)
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Pass nothing any more."""
@@ -188,21 +227,31 @@ class StreamRelay(Relay[ProxiedConnection]):
         for one in self.chosen(None):
             one.resume()
 
-    def _receive(self, sock: socket.socket) -> None:
-        try:
-            client, _ = sock.accept()
-        except (BlockingIOError, InterruptedError, ConnectionAbortedError):
-            return  # the client has changed its mind
-        except OSError:  # no file descriptor is left
-            self.log.note("not accepted")
-            self.refuse(True)
-            return
-        client.setblocking(False)
+    def take(self, client: socket.socket) -> None:
+        """Pair a client's socket with one to the target."""
         self._number += 1
-        if len(self.members) >= MAX_CONNECTIONS:
-            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, HARD_END)
+        try:
+            address = client.getpeername()
+            connection = ProxiedConnection(self, self._number, client)
+        except OSError:  # the client is gone again, or no file descriptor is left
+            self.log.note("not accepted", self._number)
             client.close()
-            self.log.note("too many", self._number)
             return
-        connection = self.members[self._number] = ProxiedConnection(self, self._number, client)
-        connection.connect()
+        self.members[self._number] = connection
+        refusal = self._acceptor.enter(connection, address)
+        if refusal:
+            connection.turn_away(refusal)
+        else:
+            connection.connect()
+
+    def forget(self, connection: ProxiedConnection) -> None:
+        """Know a connection no longer that is closed."""
+        self._acceptor.leave(connection)
+        del self.members[connection.number]
+
+    def _watch(self, sock: socket.socket) -> None:
+        sock.listen(BACKLOG)
+        self._acceptor.open(sock)
+
+    def _unwatch(self, sock: socket.socket) -> None:
+        self._acceptor.close()

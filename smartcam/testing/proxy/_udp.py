@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import socket
 from collections import Counter
 from random import Random
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from smartcam.emulator._clock import RealClock
-from smartcam.emulator.faults._delay_line import DelayLine, Transmission
+from smartcam._accepting import Places
+from smartcam.emulator._inside import DelayLine, RealClock, Transmission
 from smartcam.exceptions import ConfigurationError
 from smartcam.testing.proxy._relay import Proxied, Relay
 from smartcam.testing.proxy._rules import (
@@ -25,15 +26,19 @@ from smartcam.testing.proxy._rules import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from smartcam.testing.proxy._log import LinkLog
     from smartcam.testing.proxy._rules import Rule
 
 MAX_SIZE = 1 << 16
 """Bytes read of a datagram; none is longer."""
 
 MAX_CLIENTS = 64
-"""Client addresses that are known; beyond it the one known longest is forgotten."""
+"""Client addresses that are known; the one that was not answered for longest makes room."""
 
-MAX_WAITING = 1024
+ANSWERED_GRACE = 60.0
+"""Seconds that a client keeps its place for certain after the target has answered it."""
+
+MAX_WAITING_DATAGRAMS = 1024
 """Datagrams that rules hold back; more are lost and counted as ``full``."""
 
 
@@ -44,9 +49,14 @@ class _Peer(Proxied):
         super().__init__(relay, number)
         self.address = address
         self._relay = relay
+        self._answered = -ANSWERED_GRACE
         self._sock = socket.socket(relay.family, socket.SOCK_DGRAM)
-        self._sock.setblocking(False)
-        self._sock.connect(relay.target)
+        try:
+            self._sock.setblocking(False)
+            self._sock.connect(relay.target)
+        except OSError:
+            self._sock.close()
+            raise
         self._loop.add_reader(self._sock, self._receive)
         self._seen: Counter[Direction] = Counter()
         self._lines = {way: self._line(way) for way in DIRECTIONS}
@@ -85,12 +95,24 @@ class _Peer(Proxied):
                 sent.delay += rule.seconds + chance.random() * rule.jitter
             elif isinstance(rule, Reorder):
                 sent.gather, sent.behind = (rule.behind, rule.seconds), True
-        if (sent.delay or sent.behind) and sum(map(len, self._lines.values())) >= MAX_WAITING:
+        if (sent.delay or sent.behind) and sum(
+            map(len, self._lines.values())
+        ) >= MAX_WAITING_DATAGRAMS:
             self.note("full", direction)
             return
         line = self._lines[direction]
         line.put([sent], 0 if sent.behind else 1)
         line.run()
+
+    @property
+    def settled(self) -> bool:
+        """True if the target has answered the client lately."""
+        return self._loop.time() - self._answered < ANSWERED_GRACE
+
+    def turn_away(self, why: str) -> None:
+        """Forget the client, for another one."""
+        self.note("turned away")
+        self.reset()
 
     def cut(self) -> None:
         """Forget the client; datagrams know no orderly end."""
@@ -102,6 +124,7 @@ class _Peer(Proxied):
         What is on its way is lost.
         """
         del self._relay.members[self.address]
+        self._relay.places.leave(self)
         for line in self._lines.values():
             line.close()
         self._loop.remove_reader(self._sock)
@@ -127,6 +150,8 @@ class _Peer(Proxied):
         except OSError:  # the system says that nothing listens there
             self.note("no target", "up")
             return
+        self._answered = self._loop.time()
+        self._relay.places.move_back(self, self._answered)
         self.take("down", data)
 
     def _send(self, direction: Direction, batch: list[tuple[Transmission, bytes]]) -> None:
@@ -149,6 +174,10 @@ class DatagramRelay(Relay[_Peer]):
 
     kind: ClassVar[socket.SocketKind] = socket.SOCK_DGRAM
     rule_kind: ClassVar[type[Rule]] = DatagramRule
+
+    def __init__(self, rules: Sequence[Rule], log: LinkLog) -> None:
+        super().__init__(rules, log)
+        self.places: Places[_Peer] = Places(MAX_CLIENTS, own="an answer")
 
     def stall(self, direction: Direction | None, connection: int | None) -> None:
         """Lose everything; of one client alone is not possible."""
@@ -178,18 +207,32 @@ class DatagramRelay(Relay[_Peer]):
         self._bind(self._address)
         self._listen()
 
+    def _watch(self, sock: socket.socket) -> None:
+        asyncio.get_running_loop().add_reader(sock, self._receive, sock)
+
+    def _unwatch(self, sock: socket.socket) -> None:
+        asyncio.get_running_loop().remove_reader(sock)
+
     def _receive(self, sock: socket.socket) -> None:
         try:
             data, address = sock.recvfrom(MAX_SIZE)
         except OSError:  # nothing there, or a client's socket is shut, which is not for us to know
             return
-        self._peer(address).take("up", data)
+        peer = self.members.get(address) or self._newcomer(address)
+        if peer is not None:
+            peer.take("up", data)
 
-    def _peer(self, address: Any) -> _Peer:
-        if address not in self.members:
-            if len(self.members) >= MAX_CLIENTS:
-                self.reset(next(iter(self.members.values())).number)
-            self._number += 1
-            self.members[address] = _Peer(self, self._number, address)
-            self.log.note("connect", self._number)
-        return self.members[address]
+    def _newcomer(self, address: Any) -> _Peer | None:
+        """Return a client that was not known; None where there is no room for it."""
+        self._number += 1
+        try:
+            peer = _Peer(self, self._number, address)
+        except OSError:  # no file descriptor is left
+            self.log.note("not accepted", self._number)
+            return None
+        self.members[address] = peer
+        if self.places.enter(peer, str(address[0]), asyncio.get_running_loop().time()):
+            peer.turn_away("everybody else was answered lately")
+            return None
+        self.log.note("connect", self._number)
+        return peer

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING, Self
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from tests.emulator.stream_client import StreamClient
 
-    from smartcam.emulator._insight.camera import EmulatedInSight
+if TYPE_CHECKING:
+    from smartcam.emulator import EmulatedInSight
 
 GREETING = b"Welcome to In-Sight(tm)  8502P Session 0\r\nUser: "  # derived: a record of an 8502P
 PASSWORD = b"Password: "
@@ -20,28 +19,9 @@ INVALID = b"-1\r\n"
 FAILED = b"-2\r\n"
 HELD = b"-5\r\n"
 
-TIMEOUT = 5.0
 
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Let the loop turn until ``condition`` holds."""
-    async with asyncio.timeout(TIMEOUT):
-        while not condition():  # noqa: ASYNC110  what is waited for has no event to set
-            await asyncio.sleep(0)
-
-
-class TelnetClient:
+class TelnetClient(StreamClient):
     """A plain TCP client."""
-
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self.reader = reader
-        self.writer = writer
-
-    @classmethod
-    async def open(cls, emulator: EmulatedInSight) -> Self:
-        """Connect, say nothing."""
-        async with asyncio.timeout(TIMEOUT):
-            return cls(*await asyncio.open_connection(emulator.host, emulator.port))
 
     @classmethod
     async def log_in(cls, emulator: EmulatedInSight, number: int = 0) -> Self:
@@ -52,23 +32,6 @@ class TelnetClient:
         await client.ask(b"\r\n", LOGGED_IN)
         return client
 
-    async def __aenter__(self) -> Self:
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        self.writer.transport.abort()
-        # the transport lets go of its socket in the loop's next round
-        await asyncio.sleep(0)
-
-    def send(self, data: bytes) -> None:
-        self.writer.write(data)
-
-    async def expect(self, expected: bytes) -> None:
-        """Read exactly these bytes."""
-        async with asyncio.timeout(TIMEOUT):
-            got = await self.reader.readexactly(len(expected))
-        assert got == expected
-
     async def ask(self, command: bytes, answer: bytes) -> None:
         self.send(command)
         await self.expect(answer)
@@ -76,12 +39,3 @@ class TelnetClient:
     async def expect_nothing(self) -> None:
         """See that nothing was on its way: the next bytes answer what is asked now."""
         await self.ask(b"XX\r\n", UNKNOWN)
-
-    async def expect_end(self) -> None:
-        """See that the camera closes the connection and says nothing more."""
-        async with asyncio.timeout(TIMEOUT):
-            try:
-                rest = await self.reader.read()
-            except ConnectionResetError:
-                rest = b""
-        assert rest == b""

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.emulator._clock import ManualClock
-from smartcam.emulator._insight.camera import EmulatedInSight
+from smartcam.emulator import EmulatedInSight, ManualClock
 
 if sys.version_info < (3, 12):
     pytest.skip("needs Python 3.12 for CognexNativePy", allow_module_level=True)

@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam.emulator._clock import ManualClock
-from smartcam.emulator._insight.camera import EmulatedInSight
-from smartcam.emulator._insight.commands import InSightQuirks
-from smartcam.emulator._insight.job import BUILTIN_JOBS, Job
-from smartcam.protocols._insight import words
+from smartcam.emulator import EmulatedInSight, InSightQuirks, Job, ManualClock
+from smartcam.emulator._insight.job import BUILTIN_JOBS
+from smartcam.protocols._inside import words
 from tests.emulator.insight import insight_wire as wire
 from tests.emulator.insight.insight_wire import TelnetClient
 

@@ -10,12 +10,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from smartcam.emulator import Job
 from smartcam.emulator._insight.commands import InSightCommands
 from smartcam.emulator._insight.device import InSightDevice
 from smartcam.emulator._insight.image import bitmap, check_image, grey_pattern
-from smartcam.emulator._insight.job import Control, Job, make_job, shown
+from smartcam.emulator._insight.job import Control, make_job, shown
 from smartcam.exceptions import ConfigurationError
-from smartcam.protocols._insight.words import COMMANDS, StatusCode
+from smartcam.protocols._inside import StatusCode
+from smartcam.protocols._insight.words import COMMANDS
 
 SECOND = 1_000_000_000
 

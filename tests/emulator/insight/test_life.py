@@ -9,16 +9,15 @@ import socket
 import numpy as np
 import pytest
 
-from smartcam.emulator._clock import ManualClock
-from smartcam.emulator._insight.camera import EmulatedInSight
-from smartcam.emulator._insight.commands import InSightQuirks
+from smartcam.emulator import EmulatedInSight, InSightQuirks, ManualClock
 from smartcam.emulator._insight.connection import MAX_SESSIONS
-from smartcam.emulator._line_camera import MAX_WAITING
+from smartcam.emulator._line_camera import MAX_INPUT_BYTES
 from smartcam.emulator._line_codec import MAX_LOGGED
 from smartcam.emulator._links import _TcpLink
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from tests.emulator.insight import insight_wire as wire
 from tests.emulator.insight.insight_wire import TelnetClient
+from tests.handmade import until
 
 JOB = {"file": "1.job", "cells": {"A1": 5}, "acquisition_time": 0.1, "processing_time": 0.1}
 
@@ -215,8 +214,8 @@ async def test_commands_behind_one_under_way_wait_in_a_bounded_buffer() -> None:
         (link,) = emulator._clients
         assert isinstance(link, _TcpLink)
         client.send(b"SW8\r\n" + 500 * line)
-        await wire.until(lambda: not link._transport.is_reading())
-        assert MAX_WAITING < link.machine.buffered < MAX_WAITING + 2**18 + 1
+        await until(lambda: not link._transport.is_reading())
+        assert MAX_INPUT_BYTES < link.machine.buffered < MAX_INPUT_BYTES + 2**18 + 1
         clock.advance(0.2)
         await client.expect(wire.DONE + 500 * wire.INVALID)
 
@@ -228,7 +227,7 @@ async def test_client_that_does_not_read_loses_its_connection() -> None:
         await TelnetClient.log_in(emulator) as client,
     ):
         client.send(3 * b"RI\r\n")
-        await wire.until(lambda: not emulator.links)
+        await until(lambda: not emulator.links)
 
 
 async def test_log_is_bounded_and_cuts_what_is_long() -> None:

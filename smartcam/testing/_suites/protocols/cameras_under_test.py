@@ -51,12 +51,12 @@ class LiveCamera:
 
     @property
     def has_session(self) -> bool:
-        """Whether a client has the camera."""
+        """True while a client has the camera."""
         self._cannot("tell whether a client has the camera")
 
     @property
     def inspects(self) -> bool:
-        """Whether an inspection is under way."""
+        """True while an inspection is under way."""
         self._cannot("tell whether an inspection is under way")
 
     def trigger(self) -> None:
@@ -83,19 +83,20 @@ class CameraKind:
     """One kind of camera.
 
     Attributes:
-        name: for people.
-        open: puts one up.
-        applications: those that stand on it; ``COUNTER`` must.
+        name: name of the kind for people.
+        open: function that opens a camera of this kind.
+        applications: ids of the applications on the camera, ``COUNTER`` among them.
         numbers: how to interpret what the applications send: a record whose field ``n`` is the
             number.
-        numbers_with_sequence: the same with the number marked, where it can be set.
+        numbers_with_sequence: ``numbers`` with the number marked as the sequence number, where
+            that can be set.
         raw_request: id of a request that is answered by something, None where there is none.
         foreign_request: an id of another kind than the protocol's.
         silent_request: id of a request that the camera leaves without an answer, None where there
             is none; unused where there are result codes.
-        datagrams: a message may be lost, and nobody is told that the camera is gone.
-        exclusive: a second client takes the camera from the first.
-        has_zero: an application may have the id 0.
+        datagrams: True if messages may be lost, and nobody is told that the camera is gone.
+        exclusive: True if a second client takes the camera from the first.
+        has_zero: True if an application may have the id 0.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What the checks of a client in front of a camera share."""
+"""The helpers that the checks of a client in front of a camera share."""
 # ruff: noqa: S101 - they are tests, in a package so that others can run them
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     Suite = TypeVar("Suite")
     Given = ParamSpec("Given")
 
-SHORT = 0.05
+SHORT_TIMEOUT = 0.05
 """Seconds of a timeout that is meant to fire."""
 
-SOON = 5.0
+SOON_TIMEOUT = 5.0
 """Seconds after which what should happen at once fails the check."""
 
-LONGEST = 60.0
+CHECK_TIMEOUT = 60.0
 """Seconds of a whole check."""
 
 GRACE_STEPS = 100
@@ -57,7 +57,7 @@ def in_a_loop(
 
 
 async def _watched(check: Coroutine[Any, Any, None]) -> None:
-    async with asyncio.timeout(LONGEST):
+    async with asyncio.timeout(CHECK_TIMEOUT):
         await check
     steps = 0
     while left := asyncio.all_tasks() - {asyncio.current_task()}:
@@ -84,7 +84,7 @@ def client(camera_kind: CameraKind, live: LiveCamera, **options: Any) -> Camera:
 async def visiting(
     camera_kind: CameraKind, **options: Any
 ) -> AsyncIterator[tuple[LiveCamera, Camera]]:
-    """A camera that is up, and a client in a session with it."""
+    """Have a camera that is up, and a client in a session with it."""
     if "application" in options:
         needs(camera_kind, options["application"])
     async with camera_kind.open() as live, client(camera_kind, live, **options) as camera:
@@ -93,14 +93,14 @@ async def visiting(
 
 async def number(camera: Camera, application: int | None = None, **options: Any) -> int:
     """Trigger and return the number that came."""
-    options.setdefault("timeout", SOON)
+    options.setdefault("timeout", SOON_TIMEOUT)
     result = await camera.trigger(application, **options)
     return int(result.value.n)
 
 
 async def until(condition: Callable[[], object]) -> None:
     """Let the loop run until something is true."""
-    async with asyncio.timeout(SOON):
+    async with asyncio.timeout(SOON_TIMEOUT):
         while not condition():  # noqa: ASYNC110 - whatever the condition is
             await asyncio.sleep(0)
 

@@ -1,4 +1,4 @@
-"""What client and camera say to each other, written down, and a machine that is led through it."""
+"""Written conversations of client and camera, and a player that leads a machine through them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._framed.machine import LinkFailed, ResultBurst
+from smartcam.protocols import LinkFailed, Role, Transport
+from smartcam.protocols._inside import ResultBurst
 from smartcam.protocols.messages import Message
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from smartcam.protocols._base import Dialect, Protocol
-    from smartcam.protocols._framed.framing import Frame
-    from smartcam.protocols._framed.machine import Event, LinkMachine
+    from smartcam.protocols import Dialect, Frame, LinkMachine, Protocol
+    from smartcam.protocols._inside import Event
     from smartcam.protocols.messages import Sender
 
     Trace = Callable[[Sender, Frame | RemoteProtocolError], None]
@@ -24,7 +23,7 @@ MAX_LENGTH = 1 << 12
 """Largest payload that the machines of a suite accept, bytes."""
 
 Told: TypeAlias = Message | type[RemoteProtocolError]
-"""What a machine tells: a message, or the kind of error that ends the link."""
+"""A machine's output: a message, or the kind of error that ends the link."""
 
 
 class Sent(NamedTuple):
@@ -62,12 +61,12 @@ class Conversation:
     """Bytes from the protocol's documents: what is said on one link, in order, from its beginning.
 
     Attributes:
-        name: for people.
-        steps: who says what.
+        name: name of the conversation for people.
+        steps: bytes that client and camera send, in order.
         dialect: name of the dialect.
-        transport: what carries it.
+        transport: transport that carries the conversation.
         quirks: pinned deviations from the dialect.
-        parameters: what else a URL would say.
+        parameters: further parameters that a URL would have.
     """
 
     name: str

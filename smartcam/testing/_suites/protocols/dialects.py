@@ -19,10 +19,17 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.models import jsonable
+from smartcam.protocols import (
+    CodeMeaning,
+    Frame,
+    FramedDialect,
+    RawRequest,
+    Spelled,
+    Transport,
+    Verdict,
+)
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import CodeMeaning, RawRequest, Spelled, Transport, Verdict
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Frame, Framer
+from smartcam.protocols._inside import Framer
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
 from smartcam.testing._suites.protocols.parameters import Parameters
@@ -33,10 +40,10 @@ if TYPE_CHECKING:
 
     from hypothesis.strategies import DataObject
 
-    from smartcam.protocols._base import Dialect
+    from smartcam.protocols import Dialect
 
 SCHEME = re.compile(r"[a-z][a-z0-9+.-]*")
-"""What a URL may begin with (RFC 3986, 3.1), in small letters."""
+"""The beginning of a URL (RFC 3986, 3.1), in small letters."""
 
 CODES = (*range(-300, 301), -(1 << 31), (1 << 16) - 1, (1 << 32) - 1)
 """Result codes that a dialect is asked the meaning of."""
@@ -47,7 +54,7 @@ def _is_line(text: object) -> bool:
 
 
 class DialectChecks(Parameters):
-    """What holds for every protocol and dialect, without a camera."""
+    """The checks of every protocol and dialect, without a camera."""
 
     # ------------------------------------------------------------------ the protocol
 
@@ -81,7 +88,7 @@ class DialectChecks(Parameters):
         assert loaded is self.protocol, f"the entry point {name!r} gives {loaded!r:.300}"
 
     def test_every_dialect_is_tried(self) -> None:
-        """A client that was told no dialect tries each, and a pinned one is what it gets."""
+        """Check that a client tries each dialect, and gets the one that is pinned."""
         protocol = self.protocol
         used = set(protocol.schemes.values())
         surplus = set(protocol.detection) - used
@@ -100,7 +107,7 @@ class DialectChecks(Parameters):
                 assert not others, f"pinned {name!r} over {transport.value} tries {others}, too"
 
     def test_model_picks_the_protocol(self) -> None:
-        """A bare host with a model, in any letters, is a camera of this protocol."""
+        """Check that a bare host with a model, in any letters, is a camera of this protocol."""
         for model in self.protocol.models:
             for written in (model, model.lower()):
                 address = parse_address("192.0.2.7", model=written)
@@ -110,7 +117,7 @@ class DialectChecks(Parameters):
     # ------------------------------------------------------------------ a dialect
 
     def test_dialect_describes_itself(self, dialect: Dialect) -> None:
-        """What it is, where it is described, and which ids an application may have."""
+        """Check a dialect's name, source, and the ids that an application may have."""
         assert _is_line(dialect.about), f"about: expected a line, got {dialect.about!r}"
         assert _is_line(dialect.source), f"source: expected a line, got {dialect.source!r}"
         assert dialect.label.startswith(dialect.name), f"label: {dialect.label!r}"
@@ -127,7 +134,7 @@ class DialectChecks(Parameters):
             assert "user" in self.protocol.parameters, "has_login, but no parameter 'user'"
 
     def test_dialect_has_what_a_client_needs(self, dialect: Dialect) -> None:
-        """A session, a sign of life, results, and the status: by itself or on request."""
+        """Check for a session, a sign of life, results, and the status: by itself or on request."""
         missing = [one.__name__ for one in NEEDED if not dialect.has(one)]
         assert not missing, f"has() is False for {', '.join(missing)}"
         assert dialect.answers(m.Connect), "Connect must be answered"
@@ -138,7 +145,7 @@ class DialectChecks(Parameters):
         )
 
     def test_capabilities_are_those_of_its_messages(self, dialect: Dialect) -> None:
-        """Each ability has its messages, and the other way round."""
+        """Check that each ability has its messages, and the other way round."""
         for name, needed in ABILITIES.items():
             can = getattr(dialect.capabilities, name)
             has = [dialect.has(one) for one in needed]
@@ -149,7 +156,7 @@ class DialectChecks(Parameters):
                 assert not has[0], f"capabilities.{name} is False, but it has {names}"
 
     def test_messages_have_ids_names_and_fields(self, dialect: Dialect) -> None:
-        """What it has can be called by a name; its fields are the message's."""
+        """Check that each message has an id and a name, and that its fields are the message's."""
         for kind in MESSAGES:
             if not dialect.has(kind):
                 continue
@@ -162,7 +169,7 @@ class DialectChecks(Parameters):
             assert not unknown, f"fields({kind.__name__}) has {unknown}"
 
     def test_message_that_it_has_not_is_unsupported(self, dialect: Dialect) -> None:
-        """Who asks for it is told what the dialect is called."""
+        """Check that the error for a missing message names the dialect."""
         for kind in MESSAGES:
             if dialect.has(kind):
                 continue
@@ -172,7 +179,7 @@ class DialectChecks(Parameters):
                 assert dialect.name in said, f"{said}: which dialect?"
 
     def test_codes_mean_something(self, dialect: Dialect) -> None:
-        """Any code has a text and a verdict; where there are codes one is good and one is not."""
+        """Check that any code has a text and a verdict, and that one is good and one is not."""
         verdicts: set[Verdict] = set()
         for request in (None, *filter(dialect.has, REQUESTS)):
             for code in CODES:
@@ -189,7 +196,7 @@ class DialectChecks(Parameters):
             assert verdicts - {Verdict.DONE}, "result_codes, but every code says done"
 
     def test_any_frame_can_be_spelled(self, dialect: Dialect) -> None:
-        """A trace shows whatever comes, and never fails."""
+        """Check that a trace shows whatever comes, and never fails."""
         from smartcam.testing._suites import strategies
 
         def check(data: DataObject) -> None:
@@ -201,7 +208,7 @@ class DialectChecks(Parameters):
         strategies.each_drawn(check)
 
     def test_any_raw_request_is_taken_or_refused(self, dialect: Dialect) -> None:
-        """Ids of either kind, known or not, are a request or one of smartcam's errors."""
+        """Check that any id, known or not, is a request or one of smartcam's errors."""
         refusals = (
             UnsupportedError,
             LocalProtocolError,
@@ -227,7 +234,7 @@ class DialectChecks(Parameters):
         assert "no such quirk" in said, f"{said}: which quirk?"
 
     def test_address_is_read_back(self, dialect: Dialect) -> None:
-        """A URL with everything pinned is the same when it is read again, and has no password."""
+        """Check that a URL with everything pinned is read back, and has no password."""
         parameters: list[tuple[tuple[str, str], ...]] = [()]
         parameters += [
             tuple(one.parameters.items())
@@ -252,7 +259,7 @@ class DialectChecks(Parameters):
     # ------------------------------------------------------------------ binary frames
 
     def test_framed_messages_are_read_back(self, dialect: Dialect) -> None:
-        """A dialect of binary frames reads what it writes, whatever the values are."""
+        """Check that a dialect of binary frames reads what it writes, whatever the values are."""
         if not isinstance(dialect, FramedDialect):
             pytest.skip("the dialect is no FramedDialect: its machine's conversations say it all")
         from smartcam.testing._suites import strategies

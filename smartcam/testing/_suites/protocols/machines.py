@@ -16,10 +16,9 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     UnsupportedError,
 )
+from smartcam.protocols import Counters, Frame, LinkEnded, LinkFailed, State, Transport, Verdict
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Transport, Verdict
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import Counters, LinkEnded, LinkFailed, ResultBurst, State
+from smartcam.protocols._inside import ResultBurst
 from smartcam.testing._suites.protocols.conversations import Came, Player, Sent
 from smartcam.testing._suites.protocols.dialects import see_spelled
 from smartcam.testing._suites.protocols.parameters import Parameters
@@ -30,7 +29,8 @@ if TYPE_CHECKING:
 
     from hypothesis.strategies import DataObject
 
-    from smartcam.protocols._framed.machine import Event, LinkMachine
+    from smartcam.protocols import LinkMachine
+    from smartcam.protocols._inside import Event
     from smartcam.testing._suites.protocols.conversations import Conversation, Step
 
 MAX_CUTS = 64
@@ -40,7 +40,7 @@ MAX_ERROR_TEXT = 500
 """Characters of an error's text: a peer's bytes are in it, 64 of them at most."""
 
 FILLERS = (b"\0", b"A", b"1", b"\n", b"\xff")
-"""What a camera that has lost its mind says, without an end."""
+"""Bytes of a camera that sends one of them without an end."""
 
 REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 
@@ -48,11 +48,11 @@ ENOUGH = 1000
 """Messages after which bytes without an end are messages."""
 
 HIDDEN = 2
-"""How many times the bound a machine may take in memory for bytes that wait, events apart."""
+"""Largest memory of a machine for bytes that wait, in multiples of the bound, events apart."""
 
 
 class MachineChecks(Parameters):
-    """What holds for the machine of every protocol, without a socket.
+    """The checks of every protocol's machine, without a socket.
 
     Attributes:
         max_waiting: bytes that a machine may keep of what is not whole yet, where 4 KiB of payload
@@ -64,13 +64,13 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ conversations
 
     def test_conversation_goes_as_written(self, conversation: Conversation) -> None:
-        """Each request is these bytes, and what comes is these messages."""
+        """Check that each request is the written bytes, and each answer the written message."""
         Player(self.protocol, conversation).play()
         kinds = [type(one.message) for one in conversation.steps if isinstance(one, Sent)]
         assert m.Connect in kinds, f"{conversation}: nobody sends Connect"
 
     def test_conversation_can_be_cut_anywhere(self, stream: Conversation) -> None:
-        """A stream has no boundaries: any piece may come by itself, or with what follows."""
+        """Check any cut of a stream: each piece may come by itself, or with what follows."""
         for room in (True, False):
             for cuts in (_bytewise, _whole):
                 player = Player(self.protocol, stream)
@@ -86,7 +86,7 @@ class MachineChecks(Parameters):
         Player(self.protocol, joined).play()
 
     def test_any_cutting_of_any_bytes_tells_the_same(self, stream: Conversation) -> None:
-        """Also of bytes that no camera sends."""
+        """Check any cut of bytes that no camera sends as well."""
         from smartcam.testing._suites import strategies
 
         places = range(len(stream.steps) + 1)
@@ -147,7 +147,7 @@ class MachineChecks(Parameters):
             assert failed or isinstance(judge.last, LinkEnded), f"at step {place}: {judge.last}"
 
     def test_what_waits_for_more_has_a_bound(self, conversation: Conversation) -> None:
-        """Bytes without an end fail, are dropped, or are messages; they are not collected."""
+        """Check that bytes without an end fail, are dropped, or are messages."""
         tracing = tracemalloc.is_tracing()
         for place, halves in _places(conversation):
             for filler in FILLERS:
@@ -187,7 +187,7 @@ class MachineChecks(Parameters):
     # ------------------------------------------------------------------ requests
 
     def test_request_before_the_session_is_refused(self, conversation: Conversation) -> None:
-        """It is a LocalProtocolError, and then everything goes as written."""
+        """Check that it is a LocalProtocolError, and that everything then goes as written."""
         player = Player(self.protocol, conversation)
         dialect = player.machine.dialect
         for kind in REQUESTS:
@@ -196,14 +196,14 @@ class MachineChecks(Parameters):
         player.play()
 
     def test_disconnect_before_the_session_is_harmless(self, conversation: Conversation) -> None:
-        """A client says it first, to end a session that a dead one left behind."""
+        """Check Disconnect as the first word: it ends a session that a dead client left."""
         player = Player(self.protocol, conversation)
         player.machine.send(m.Disconnect())
         player.written()
         player.play()
 
     def test_message_that_it_has_not_is_refused(self, conversation: Conversation) -> None:
-        """At any time, and then everything goes as written."""
+        """Check the refusal at any time, and that everything then goes as written."""
         for place in range(len(conversation.steps) + 1):
             player = Player(self.protocol, conversation).play(place)
             dialect = player.machine.dialect
@@ -215,7 +215,7 @@ class MachineChecks(Parameters):
     def test_second_request_while_the_answer_is_owed_is_refused(
         self, conversation: Conversation
     ) -> None:
-        """Answers do not say what they answer; only a status is as good for two."""
+        """Check the refusal, since answers do not say what they answer; a status serves two."""
         for place, step in enumerate(conversation.steps):
             if isinstance(step, Sent) and isinstance(step.message, m.Request):
                 player = Player(self.protocol, conversation).play(place + 1)
@@ -228,7 +228,7 @@ class MachineChecks(Parameters):
                     player.play()
 
     def test_answer_that_nobody_asked_for_is_not_told(self, conversation: Conversation) -> None:
-        """It would pass for the next one's."""
+        """Check that the answer is kept back, since it would pass for the next request's."""
         for place, answer, data in _answers(conversation):
             player = Player(self.protocol, conversation).play(place)
             events = [event for one in data for event in player.deliver(one)]
@@ -236,7 +236,7 @@ class MachineChecks(Parameters):
             assert not found, f"at step {place}, nobody had asked, but it told {found}"
 
     def test_disconnect_is_the_last_word(self, conversation: Conversation) -> None:
-        """It can be said in any session, and then nothing is: the way out is closed."""
+        """Check that Disconnect can be said in any session, and closes the way out."""
         for place in range(len(conversation.steps) + 1):
             player = Player(self.protocol, conversation).play(place)
             machine = player.machine
@@ -299,14 +299,14 @@ class MachineChecks(Parameters):
                     assert state is State.FAILED, f"{where}: it is {state}"
 
     def test_bytes_are_counted(self, conversation: Conversation) -> None:
-        """What came is in the counters: an attempt's error says how much it was."""
+        """Check the counter of bytes, which an attempt's error tells."""
         player = Player(self.protocol, conversation).play()
         came = sum(len(one.data) for one in conversation.steps if isinstance(one, Came))
         counted = player.machine.counters.bytes_received
         assert counted == came, f"counters.bytes_received is {counted}, {came} came"
 
     def test_trace_shows_what_is_said(self, conversation: Conversation) -> None:
-        """Both sides' frames, in words, without the password; nothing else changes."""
+        """Check that a trace has both sides' frames, in words, without the password."""
         seen: list[tuple[m.Sender, Frame | RemoteProtocolError]] = []
         player = Player(
             self.protocol, conversation, lambda sender, frame: seen.append((sender, frame))
@@ -343,7 +343,7 @@ class _Judge:
 
     @property
     def over(self) -> bool:
-        """Whether the link's end was told."""
+        """True if the link's end was told."""
         return isinstance(self.last, (LinkFailed, LinkEnded, State))
 
     def let(self, action: bytes | m.Message) -> None:

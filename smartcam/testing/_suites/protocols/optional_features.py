@@ -18,8 +18,8 @@ from smartcam import (
 )
 from smartcam.testing._suites.protocols.cameras_under_test import ECHO
 from smartcam.testing._suites.protocols.client_checks import (
-    SHORT,
-    SOON,
+    SHORT_TIMEOUT,
+    SOON_TIMEOUT,
     in_a_loop,
     needs,
     number,
@@ -36,7 +36,7 @@ LEAP_DAY = datetime(2024, 2, 29, 23, 59, 30)  # noqa: DTZ001 - the camera's cloc
 
 
 class OptionalFeatureChecks(Parameters):
-    """What not every camera can do: it does, or an error says so and the session goes on."""
+    """The checks of optional abilities: each works, or an error says so and the session lasts."""
 
     @in_a_loop
     async def test_start_and_stop(self, camera_kind: CameraKind) -> None:
@@ -56,7 +56,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_clock(self, camera_kind: CameraKind) -> None:
-        """What was set is told."""
+        """Check that the clock shows the time that was set."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.set_clock:
                 await camera.set_clock(LEAP_DAY)
@@ -69,7 +69,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_input_belongs_to_its_trigger(self, camera_kind: CameraKind) -> None:
-        """What was given is used by the next inspection."""
+        """Check that input data is used by the next inspection."""
         async with visiting(camera_kind) as (_, camera):
             data = struct.pack("<I", 4711)
             if not camera.capabilities.input_data:
@@ -98,7 +98,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_sequence_number(self, camera_kind: CameraKind) -> None:
-        """What was set comes with the next result."""
+        """Check that the number that was set comes with the next result."""
         async with visiting(camera_kind, interpret_as=camera_kind.numbers_with_sequence) as (
             _,
             camera,
@@ -113,7 +113,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_query_status(self, camera_kind: CameraKind) -> None:
-        """The answer is the status."""
+        """Check that the answer is the status."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.get_status:
                 assert Status.RUNNING in await camera.query_status()
@@ -122,7 +122,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_reset_errors(self, camera_kind: CameraKind) -> None:
-        """The answer is a status without them."""
+        """Check that the answer is a status without the errors."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.reset_errors:
                 assert Status.OVERTRIGGERED not in await camera.reset_errors()
@@ -131,16 +131,16 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_read_image(self, camera_kind: CameraKind) -> None:
-        """There is a picture."""
+        """Check that there is a picture."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.read_image:
-                assert len(await camera.read_image(timeout=SOON)) > 0
+                assert len(await camera.read_image(timeout=SOON_TIMEOUT)) > 0
             else:
                 await refused(camera, camera.read_image())
 
     @in_a_loop
     async def test_load_by_file(self, camera_kind: CameraKind) -> None:
-        """A file that is not there is refused."""
+        """Check that a file that is not there is refused."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.load_file:
                 with pytest.raises(CommandRejectedError):
@@ -151,7 +151,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_reboot(self, camera_kind: CameraKind) -> None:
-        """The session is over."""
+        """Check that the session is over."""
         async with visiting(camera_kind, close_timeout=0.2) as (_, camera):
             if not camera.capabilities.reboot:
                 await refused(camera, camera.reboot())
@@ -163,7 +163,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_request_gives_the_answers_body(self, camera_kind: CameraKind) -> None:
-        """Any request by its id, answered or not."""
+        """Check any request by its id, answered or not."""
         async with visiting(camera_kind) as (_, camera):
             if camera_kind.raw_request is not None:
                 assert await camera.request(camera_kind.raw_request)
@@ -177,10 +177,10 @@ class OptionalFeatureChecks(Parameters):
     async def test_request_that_nobody_answers_costs_the_link(
         self, camera_kind: CameraKind
     ) -> None:
-        """A later answer would pass for the next one."""
+        """Check that the link is given up, since a late answer would pass for the next one."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.result_codes or camera_kind.silent_request is None:
                 return  # it answers everything
             with pytest.raises(ResponseTimeoutError):
-                await camera.request(camera_kind.silent_request, timeout=SHORT)
+                await camera.request(camera_kind.silent_request, timeout=SHORT_TIMEOUT)
             await until(lambda: not camera.connected)

@@ -1,4 +1,4 @@
-"""What a suite's checks are run with: each dialect, conversation or kind of camera, by its name."""
+"""Run a suite's checks with each dialect, conversation or kind of camera, by its name."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 
-from smartcam.protocols._base import Protocol, Transport
+from smartcam.protocols import Protocol, Transport
+from smartcam.testing._suites.in_words import SaysWhatWasExpected
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.protocols._base import Dialect
+    from smartcam.protocols import Dialect
     from smartcam.testing._suites.protocols.cameras_under_test import CameraKind
     from smartcam.testing._suites.protocols.conversations import Conversation
 
 
-class Parameters:
+class Parameters(SaysWhatWasExpected):
     """Base of the suites: what an author gives.
 
     Attributes:

@@ -22,8 +22,8 @@ from smartcam import (
 )
 from smartcam.testing._suites.protocols.cameras_under_test import COUNTER, OTHER
 from smartcam.testing._suites.protocols.client_checks import (
-    SHORT,
-    SOON,
+    SHORT_TIMEOUT,
+    SOON_TIMEOUT,
     balance,
     client,
     in_a_loop,
@@ -57,7 +57,7 @@ class SessionChecks(Parameters):
 
     @in_a_loop
     async def test_connect_unpinned_finds_out_and_pins_it(self, camera_kind: CameraKind) -> None:
-        """The dialect is found out, and then stands in the URL."""
+        """Check that the dialect is found out, and then stands in the URL."""
         async with camera_kind.open() as live:
             camera = smartcam.connect(
                 live.unpinned, interpret_as=camera_kind.numbers, reconnect=None
@@ -66,7 +66,7 @@ class SessionChecks(Parameters):
             async with camera:
                 assert camera.url == live.url
                 assert await number(camera) == 0
-                async with asyncio.timeout(SOON):
+                async with asyncio.timeout(SOON_TIMEOUT):
                     event = await anext(events)
                     while not isinstance(event, Connected):
                         event = await anext(events)
@@ -76,7 +76,7 @@ class SessionChecks(Parameters):
     async def test_connect_with_an_application_has_it_running(
         self, camera_kind: CameraKind
     ) -> None:
-        """The one that was named is switched to."""
+        """Check that the client switches to the application that was named."""
         async with visiting(camera_kind, application=OTHER) as (_, camera):
             assert camera.active_application == OTHER
             result = await camera.trigger()
@@ -86,11 +86,11 @@ class SessionChecks(Parameters):
     async def test_close_ends_the_session_and_leaves_the_camera_as_it_is(
         self, camera_kind: CameraKind
     ) -> None:
-        """The camera is told, and goes on running; closing twice is harmless."""
+        """Check that the camera is told, and goes on running; closing twice is harmless."""
         async with camera_kind.open() as live:
             assert not live.has_session
             camera = await client(camera_kind, live)
-            if camera.capabilities.switch:
+            if camera.capabilities.switch and OTHER in camera_kind.applications:
                 await camera.switch_application(OTHER)
             left_with = camera.active_application
             assert live.has_session
@@ -111,21 +111,21 @@ class SessionChecks(Parameters):
             await number(camera)
             await live.restart()
             await until(lambda: not camera.connected)
-            async with asyncio.timeout(SOON):
+            async with asyncio.timeout(SOON_TIMEOUT):
                 kinds = [type(await anext(events))]
                 while kinds[-1] is not Reconnected:
                     kinds.append(type(await anext(events)))
             assert Disconnected in kinds
-            await camera.wait_connected(SOON)
+            await camera.wait_connected(SOON_TIMEOUT)
             assert (await camera.trigger()).application == COUNTER
             assert camera.statistics().reconnects == 1
             balance(camera.statistics())
 
     @in_a_loop
     async def test_killed_camera_ends_what_waits_for_it(self, camera_kind: CameraKind) -> None:
-        """Every wait and stream ends with a ConnectionLostError."""
+        """Check that every wait and stream ends with a ConnectionLostError."""
         async with visiting(camera_kind, liveness_timeout=0.4) as (live, camera):
-            waiting = asyncio.create_task(camera.wait_status(lambda _: False, timeout=SOON))
+            waiting = asyncio.create_task(camera.wait_status(lambda _: False, timeout=SOON_TIMEOUT))
             results = camera.results()
             await number(camera)
             try:
@@ -136,9 +136,9 @@ class SessionChecks(Parameters):
             with pytest.raises(ConnectionLostError):
                 await waiting
             with pytest.raises(ConnectionLostError):
-                await camera.trigger(timeout=SOON)
+                await camera.trigger(timeout=SOON_TIMEOUT)
             assert not camera.connected
-            async with asyncio.timeout(SOON):
+            async with asyncio.timeout(SOON_TIMEOUT):
                 assert (await anext(results)).value.n == 0
                 with pytest.raises(ConnectionLostError):
                     await anext(results)
@@ -148,24 +148,24 @@ class SessionChecks(Parameters):
     async def test_newcomer_takes_the_camera_or_stands_beside(
         self, camera_kind: CameraKind
     ) -> None:
-        """As its kind says."""
+        """Check that the newcomer is served as the kind of camera says."""
         async with visiting(camera_kind) as (live, first), client(camera_kind, live) as second:
             assert await number(second) == 0
             if not camera_kind.exclusive:
                 assert await number(first) == 1
             elif camera_kind.datagrams:
                 with pytest.raises(TriggerTimeoutError):
-                    await first.trigger(timeout=SHORT)
+                    await first.trigger(timeout=SHORT_TIMEOUT)
             else:
                 with pytest.raises(ConnectionLostError):
-                    await first.trigger(timeout=SOON)
+                    await first.trigger(timeout=SOON_TIMEOUT)
             await number(second)
 
     @in_a_loop
     async def test_two_that_want_the_camera_do_not_fight_for_it(
         self, camera_kind: CameraKind
     ) -> None:
-        """One gives up, the other keeps it."""
+        """Check that one client gives up, and the other keeps the camera."""
         async with (
             visiting(camera_kind, reconnect=FAST) as (live, first),
             client(camera_kind, live, reconnect=FAST) as second,
@@ -173,7 +173,7 @@ class SessionChecks(Parameters):
             if camera_kind.exclusive and not camera_kind.datagrams:
                 await until(lambda: is_taken(first) or is_taken(second))
                 left = second if is_taken(first) else first
-                await left.wait_connected(SOON)
+                await left.wait_connected(SOON_TIMEOUT)
                 await number(left)
                 assert not is_taken(left)
             balance(first.statistics())
@@ -181,7 +181,7 @@ class SessionChecks(Parameters):
 
 
 def is_taken(camera: Camera) -> bool:
-    """Whether a client has given up because another one has the camera."""
+    """Return True if a client has given up because another one has the camera."""
     try:
         camera.next_result().close()
     except ConnectionTakenError:

@@ -10,7 +10,7 @@ from smartcam.testing._suites.protocols.triggers import TriggerChecks
 
 
 class WireSuite(DialectChecks, MachineChecks):
-    """What holds for dialects and machine of every protocol, seen without a camera.
+    """The checks of every protocol's dialects and machine, without a camera.
 
     A subclass has ``protocol``, which must be installed, and ``conversations``: at least one for
     each dialect, with the bytes of the protocol's documents.
@@ -18,7 +18,7 @@ class WireSuite(DialectChecks, MachineChecks):
 
 
 class CameraSuite(SessionChecks, TriggerChecks, OptionalFeatureChecks):
-    """What a user may expect of the client, whichever camera it is in front of.
+    """The checks of the client in front of any camera.
 
     A subclass has ``camera_kinds``, emulated or real cameras. What a camera cannot do in its
     dialect must be an UnsupportedError, and the session must go on.

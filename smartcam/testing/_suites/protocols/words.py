@@ -10,7 +10,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from smartcam.protocols._base import Dialect
+    from smartcam.protocols import Dialect
 
 MESSAGES: tuple[type[m.Message], ...] = tuple(
     found
@@ -23,7 +23,7 @@ MESSAGES: tuple[type[m.Message], ...] = tuple(
 """Every message that a dialect may have."""
 
 REQUESTS: tuple[type[m.Request], ...] = tuple(one for one in MESSAGES if issubclass(one, m.Request))
-"""Those that a client sends."""
+"""The types of all messages that a client sends."""
 
 NEEDED: tuple[type[m.Message], ...] = (
     m.Connect,
@@ -34,7 +34,7 @@ NEEDED: tuple[type[m.Message], ...] = (
     m.StatusReport,
     m.ResultContainer,
 )
-"""What no client can do without: a session, a sign of life, the status, results."""
+"""Messages that no client can do without: a session, a sign of life, the status, results."""
 
 ABILITIES: Mapping[str, tuple[type[m.Message], ...]] = {
     "switch": (m.SwitchApplication, m.SwitchAnswer),

@@ -1,0 +1,82 @@
+"""Applications whose results come from inspected pictures: the emulated camera gets real eyes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from pydantic import ConfigDict, Field, model_validator
+
+from smartcam.emulator._application import Application
+from smartcam.emulator._data import Seconds  # noqa: TC001 - pydantic does
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from smartcam.emulator._generators import Values
+
+
+class InspectionOrder(NamedTuple):
+    """An inspection that a camera asks for.
+
+    Attributes:
+        application: id of the program that is to run.
+        number: sequence number of the run.
+        input: input data of the trigger; empty where none was ever given.
+    """
+
+    application: int
+    number: int
+    input: bytes
+
+
+class Inspector(ABC):
+    """Takes a picture for a run of a camera, and inspects it.
+
+    The camera calls it in the event loop's thread, for one run at a time.
+    """
+
+    @abstractmethod
+    def begin(
+        self,
+        order: InspectionOrder,
+        seen: Callable[[], None],
+        done: Callable[[Values | None], None],
+    ) -> None:
+        """Begin an inspection of the first picture that is exposed from now on.
+
+        Args:
+            order: the run.
+            seen: is called when the picture is there.
+            done: is called with what the application's layout holds; None where the inspection
+                failed and there is no result.
+
+        Both are called in the event loop's thread, later and not from inside this call. After
+        :meth:`cancel` neither is.
+        """
+
+    @abstractmethod
+    def cancel(self) -> None:
+        """Give up the inspection under way; does nothing where none is."""
+
+
+class InspectedApplication(Application):
+    """An application whose values an inspector finds in a picture."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(arbitrary_types_allowed=True)
+
+    load_time: Seconds = Field(
+        default=0.01, description="seconds that a switch to it takes, in which it is BUSY"
+    )
+    inspector: Inspector = Field(description="what inspects the pictures")
+
+    @property
+    def period(self) -> int | None:
+        """None: each run makes its own container."""
+        return None
+
+    @model_validator(mode="after")
+    def _check(self) -> InspectedApplication:
+        if self.layout is None:
+            raise ValueError("an inspected application needs a layout")
+        return self

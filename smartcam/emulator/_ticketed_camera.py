@@ -1,0 +1,163 @@
+"""Emulated cameras that speak in frames with a ticket: the base for those of a make."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+from smartcam.emulator._line_camera import LineCamera, LineClient
+from smartcam.emulator._line_codec import LineCodec, LineFramer, LineServer
+from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.protocols import Frame, TicketedDialect
+
+if TYPE_CHECKING:
+    from smartcam.emulator._client_link import ClientLink
+    from smartcam.emulator._line_codec import HeardLine
+    from smartcam.protocols import LineRow
+
+MAX_REQUEST = 1 << 16
+"""Bytes of a request's content at most."""
+
+
+class TicketedClient(LineClient):
+    """A client of an emulated camera that speaks in frames.
+
+    Attributes:
+        dialect: how the client is spoken to.
+        ticket: ticket of the request under way, "" where it has none.
+    """
+
+    def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
+        super().__init__(camera, link, server)
+        dialect = next(iter(camera.protocol.dialects.values()))
+        assert isinstance(dialect, TicketedDialect)  # noqa: S101 - as make_codec has seen to
+        self.dialect: TicketedDialect = dialect
+        self.ticket: str = ""
+
+    def pack(self, text: str) -> bytes:
+        """Return an answer to the request under way, with its ticket."""
+        return self.frame(text, self.ticket)
+
+    def say_again(self, data: bytes) -> None:
+        """Say a frame once more, with the ticket of the request under way unless it has its own."""
+        codec = self._camera.lines
+        ticket = codec.answer_key(data)
+        if self.ticket and ticket.isdecimal() and int(ticket) in self.dialect.tickets:
+            data = data.replace(ticket.encode(), self.ticket.encode(), 1)  # of header or content
+            header = data.find(b"\r\n") + 2
+            if data[4:5] == b"L" and data[header : header + 4] == ticket.encode():
+                data = data[:header] + self.ticket.encode() + data[header + 4 :]
+        self.say_bytes(data)
+
+    def frame(self, text: str, ticket: str) -> bytes:
+        """Return a frame as this client is spoken to."""
+        dialect = self.dialect
+        content = text.encode(dialect.encoding, "replace")
+        return dialect.frame(content, ticket[: dialect.width], length=dialect.digits > 0)
+
+
+class TicketedCodec(LineCodec):
+    """The frames of a camera: with a header of text, or ended by ``CR LF`` alone."""
+
+    def __init__(self, dialect: TicketedDialect) -> None:
+        super().__init__(
+            dialect.name,
+            dialect.rows,
+            line_end=dialect.line_end,
+            ends=re.compile(b"\r\n"),
+            max_line=MAX_REQUEST,
+            encoding=dialect.encoding,
+            split=dialect.split,
+        )
+        width = dialect.width
+        self.header: re.Pattern[bytes] = re.compile(
+            rb"([0-9]{%d})?L([0-9]{%d})\r\n" % (width, dialect.digits)
+        )
+        self.header_size: int = width + 1 + dialect.digits + 2
+        self._ticket = re.compile(f"[0-9]{{{width}}}")
+
+    def framer(self, max_length: int) -> TicketedFramer:
+        """Return a new reader that cuts a client's bytes into frames."""
+        return TicketedFramer(self)
+
+    def said(self, data: bytes) -> str:
+        """Return the text of a frame without its header."""
+        found = self.header.match(data)
+        return data[found.end() if found else 0 :].removesuffix(b"\r\n").decode(self.encoding)
+
+    def request_key(self, data: bytes) -> str:
+        """Return the ticket of a request."""
+        return self.content(self.said(data))[0]
+
+    def text(self, data: bytes) -> str:
+        """Return a request without header and ticket."""
+        return self.content(self.said(data))[1]
+
+    def content(self, text: str) -> tuple[str, str]:
+        """Return the ticket, "" for none, and what follows."""
+        found = self._ticket.match(text)
+        return ("", text) if found is None else (found[0], text[found.end() :])
+
+
+class TicketedFramer(LineFramer):
+    """Cuts a client's frames, whichever form they have."""
+
+    def __init__(self, codec: TicketedCodec) -> None:
+        super().__init__(codec)
+        self._frames = codec
+
+    def next_frame(self) -> Frame | None:
+        """Return the next frame, None if it is not whole yet; FrameError: it is too long."""
+        codec = self._frames
+        found = codec.header.match(self._buffer)
+        if found is None:
+            if self._buffer[4:5] == b"L" and len(self._buffer) < codec.header_size:
+                return None
+            return super().next_frame()
+        length = int(found[2])
+        if length > codec.max_line:
+            raise FrameError(f"a frame of {length} bytes came", data=bytes(self._buffer[:64]))
+        end = found.end() + length
+        if len(self._buffer) < end:
+            return None
+        data = bytes(self._buffer[:end])
+        del self._buffer[:end]
+        self._searched = 0
+        return Frame(codec.row_of(codec.text(data)), data)
+
+
+class TicketedCamera(LineCamera):
+    """An emulated camera that hears frames, each with a ticket that its answer carries back.
+
+    A subclass overrides :meth:`answer`, or :meth:`hear` where an answer needs time: requests are
+    heard while earlier ones are done.
+
+    Attributes:
+        also_hears: requests that other clients ask, beside those of the dialect.
+    """
+
+    also_hears: ClassVar[tuple[LineRow, ...]] = ()
+
+    def make_codec(self) -> LineCodec:
+        """Return the frames of its protocol's first dialect.
+
+        Raises:
+            ConfigurationError: that has none with tickets.
+        """
+        dialect = next(iter(self.protocol.dialects.values()))
+        if not isinstance(dialect, TicketedDialect):
+            raise ConfigurationError(
+                f"{type(self).__name__}: dialect {dialect.name} has no tickets"
+            )
+        *rows, last = dialect.rows  # which may be any line
+        return TicketedCodec(replace(dialect, rows=(*rows, *self.also_hears, last), split=None))
+
+    def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
+        """Return a new client."""
+        return TicketedClient(self, link, server)
+
+    def begun(self, client: LineClient, message: HeardLine) -> None:
+        """Note the ticket of a request."""
+        if isinstance(client, TicketedClient) and isinstance(self.lines, TicketedCodec):
+            client.ticket = self.lines.content(self.lines.said(message.data))[0]

@@ -1,0 +1,36 @@
+"""Failures of the suites, in words: a check's name and text say what was expected."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class SaysWhatWasExpected:
+    """Base of the suites: a check that fails says what it expects, before what was compared."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name, check in list(vars(cls).items()):
+            if name.startswith("test_") and inspect.isfunction(check):
+                setattr(cls, name, _in_words(check))
+
+
+def _in_words(check: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a check whose failure begins with what was expected."""
+    what = check.__name__.removeprefix("test_").replace("_", " ")
+    text = " ".join((check.__doc__ or "").split())
+
+    @functools.wraps(check)
+    def run(*args: Any, **given: Any) -> Any:
+        try:
+            return check(*args, **given)
+        except AssertionError as exc:
+            exc.args = (f"expected: {what}. {text}\nfound otherwise: {exc}",)
+            raise
+
+    return run
