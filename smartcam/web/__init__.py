@@ -1,4 +1,4 @@
-"""Pages and HTTP calls: an emulator, a camera, a fleet, wizards, frames, colours, clouds.
+"""Pages and HTTP calls: emulators, cameras, fleets, wizards, frames, colours, clouds, programs.
 
 ::
 
@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from smartcam._extras import missing
 from smartcam._lazy import lazy
-from smartcam.exceptions import MissingExtraError
 
 if TYPE_CHECKING:
     from smartcam.web._clouds import CloudSite
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from smartcam.web._frames import FramesSite
     from smartcam.web._live import LiveSite
     from smartcam.web._operations import OperationsSite
+    from smartcam.web._teach import TeachSite
     from smartcam.web._wizard import WizardSite
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "FramesSite",
     "LiveSite",
     "OperationsSite",
+    "TeachSite",
     "WizardSite",
 ]
 
@@ -47,6 +49,7 @@ _resolve = lazy(
         "_frames": "FramesSite",
         "_live": "LiveSite",
         "_operations": "OperationsSite",
+        "_teach": "TeachSite",
         "_wizard": "WizardSite",
     },
 )
@@ -58,6 +61,4 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as exc:
         if exc.name != "aiohttp":
             raise
-        raise MissingExtraError(
-            'the web page needs aiohttp: pip install "smartcam[web]"', extra="web"
-        ) from exc
+        raise missing("aiohttp") from exc

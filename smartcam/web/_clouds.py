@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
@@ -18,25 +17,26 @@ import numpy as np
 from smartcam.depth import Cloud, voxel_grid
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._routes import CallRequest, Calls
-from smartcam.web._site import API, Site
+from smartcam.web._site import API
 from smartcam.web._sockets import PageSocket, check_websocket
+from smartcam.web._threaded_site import ThreadedSite
 
 if TYPE_CHECKING:
     from aiohttp import web
 
 _log = logging.getLogger("smartcam.web")
 
-MOST_POINTS: Final = 1_000_000
-"""Of what crosses; a cloud of more is thinned."""
+MAX_CLOUD_POINTS: Final = 1_000_000
+"""Points of a cloud that are sent to a page; a cloud of more is thinned."""
 
 MAX_VIEWERS: Final = 8
-"""At a time; each may have a cloud of 15 MB on the way."""
+"""Pages that may be open at a time; each may have a cloud of 15 MB on the way."""
 
 PROTOCOL: Final = "smartcam.cloud"
-"""Of the WebSockets."""
+"""Subprotocol of the WebSockets that send clouds."""
 
 PART: Final = 1 << 16
-"""Bytes of a message: what is written at a time."""
+"""Bytes of a message that are written at a time."""
 
 SLOW: Final = 60.0
 """Seconds within which a page must have taken a cloud and shown it."""
@@ -51,7 +51,7 @@ class _Packed(NamedTuple):
     body: bytes  # float32 x, y, z of all points, then uint8 red, green, blue of all, if there are
 
 
-class CloudSite(Site):
+class CloudSite(ThreadedSite):
     """A page that shows a cloud, to be turned, and HTTP calls.
 
     ::
@@ -61,7 +61,7 @@ class CloudSite(Site):
             site.show(newer)    # from now on
 
     Args:
-        cloud: that is shown first; None: the page waits for one.
+        cloud: the cloud shown first; None: the page waits for one.
         up: the axis that points up when the page is opened; ``-y`` is up for a camera that stands
             level.
         host: address to listen on; nothing but this.
@@ -89,7 +89,6 @@ class CloudSite(Site):
         self._cloud: Cloud = Cloud(np.empty((0, 3)))
         self._number = 0  # of the cloud; 0: there is none yet
         self._newer = asyncio.Event()
-        self._threads: ThreadPoolExecutor | None = None
         self._packing: tuple[int, asyncio.Future[_Packed]] | None = None
         if cloud is not None:
             self.show(cloud)
@@ -110,12 +109,6 @@ class CloudSite(Site):
         self._newer.set()
         self._newer = asyncio.Event()
 
-    async def start(self) -> None:
-        """Open the port."""
-        if self._threads is None:
-            self._threads = ThreadPoolExecutor(1, thread_name_prefix="smartcam.web.cloud")
-        await super().start()
-
     async def stop(self) -> None:
         """Close the port; nobody looks any longer."""
         for one in self.viewers:
@@ -123,10 +116,7 @@ class CloudSite(Site):
         try:
             await super().stop()
         finally:
-            threads, self._threads = self._threads, None
             self._packing = None
-            if threads is not None:
-                await asyncio.to_thread(threads.shutdown)
 
     async def newer(self, number: int) -> tuple[int, _Packed]:
         """Return the newest cloud after one of a number, packed once for all, and its number.
@@ -144,7 +134,7 @@ class CloudSite(Site):
         return found, await asyncio.shield(job)
 
     def state(self) -> dict[str, Any]:
-        """Return what there is."""
+        """Return the state of the cloud and the number of viewers, as values for JSON."""
         return {
             "number": self._number,
             "points": len(self._cloud),
@@ -171,7 +161,7 @@ def packed(cloud: Cloud) -> _Packed:
 
 
 def _packed(cloud: Cloud) -> _Packed:
-    thin, size = thinned(cloud, MOST_POINTS)
+    thin, size = thinned(cloud, MAX_CLOUD_POINTS)
     columns = [thin.points.astype("<f4", copy=False).tobytes()]
     if thin.colours is not None:
         columns.append(thin.colours.tobytes())
@@ -206,7 +196,7 @@ def thinned(cloud: Cloud, most: int) -> tuple[Cloud, float | None]:
 
 
 class CloudViewer(PageSocket):
-    """One who looks."""
+    """The WebSocket of a page that shows the cloud."""
 
     def __init__(self, site: CloudSite, request: web.Request) -> None:
         # one that vanished while nothing was to be sent gives its place back
@@ -243,13 +233,13 @@ CALLS: Calls[CloudSite] = Calls()
 
 @CALLS.add("GET", API)
 def _calls(_site: CloudSite, _call: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 
 @CALLS.add("GET", f"{API}/cloud")
 def _cloud(site: CloudSite, _call: CallRequest) -> object:
-    """What there is: the newest cloud's number and points, and which axis is up."""
+    """Return the newest cloud's number and points, and which axis is up."""
     return site.state()
 
 

@@ -7,26 +7,25 @@ newest one, and another range is shown at once where the next picture takes long
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 from collections import OrderedDict, deque
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Final, TypeVar
 
 import numpy as np
 from aiohttp import web
 from pydantic import Field
 
-from smartcam.calibration._optional_imports import load
+from smartcam._extras import load
 from smartcam.depth import ColourRange, find_regions
-from smartcam.depth._colours import hsv
+from smartcam.depth._inside import hsv
 from smartcam.exceptions import ConfigurationError, FrameSourceError, LocalProtocolError
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._jpeg import jpeg, require_encoder
 from smartcam.web._routes import CallBody, CallRequest, Calls
-from smartcam.web._site import API, Site
+from smartcam.web._site import API
+from smartcam.web._threaded_site import ThreadedSite
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -37,24 +36,24 @@ MAX_LOOKS: Final = 16
 """Pictures asked for at a time: eight people, two each."""
 
 MAX_KEPT: Final = 8
-"""People whose pictures are kept."""
+"""Viewers whose pictures are kept."""
 
 KEPT: Final = 2
-"""Pictures of each: the one that is shown, and the one on its way."""
+"""Pictures kept for each viewer: the one that is shown, and the one on its way."""
 
 THREADS: Final = 2
-"""That make pictures and masks."""
+"""Threads that make pictures and masks."""
 
-LEAST_REGION: Final = 2e-3
-"""Part of the picture that a region has at least to be told of."""
+MIN_REGION_SHARE: Final = 2e-3
+"""Least share of the picture that a region must fill to be reported."""
 
 MAX_REGIONS: Final = 8
-"""Regions that are told of."""
+"""Regions that are reported at most, the largest first."""
 
 T = TypeVar("T")
 
 
-class ColourSite(Site):
+class ColourSite(ThreadedSite):
     """A page that picks a range of colours in a camera's live picture.
 
     ::
@@ -66,9 +65,9 @@ class ColourSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        source: it is opened and closed by who made it. It streams for each picture that is asked
-            for; ``linger`` has it go on in between.
-        colours: what the page begins with.
+        source: source that the caller opens and closes. It streams for each picture that is asked
+            for; ``linger`` lets it stream on in between.
+        colours: range of colours that the page begins with.
         quality: of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as it is.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
@@ -83,6 +82,8 @@ class ColourSite(Site):
         ConfigurationError: the token cannot be used, or the quality is none.
         MissingExtraError: the extra ``depth`` is not installed.
     """
+
+    thread_count: ClassVar[int] = THREADS
 
     def __init__(
         self,
@@ -102,15 +103,8 @@ class ColourSite(Site):
         self.source: FrameSource = source
         self.colours: ColourRange = ColourRange() if colours is None else colours
         self._quality = quality
-        self._threads: ThreadPoolExecutor | None = None
         self._looks = 0
         self._kept: OrderedDict[str, deque[Frame]] = OrderedDict()
-
-    async def start(self) -> None:
-        """Open the port."""
-        if self._threads is None:
-            self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.colours")
-        await super().start()
 
     async def stop(self) -> None:
         """Close the port; nothing is kept."""
@@ -118,9 +112,6 @@ class ColourSite(Site):
             await super().stop()
         finally:
             self._kept.clear()
-            threads, self._threads = self._threads, None
-            if threads is not None:
-                await asyncio.to_thread(threads.shutdown)
 
     async def next_frame(self, viewer: str) -> Frame:
         """Return the next frame of the source, and keep it for a viewer.
@@ -166,10 +157,8 @@ class ColourSite(Site):
 
         Cancellation: safe; a thread that has begun goes on to the end.
         """
-        if self._threads is None:
-            raise RefusedError(503, "a site that ends", "one that runs")
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._threads, what, *args)
+            return await self.in_thread(what, *args)
         except FrameSourceError as exc:
             raise RefusedError(409, str(exc), "a frame that can be read") from exc
 
@@ -186,7 +175,7 @@ class ColourSite(Site):
         picture = jpeg(frame, self._quality)
         mask = colours.mask_hsv(hsv(frame))
         _, png = load("cv2").imencode(".png", mask.view(np.uint8) * 255)
-        regions = find_regions(mask, area=(LEAST_REGION * mask.size, np.inf), most=MAX_REGIONS)
+        regions = find_regions(mask, area=(MIN_REGION_SHARE * mask.size, np.inf), most=MAX_REGIONS)
         said = {
             "sequence": frame.sequence,
             "width": frame.width,
@@ -270,7 +259,7 @@ class AroundBody(CallBody):
 
 @CALLS.add("GET", API)
 def _calls(_site: ColourSite, _call: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 

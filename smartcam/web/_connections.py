@@ -1,9 +1,7 @@
 """The connections of a site: how many there are, and how long each may take for a request.
 
-All of it holds before a token is looked at. A connection whose request is there in whole is being
-answered and has its place for certain; of the others, the one without such a request for longest
-makes room for a newcomer. So nobody can lock a page, or take the process its file descriptors,
-which the camera's port needs, too.
+It is the policy of every port (:mod:`smartcam._accepting`), and holds before a token is looked at.
+What stands for a session is a request that is there in whole, while it is answered.
 """
 
 from __future__ import annotations
@@ -12,6 +10,8 @@ import asyncio
 import contextlib
 import logging
 from typing import TYPE_CHECKING, cast
+
+from smartcam._accepting import Acceptor, Places
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -41,43 +41,22 @@ _BUSY = (
 )
 
 
-class Places:
-    """The places of a site; ``make`` returns what speaks HTTP on a connection."""
+class Visitors:
+    """The connections of a site.
+
+    Args:
+        make: returns what speaks HTTP on a connection.
+    """
 
     def __init__(self, make: Callable[[], asyncio.Protocol]) -> None:
-        self.crowded_out: int = 0  # connections that were closed because too many were open
         self.make: Callable[[], asyncio.Protocol] = make
         self.closed: bool = False
-        # the one without a whole request for longest stands first
-        self._visitors: dict[Visitor, None] = {}
-
-    def __len__(self) -> int:
-        return len(self._visitors)
-
-    def __call__(self) -> Visitor:
-        """Return the protocol of a new connection."""
-        return Visitor(self)
-
-    def enter(self, visitor: Visitor) -> bool:
-        """Take a connection; False where none can make room for it."""
-        if len(self._visitors) >= MAX_CONNECTIONS:
-            self.crowded_out += 1
-            one = next((one for one in self._visitors if not one.answered), None)
-            if one is None:
-                return False
-            one.close(f"{MAX_CONNECTIONS} others are open, it was without a request for longest")
-        self._visitors[visitor] = None
-        return True
-
-    def renew(self, visitor: Visitor) -> None:
-        """A request was answered."""
-        if visitor in self._visitors:
-            del self._visitors[visitor]
-            self._visitors[visitor] = None
-
-    def leave(self, visitor: Visitor) -> None:
-        """A connection is gone; harmless when said twice."""
-        self._visitors.pop(visitor, None)
+        self.places: Places[Visitor] = Places(
+            MAX_CONNECTIONS, within=HEAD_TIMEOUT, what="no request", own="a request"
+        )
+        self.acceptor: Acceptor[Visitor] = Acceptor(
+            lambda: Visitor(self), self.places, _log, name="smartcam.web"
+        )
 
 
 class Visitor(asyncio.Protocol):
@@ -85,11 +64,11 @@ class Visitor(asyncio.Protocol):
 
     _transport: asyncio.Transport
 
-    def __init__(self, places: Places) -> None:
-        self.answered: bool = False  # whether a request that is there in whole is being answered
-        self._places = places
+    def __init__(self, visitors: Visitors) -> None:
+        self.settled: bool = False  # whether a request that is there in whole is being answered
+        self._visitors = visitors
+        self._acceptor = visitors.acceptor
         self._inner: asyncio.Protocol | None = None  # None: nobody hears what comes
-        self._timer: asyncio.TimerHandle | None = None
         self._head: bytearray | None = None  # while a head is awaited: what came of it
         self._idle = False  # its first byte may take long
         self._rest: StreamReader | None = None  # a body that was refused before it had come
@@ -102,16 +81,17 @@ class Visitor(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         address = transport.get_extra_info("peername")
         self._peer = f"{address[0]}:{address[1]}" if address else "?"
-        if self._places.closed:
+        if self._visitors.closed:
             self._transport.abort()
-        elif not self._places.enter(self):
-            _log.info("= %s: connection closed: every place is taken", self._peer)
+            return
+        refusal = self._acceptor.enter(self, address)
+        if refusal:
+            _log.info("= %s: connection closed: %s", self._peer, refusal)
             self._transport.write(_BUSY)
             self._transport.close()
         else:
-            self._inner = self._places.make()
+            self._inner = self._visitors.make()
             self._head = bytearray()
-            self._set_timer(HEAD_TIMEOUT, "no request")
             self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
@@ -137,8 +117,7 @@ class Visitor(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Give the place back."""
-        self._stop_timer()
-        self._places.leave(self)
+        self._acceptor.leave(self)
         if self._inner is not None:
             self._inner.connection_lost(exc)
         if self._rest is not None:  # for which aiohttp would wait even now
@@ -148,34 +127,33 @@ class Visitor(asyncio.Protocol):
 
     @contextlib.contextmanager
     def request(self, request: web.BaseRequest) -> Iterator[None]:
-        """In here a request is dealt with whose head is there."""
-        self._stop_timer()
+        """Deal, while in here, with a request whose head is there."""
+        self._acceptor.expect(self, None, "")
         self._head = None
         try:
             yield
         finally:
             if request.content.is_eof():
                 self._head, self._idle = bytearray(), True
-                self._set_timer(KEEP_ALIVE, "no request")
+                self._acceptor.expect(self, KEEP_ALIVE, "no request")
             else:  # the connection ends with it
                 self._rest = request.content
-                self._set_timer(HEAD_TIMEOUT, "no end of a body")
+                self._acceptor.expect(self, HEAD_TIMEOUT, "no end of a body")
 
     @contextlib.contextmanager
     def answer(self) -> Iterator[None]:
-        """In here a request is answered that is there in whole: the place is safe."""
-        self.answered = True
+        """Answer, while in here, a request that is there in whole: the place is safe."""
+        self.settled = True
         try:
             yield
         finally:
-            self.answered = False
-            self._places.renew(self)
+            self.settled = False
+            self._acceptor.move_back(self)
 
-    def close(self, reason: str) -> None:
+    def turn_away(self, why: str) -> None:
         """End the connection at once."""
-        _log.info("= %s: connection closed: %s", self._peer, reason)
-        self._stop_timer()
-        self._places.leave(self)
+        _log.info("= %s: connection closed: %s", self._peer, why)
+        self._acceptor.leave(self)
         self._transport.abort()
 
     # ------------------------------------------------------------------ inside
@@ -184,25 +162,14 @@ class Visitor(asyncio.Protocol):
         """Look for the end of the head that is awaited."""
         if self._idle:
             self._idle = False
-            self._set_timer(HEAD_TIMEOUT, "half a request")
+            self._acceptor.expect(self, HEAD_TIMEOUT, "half a request")
         known = max(0, len(head) - len(_HEAD_END) + 1)
         head += data
         end = head.find(_HEAD_END, known)
         if end >= 0:
             self._head = None
         if (end if end >= 0 else len(head)) > MAX_HEAD:
-            self.close(f"the head of its request has more than {MAX_HEAD} bytes")
-
-    def _set_timer(self, seconds: float, what: str) -> None:
-        self._stop_timer()
-        if not self._transport.is_closing():
-            loop = asyncio.get_running_loop()
-            self._timer = loop.call_later(seconds, self.close, f"{what} within {seconds:g} s")
-
-    def _stop_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+            self.turn_away(f"the head of its request has more than {MAX_HEAD} bytes")
 
 
 def visitor_of(request: web.BaseRequest) -> Visitor | None:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, model_validator
 
-from smartcam.emulator._camera import CONDITIONS
-from smartcam.emulator._scene import PIECES, TablePose
+from smartcam.emulator import TablePose
+from smartcam.emulator._inside import CONDITIONS, PIECES
 from smartcam.emulator.faults import Fault
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import _serialize as serialize
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-    from smartcam.emulator import WireCamera
-    from smartcam.emulator._scene import TableScene
+    from smartcam.emulator import TableScene, WireCamera
 
 MAX_ENTRIES = 1000
 """Log entries that one answer tells; ``next`` says where to go on."""
@@ -32,7 +31,7 @@ MAX_ENTRIES = 1000
 MAX_WAIT = 30.0
 """Seconds that a call waits for a log entry at most."""
 
-MAX_WAITING = 16
+MAX_WAITING_CHANGES = 16
 """Calls that wait for one at a time. With the event streams they leave half of the places free."""
 
 LOOK_AGAIN = 0.02
@@ -88,10 +87,12 @@ class EmulatorSite(Site):
         """Wait until something holds, for some time, and as long as site and client are there.
 
         Raises:
-            RefusedError: 503, :data:`MAX_WAITING` calls wait already.
+            RefusedError: 503, :data:`MAX_WAITING_CHANGES` calls wait already.
         """
-        if self._waiting >= MAX_WAITING:
-            raise RefusedError(503, f"waiting call {MAX_WAITING + 1}", f"{MAX_WAITING} at one time")
+        if self._waiting >= MAX_WAITING_CHANGES:
+            raise RefusedError(
+                503, f"waiting call {MAX_WAITING_CHANGES + 1}", f"{MAX_WAITING_CHANGES} at one time"
+            )
         self._waiting += 1
         try:
             loop = asyncio.get_running_loop()
@@ -140,7 +141,7 @@ class _PartPose(CallBody):
 
 
 class _Place(BaseModel):
-    """Where a look into the log begins."""
+    """The place where a look into the log begins."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
@@ -148,7 +149,7 @@ class _Place(BaseModel):
 
 
 class _Part(_Place):
-    """Which part of the log is wanted."""
+    """The part of the log that is wanted."""
 
     limit: int = Field(default=MAX_ENTRIES, ge=1, le=MAX_ENTRIES)
     wait: float = Field(default=0.0, ge=0, le=MAX_WAIT, allow_inf_nan=False)
@@ -185,7 +186,7 @@ def _emulator(site: EmulatorSite, call: CallRequest) -> WireCamera:
 
 
 def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
-    """Return what an operator does with a camera; RefusedError: it has nothing like that."""
+    """Return a method of the camera's operator; RefusedError: the camera has no such method."""
     emulator = _emulator(site, call)
     if not hasattr(emulator.device, what):
         able = ", ".join(serialize.abilities(emulator)) or "nothing of the kind"
@@ -195,7 +196,7 @@ def _operator(site: EmulatorSite, call: CallRequest, what: str) -> Any:
 
 def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
     """Return the table that a camera looks at; RefusedError: it looks at none."""
-    scene = _emulator(site, call).scene
+    scene = _emulator(site, call).table
     if scene is None:
         raise RefusedError(409, "a camera without a scene", "one that looks at a table")
     return scene
@@ -203,7 +204,7 @@ def _table(site: EmulatorSite, call: CallRequest) -> TableScene:
 
 @CALLS.add("GET", API)
 def _calls(_site: EmulatorSite, _ask: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 

@@ -1,4 +1,4 @@
-"""What a call is answered with that cannot be done: JSON that says why."""
+"""Answer a call that cannot be done: JSON that says why."""
 
 from __future__ import annotations
 

@@ -16,14 +16,14 @@ MAX_LOG_NEWS = 200
 """Log entries in one event; at ten events a second it keeps up with 2000 messages a second."""
 
 MAX_FAULTS_TOLD = 100
-"""Faults that an event tells."""
+"""Faults that one event reports at most."""
 
 CLOCK_LOOKS = round(1.0 / PERIOD)
 """Looks after which the clock is told: once a second. It shows a reader that is gone, too."""
 
 
 class Watcher:
-    """What one reader knows of a camera.
+    """The state of a camera as one reader knows it.
 
     ``since`` is the serial of the first log entry that is wanted; None: what comes from now on.
     """
@@ -36,12 +36,12 @@ class Watcher:
         self._looks = 0
 
     def look(self) -> Iterator[News]:
-        """Yield what changed since the last look; the first one tells everything but the log."""
+        """Yield the changes since the last look; the first look yields everything but the log."""
         emulator = self._emulator
         log = self._log()
         yield from self._changed("camera", serialize.camera_state(self._name, emulator))
-        if emulator.scene is not None:
-            yield from self._changed("scene", serialize.scene_state(emulator, emulator.scene))
+        if emulator.table is not None:
+            yield from self._changed("scene", serialize.scene_state(emulator, emulator.table))
         if self._changed_faults():
             yield News("faults", serialize.faults_state(emulator, MAX_FAULTS_TOLD))
         if log is not None:

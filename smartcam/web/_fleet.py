@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._errors import RefusedError
+from smartcam.web._failure_pictures import FailurePictures
 from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, RowsInSight
 from smartcam.web._fleet_view import FleetView
 from smartcam.web._live import CALLS as LIVE_CALLS
@@ -16,8 +17,11 @@ from smartcam.web._routes import CallRequest, Calls
 from smartcam.web._shapes import OUTLINES
 from smartcam.web._site import API, Site
 from smartcam.web._sockets import check_websocket
+from smartcam.web._units import PageUnits
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from aiohttp import web
 
     from smartcam.fleet import Fleet
@@ -25,10 +29,10 @@ if TYPE_CHECKING:
     from smartcam.web._routes import Action
 
 MAX_VIEWERS: Final = 32
-"""Pages of the table at one time."""
+"""Pages of the table that may be open at one time."""
 
 MAX_CAMERAS: Final = 16
-"""Cameras that are looked at on a page of their own, at one time."""
+"""Cameras that may have a page of their own open at one time."""
 
 LINGER: Final = 30.0
 """Seconds that a camera is followed for its own page after nobody looks at that any more."""
@@ -46,19 +50,21 @@ class FleetSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        fleet: it, opened; closed by who made it.
+        fleet: an open fleet, which the caller closes.
         control: whether the pages may trigger, start, stop and switch cameras.
+        units: names of the units that the pages show instead of SI from their beginning, such as
+            ``("mm", "deg")``. None: they begin with SI, and their switch shows these two.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         token: what every call must carry, as :class:`~smartcam.web.FramesSite` has it.
 
     Attributes:
-        view: what the table shows.
+        view: view of the fleet that the table shows.
         control: as given.
-        viewers: who looks at the table.
+        viewers: sockets of the pages that show the table.
 
     Raises:
-        ConfigurationError: the token cannot be used.
+        ConfigurationError: the token cannot be used, or a unit is unknown.
     """
 
     def __init__(
@@ -66,6 +72,7 @@ class FleetSite(Site):
         fleet: Fleet,
         *,
         control: bool = False,
+        units: Sequence[str] | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
@@ -77,14 +84,15 @@ class FleetSite(Site):
             port=port,
             token=token,
             files=(*FILES, "fleet_chart.js", "fleet_row.js", "live.css", "live.js"),
-            pages={"/camera/{name:.+}": "live.html"},
+            pages={"/camera/{name:.+}": "live"},
         )
         self.fleet: Fleet = fleet
         self.control: bool = control
-        self.view: FleetView = FleetView(fleet)
+        self.units: PageUnits = PageUnits(units)
+        self.view: FleetView = FleetView(fleet, self.units.shown)
         self.viewers: set[FleetSocket] = set()
         self._live: dict[str, WatchedCamera] = {}
-        self._keeper: asyncio.Task[None] | None = None
+        self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
         """Follow the fleet, and open the port.
@@ -96,8 +104,9 @@ class FleetSite(Site):
         """
         try:
             await self.view.start()
-            if self._keeper is None:
-                self._keeper = asyncio.create_task(self._keep(), name="smartcam.web.fleet.keeper")
+            if not self._tasks:
+                jobs = (self._keep(), FailurePictures(self.view).run())
+                self._tasks = [asyncio.create_task(job, name="smartcam.web.fleet") for job in jobs]
             await super().start()
         except BaseException:
             await self.stop()
@@ -105,10 +114,10 @@ class FleetSite(Site):
 
     async def stop(self) -> None:
         """Close the port, and leave the fleet alone."""
-        keeper, self._keeper = self._keeper, None
-        if keeper is not None:
-            keeper.cancel()
-            await asyncio.wait([keeper])
+        tasks, self._tasks = self._tasks, []
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         for viewer in self.viewers:
             viewer.end()
         try:
@@ -119,13 +128,18 @@ class FleetSite(Site):
             await self.view.stop()
 
     def about(self) -> dict[str, Any]:
-        """Return what a page is told first, as JSON."""
-        return {"fleet": self.fleet.url, "control": self.control, "outlines": OUTLINES}
+        """Return the first message to a page, as values for JSON."""
+        return {
+            "fleet": self.fleet.url,
+            "control": self.control,
+            "outlines": OUTLINES,
+            "units": self.units.as_json(),
+        }
 
     # ------------------------------------------------------------------ one camera
 
     def live(self, name: str) -> WatchedCamera:
-        """Return what follows a camera for its own page; it is made where there is none.
+        """Return the follower of a camera for its own page; make one where there is none.
 
         Raises:
             RefusedError: 404, no camera is called so; 503, there are :data:`MAX_CAMERAS` already.
@@ -144,8 +158,9 @@ class FleetSite(Site):
         if len(self._live) >= MAX_CAMERAS:
             what = f"camera {MAX_CAMERAS + 1} on a page of its own"
             raise RefusedError(503, what, f"{MAX_CAMERAS} at one time")
-        live = self._live[name] = WatchedCamera(camera, control=self.control)
         row = self.view.rows.get(name)
+        live = WatchedCamera(camera, control=self.control, units=self.units, row=row)
+        self._live[name] = live
         live.start()
         if row is not None and row.last is not None:
             live.view.show(row.last)
@@ -174,7 +189,7 @@ CALLS: Calls[FleetSite] = Calls()
 
 @CALLS.add("GET", API)
 def _calls(_site: FleetSite, _call: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 

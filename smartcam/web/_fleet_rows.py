@@ -6,30 +6,33 @@ import asyncio
 import collections
 import functools
 import json
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+import math
+import time
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.exceptions import InterpretationError, SmartCamError
-from smartcam.models import Localization, Status
-from smartcam.web._live_view import meaning, shown_value
+from smartcam.layout._inside import ShownUnits
+from smartcam.models import Status
+from smartcam.web._history import ShiftHistory
+from smartcam.web._live_view import layout_of, shown_value
+from smartcam.web._verdicts import Outcome, judged
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.fleet import FleetCamera
+    from smartcam.layout import Layout
     from smartcam.models import CameraEvent, Result
     from smartcam.streams import BatchSubscription, Subscription
 
 MAX_QUEUE: Final = 64
-"""Results of a camera that wait for a look; of those beyond only their number is known."""
+"""Results of a camera that may wait for a look; further ones are only counted."""
 
 MAX_QUEUE_BYTES: Final = 1 << 18
 """Bytes of them."""
 
 MAX_KEPT: Final = 1 << 16
 """Bytes of a result that is kept for its picture; of a longer one its length is told."""
-
-MAX_JUDGED: Final = 200
-"""Records of a result in which pass or fail is looked for."""
 
 MAX_DRAWN: Final = 30
 """Parts of a result in its picture."""
@@ -38,23 +41,29 @@ MAX_TEXT: Final = 160
 """Characters of a text in a row."""
 
 RATE_SECONDS: Final = 5
-"""Over which a rate is counted."""
+"""Seconds over which a rate is counted."""
 
 BAD_SECONDS: Final = 60.0
-"""For which a camera with an error has the mark of one."""
+"""Seconds for which a camera keeps the mark of an error."""
 
-Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
 OUTCOMES: Final[tuple[Outcome, ...]] = ("passed", "failed", "other", "errors")
 
 MODES: Final = ("error", "lost", "ended", "gone", "awaited", "stopped", "busy", "running")
-"""What a camera is, in a word, the worst first: one that has ended was taken or given up, no agent
-shares one that is gone, and one that is awaited was never there."""
+"""The states of a camera, the worst first.
+
+A camera that has ended was taken or given up; no agent shares one that is gone; one that is
+awaited
+was never there.
+"""
+
+SI: Final = ShownUnits()
+"""The units in which values are."""
 
 _ERRORS: Final = Status.SYSTEM_ERROR | Status.OVERHEAT
 
 
 class RowState(NamedTuple):
-    """How a camera is."""
+    """The state of a camera."""
 
     connected: bool
     over: bool  # it was given up
@@ -69,27 +78,33 @@ UNKNOWN: Final = RowState(False, False, Status(0), None, "", "", ())
 
 
 class FleetRow:
-    """A camera.
+    """A camera's row in the table of a fleet.
 
     Args:
-        name: of the camera.
-        ring: is called with the row when something of it may have changed.
+        name: name of the camera.
+        ring: function that is called with the row when something of it may have changed.
+        units: units that the page can show instead of SI.
 
     Attributes:
-        agents: that share it.
-        version: of the view, when it was changed last.
-        mode: what it is, in a word.
-        flags: the filters that it passes.
-        count: results that it has sent since it is followed.
-        text: in which a search looks.
+        agents: names of the agents that share the camera.
+        version: version of the view at the last change of the row.
+        mode: state of the camera, in a word.
+        flags: names of the filters that the row passes.
+        count: number of results received since the camera is followed.
+        text: text in which a search looks.
         rate: results in a second.
-        errors: results that could not be read or did not come, and times that it was lost.
-        error: the last of them, for as long as it is marked.
-        stirred: it may be otherwise than when it was looked at.
-        error_at: when it had an error last, on the loop's clock.
+        errors: number of results that could not be read or did not come, and of lost connections.
+        error: text of the last error, for as long as it is marked.
+        stirred: True if the camera may have changed since the last look.
+        error_at: time of the last error, on the loop's clock.
+        history: outcomes and failures of the last hours.
+        changed_at: time at which the camera was connected or lost at last, seconds since 1970.
+        changed_seen: False if that happened before the camera was followed; the time is then that
+            of the first look.
+        picture_at: time of the last try to get the picture of a failure, on the loop's clock.
     """
 
-    def __init__(self, name: str, ring: Callable[[FleetRow], None]) -> None:
+    def __init__(self, name: str, ring: Callable[[FleetRow], None], units: ShownUnits) -> None:
         self.name: str = name
         self.agents: set[str] = set()
         self.camera: FleetCamera[Any] | None = None
@@ -103,9 +118,15 @@ class FleetRow:
         self.error: str = ""
         self.error_at: float | None = None
         self.stirred: bool = False
+        self.history: ShiftHistory = ShiftHistory()
+        self.changed_at: float = time.time()
+        self.changed_seen: bool = False
+        self.picture_at: float = -math.inf
         self._ring = ring
+        self._units = units
         self._counted = (0, 0)  # missed, dropped
         self._last: Result[Any] | None = None
+        self._layout: Layout | None = None  # of the last result
         self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._state: RowState = UNKNOWN
         self._connected = False
@@ -132,12 +153,12 @@ class FleetRow:
         self.stir()
 
     def stir(self) -> None:
-        """It may be otherwise than before."""
+        """Note that the row may have changed."""
         self.stirred = True
         self._ring(self)
 
     def leave(self) -> None:
-        """Hear nothing more of it; idempotent."""
+        """Stop following the camera; a second call does nothing."""
         for stream in (self._results, self._events):
             if stream is not None:
                 stream.close()
@@ -157,11 +178,13 @@ class FleetRow:
                 outcomes["errors"] += 1
                 self.errors += 1
                 self._note(str(exc), now)
+                self.history.add_error(str(exc))
                 continue
             except (StopAsyncIteration, SmartCamError):
                 break
-            outcomes.update(judged(result.value) for result in batch)
+            outcomes.update(self.history.add(result) for result in batch)
             self._last = batch[-1]
+            self._layout = None if self.camera is None else layout_of(self.camera, self._last)
             full |= len(batch) >= MAX_QUEUE
         self.count += outcomes.total()
         if full:
@@ -176,7 +199,9 @@ class FleetRow:
         self._counted = (said.missed, said.dropped)
         missed, dropped = said.missed - before[0], said.dropped - before[1]
         if missed:
-            self._note(f"{missed} results did not come: cut off from the agent for too long", now)
+            text = f"{missed} results did not come: cut off from the agent for too long"
+            self._note(text, now)
+            self.history.add_missed(missed, text)
             outcomes["errors"] += missed
             self.errors += missed
         if dropped:
@@ -191,6 +216,8 @@ class FleetRow:
         camera = self.camera
         connected = camera is not None and camera.connected and bool(self.agents)
         lost = self._connected and not connected
+        if connected != self._connected:
+            self.changed_at, self.changed_seen = time.time(), self._state is not UNKNOWN
         self._connected, self.stirred = connected, False
         status, application, reason, over = Status(0), None, "", False
         if camera is not None:
@@ -202,6 +229,7 @@ class FleetRow:
                 reason = _why(camera)
         if lost:
             self._note(reason or "lost", now)
+            self.history.add_loss(reason or "no agent shares the camera")
             self.errors += 1
         elif self.error_at is not None and now - self.error_at >= BAD_SECONDS:
             self.error, self.error_at = "", None
@@ -240,6 +268,12 @@ class FleetRow:
         self.rate = (self.count - self._marks[0]) / (len(self._marks) - 1)
         return self._marks[0] != self.count
 
+    @property
+    def failure(self) -> int:
+        """Number of the failure that the newest result is; 0 where that is none."""
+        behind = self._results is None or self._results.waiting
+        return 0 if behind else self.history.last_failure
+
     # ------------------------------------------------------------------ for the page
 
     @property
@@ -249,17 +283,17 @@ class FleetRow:
 
     @property
     def last_at(self) -> float:
-        """When the last result came, seconds since 1970; 0 without one."""
+        """Time of the last result, seconds since 1970; 0 without one."""
         return self._last.received_at.timestamp() if self._last is not None else 0.0
 
     def as_json(self) -> str:
-        """Return it as JSON, made once for all who look."""
+        """Return the row as JSON, made once for all pages."""
         if self._json[0] != self.version:
             self._json = (self.version, json.dumps(self.fields(), separators=(",", ":")))
         return self._json[1]
 
     def fields(self) -> dict[str, Any]:
-        """Return it as a page shows it."""
+        """Return the row as a page shows it."""
         state = self._state
         return {
             "name": self.name,
@@ -271,8 +305,42 @@ class FleetRow:
             "rate": round(self.rate, 1),
             "count": self.count,
             "errors": self.errors,
-            "last": None if self._last is None else _pictured(self._last),
+            "last": None if self._last is None else self._pictured(self._last),
+            "changed_at": round(self.changed_at),
+            "changed_seen": self.changed_seen,
+            "failed_since": self.history.failed_since,
+            "in_a_row": self.history.in_a_row,
+            "shift": self.history.totals,
+            "trend": self.history.trend(),
         }
+
+    def _pictured(self, result: Result[Any]) -> dict[str, Any]:
+        """Return a result as a row shows it: lines of text, or parts to be drawn.
+
+        ``text`` is in SI; ``practical`` is the same in the units of the page's switch.
+        """
+        told: dict[str, Any] = {
+            "at": round(result.received_at.timestamp(), 2),
+            "number": result.number,
+            "outcome": judged(result.value),
+        }
+        if len(result.raw) > MAX_KEPT:
+            return {**told, "text": f"{len(result.raw)} bytes"}
+        value = shown_value(result.value, self._layout)
+        if "parts" in value:
+            parts = [
+                [one["name"][:40], *(round(one[key], 5) for key in ("x", "y", "theta"))]
+                for one in value["parts"][:MAX_DRAWN]
+                if None not in (one["x"], one["y"], one["theta"])
+            ]
+            return {**told, "parts": parts, "parts_count": value["count"]}
+        if "cut" in value:
+            return {**told, "text": value["cut"][:MAX_TEXT]}
+        units = value["units"]
+        lines = {"text": line_of(value["value"], units)}
+        if units:
+            lines["practical"] = line_of(value["value"], units, self._units)
+        return {**told, **{name: text[:MAX_TEXT] for name, text in lines.items()}}
 
 
 def _why(camera: FleetCamera[Any]) -> str:
@@ -307,53 +375,23 @@ def _flags(mode: str, state: RowState, *, bad: bool) -> frozenset[str]:
     return frozenset(name for name, on in flags.items() if on)
 
 
-_meaning = functools.lru_cache(maxsize=4096)(meaning)
+def line_of(value: Any, units: Any, shown: ShownUnits = SI) -> str:
+    """Return a value in one line.
 
-
-def judged(value: Any) -> Outcome:
-    """Return how a result turned out, by the names of its truth values."""
-    rows = value if isinstance(value, list) else [value]
-    verdict: Outcome = "other"
-    for row in rows[:MAX_JUDGED]:
-        if isinstance(row, Localization) or not hasattr(row, "_asdict"):
-            return "other"
-        for name, one in row._asdict().items():
-            if one is True or one is False:
-                good = _meaning(name)
-                if good is not None and one is not good:
-                    return "failed"
-                if good is not None:
-                    verdict = "passed"
-    return verdict
-
-
-def _pictured(result: Result[Any]) -> dict[str, Any]:
-    """Return a result as a row shows it: a line of text, or parts to be drawn."""
-    told: dict[str, Any] = {
-        "at": round(result.received_at.timestamp(), 2),
-        "number": result.number,
-        "outcome": judged(result.value),
-    }
-    if len(result.raw) > MAX_KEPT:
-        return {**told, "text": f"{len(result.raw)} bytes"}
-    value = shown_value(result.value)
-    if "parts" in value:
-        parts = [
-            [one["name"][:40], *(round(one[key], 5) for key in ("x", "y", "theta"))]
-            for one in value["parts"][:MAX_DRAWN]
-            if None not in (one["x"], one["y"], one["theta"])
-        ]
-        return {**told, "parts": parts, "parts_count": value["count"]}
-    text = value.get("cut") or _line(value.get("value"))
-    return {**told, "text": text[:MAX_TEXT]}
-
-
-def _line(value: Any) -> str:
-    """Return a value in one line."""
+    Args:
+        value: value, as JSON has it.
+        units: SI unit of the value, or those of its fields by their names.
+        shown: units in which the line shows numbers.
+    """
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_line(one)}" for name, one in list(value.items())[:20])
+        fields = list(value.items())[:20]
+        return ", ".join(
+            f"{name} {line_of(one, units.get(name, {}), shown)}" for name, one in fields
+        )
     if isinstance(value, list):
-        return f"{len(value)}: " + " | ".join(map(_line, value[:3]))
+        return f"{len(value)}: " + " | ".join(line_of(one, units, shown) for one in value[:3])
     if isinstance(value, float):
+        if isinstance(units, str):
+            return f"{shown.shown(value, units):.5g} {shown.of(units).name}"
         return f"{value:.5g}"
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if value and isinstance(value, str) else json.dumps(value)

@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from smartcam.web._fleet_view import FleetView
 
 PROTOCOL: Final = "smartcam.fleet"
-"""Of the WebSockets."""
+"""Subprotocol of the WebSockets that send the fleet's table."""
 
 MAX_ROWS: Final = 120
 """Rows that may be in sight: three times those of a tall screen."""
 
 MAX_SEARCH: Final = 100
-"""Characters that are searched for."""
+"""Characters of a search text at most."""
 
 LONGEST: Final = 1024
-"""Bytes of what a page may say."""
+"""Bytes of a message from a page at most."""
 
 ALIVE: Final = 5.0
 """Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
@@ -39,14 +39,14 @@ QUICK: Final = 0.05
 """Seconds between two messages at least, to a page that looks here and there."""
 
 AT_ONCE: Final = 10
-"""Rows that are made JSON before everybody else has a turn."""
+"""Rows that are made JSON before other tasks of the loop have a turn."""
 
 TOTALS: Final = 1.0
-"""Seconds between two tellings of what is true of all cameras."""
+"""Seconds between two messages with the totals of all cameras."""
 
 
 class RowsInSight(BaseModel):
-    """What a page has in sight."""
+    """The rows that a page has in sight."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
 
@@ -59,17 +59,17 @@ class RowsInSight(BaseModel):
 
     @property
     def query(self) -> RowQuery:
-        """Which rows, in which order."""
+        """Query of the rows that are wanted, and their order."""
         return RowQuery(self.search, self.filter, self.sort, self.down)
 
 
 class FleetSocket(PageSocket):
-    """One who looks.
+    """The WebSocket of a page that shows the table.
 
     Args:
-        view: of the fleet.
-        about: is told first.
-        request: that asks for the WebSocket.
+        view: view of the fleet.
+        about: values of the first message.
+        request: request that asks for the WebSocket.
     """
 
     def __init__(self, view: FleetView, about: dict[str, Any], request: web.Request) -> None:
@@ -94,7 +94,7 @@ class FleetSocket(PageSocket):
         return True
 
     async def _show(self) -> None:
-        """Tell what changed, and wait until it is shown; TimeoutError: it is not."""
+        """Send the changes until the fleet ends; TimeoutError: the page does not show them."""
         loop = asyncio.get_running_loop()
         await self._send(json.dumps({**self._about, "now": time.time()}))
         said_at = loop.time()
@@ -119,7 +119,7 @@ class FleetSocket(PageSocket):
     # ------------------------------------------------------------------ what is new
 
     async def _news(self) -> str:
-        """Return what the page does not know yet; "" for nothing."""
+        """Return a message with the changes since the last one; "" if there are none."""
         moved = self._moved.is_set()
         self._moved.clear()
         parts = [*self._changed_totals()]

@@ -1,4 +1,4 @@
-"""What the fleet's page knows: follows a fleet once, however many look.
+"""Keep the fleet's page up to date: follow a fleet once, however many look.
 
 One task looks five times a second at what rang, which costs nothing while nothing happens. Nobody
 who looks is waited for: they ask for rows in an order, and for what is newer than they know.
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.fleet import Fleet, FleetEvent
+    from smartcam.layout._inside import ShownUnits
     from smartcam.streams import Subscription
 
 _log = logging.getLogger("smartcam.web")
@@ -27,22 +28,22 @@ PERIOD: Final = 0.2
 """Seconds between two looks, and between two updates of a page."""
 
 MAX_EVENTS: Final = 50_000
-"""Of cameras that come and go, between two looks; with more the fleet is looked at anew."""
+"""Events of cameras between two looks; after more the whole fleet is read anew."""
 
 MAX_GONE: Final = 10_000
-"""Cameras that nobody shares any more and that are shown yet; those gone longest are forgotten."""
+"""Cameras shown although nobody shares them any more; those gone longest are forgotten."""
 
 AT_ONCE: Final = 50
-"""Rows or results that are dealt with before everybody else has a turn."""
+"""Rows or results that are handled before other tasks of the loop have a turn."""
 
 SIFTED: Final = 1000
-"""Rows that are searched before everybody else has a turn."""
+"""Rows that are searched before other tasks of the loop have a turn."""
 
 BUCKET: Final = 5
 """Seconds of one bar of the outcomes."""
 
 SERIES: Final = 600
-"""Seconds of outcomes."""
+"""Seconds over which outcomes are kept."""
 
 ORDERED: Final = 1.0
 """Seconds that an order stays while what it goes by changes: rows that jump cannot be read."""
@@ -59,11 +60,11 @@ SORTS: Final[dict[str, Callable[[FleetRow], Any]]] = {
     "last": lambda row: row.last_at,
     "errors": lambda row: row.errors,
 }
-"""What rows are sorted by, but their name."""
+"""Keys by which rows are sorted, other than their name."""
 
 
 class RowQuery(NamedTuple):
-    """Which rows, in which order."""
+    """A query of rows: which ones, and in which order."""
 
     search: str = ""  # words that all must be in a row
     filter: Filter = "all"
@@ -80,24 +81,28 @@ class RowOrder(NamedTuple):
 
 
 class FleetView:
-    """Follows a fleet.
+    """Follows the cameras of a fleet, for the pages that show them.
 
     Args:
-        fleet: it, opened; closed by whoever made it.
+        fleet: an open fleet, which the caller closes.
+        units: units that the pages can show instead of SI.
 
     Attributes:
         rows: cameras by name.
-        version: of all rows; grows with each change.
-        series: outcomes that were counted: start of a bar, seconds since 1970, and how many passed,
-            failed, told neither, were errors. Bars of nothing are left out.
-        ended: it follows no more.
+        version: version of all rows, which grows with each change.
+        series: counts of the outcomes: start of a bar, seconds since 1970, and the number of
+            results that passed, failed, told neither, or were errors. Empty bars are left out.
+        failing: rows whose newest result is a failure without a picture.
+        ended: True once the view does not follow the fleet any more.
     """
 
-    def __init__(self, fleet: Fleet) -> None:
+    def __init__(self, fleet: Fleet, units: ShownUnits) -> None:
         self.fleet: Fleet = fleet
+        self._units = units
         self.rows: dict[str, FleetRow] = {}
         self.version: int = 0
         self.series: collections.deque[tuple[int, ...]] = collections.deque(maxlen=SERIES // BUCKET)
+        self.failing: dict[FleetRow, None] = {}
         self.ended: bool = True
         self.agents: set[str] = set()
         self._names: list[str] = []  # sorted; empty: to be made anew
@@ -121,6 +126,11 @@ class FleetView:
             self.ended = False
             await self._begin()
             self._task = asyncio.create_task(self._run(), name="smartcam.web.fleet")
+            self._task.add_done_callback(self._follows_no_more)
+
+    def _follows_no_more(self, task: asyncio.Task[None]) -> None:
+        if task is self._task:
+            self.ended = True
 
     async def stop(self) -> None:
         """End; harmless when done twice."""
@@ -148,8 +158,6 @@ class FleetView:
         except Exception:
             _log.exception("! the fleet's page follows no more: a fault of ours")
             raise
-        finally:
-            self.ended = True
 
     # ------------------------------------------------------------------ who is there
 
@@ -206,7 +214,7 @@ class FleetView:
     def _join(self, name: str, agent: str) -> None:
         row = self.rows.get(name)
         if row is None:
-            row = self.rows[name] = FleetRow(name, self._ring)
+            row = self.rows[name] = FleetRow(name, self._ring, self._units)
             self._names = []
         self.agents.add(agent)
         row.agents.add(agent)
@@ -232,6 +240,8 @@ class FleetView:
             came = self._count_in(row, outcomes, row.count - before)
             if row.stirred or outcomes["errors"]:
                 self._refresh(row, now)
+            if row.history.wants_picture:
+                self.failing[row] = None
             done += 1 + came
             if done >= AT_ONCE:
                 done = 0
@@ -274,6 +284,7 @@ class FleetView:
     def _forget(self, name: str) -> None:
         row = self.rows.pop(name)
         row.leave()
+        self.failing.pop(row, None)
         self._flags.subtract(row.flags)
         self._aging.discard(row)
         self._gone.pop(name, None)
@@ -310,7 +321,7 @@ class FleetView:
     # ------------------------------------------------------------------ for those who look
 
     def totals(self) -> dict[str, Any]:
-        """Return what is true of all cameras."""
+        """Return the totals of all cameras, as values for JSON."""
         rate = (self._marks[-1] - self._marks[0]) / max(1, len(self._marks) - 1)
         counts = {name: self._flags[name] for name in ("connected", "errors", "busy", "stopped")}
         return {
@@ -343,7 +354,7 @@ class FleetView:
         return made
 
     def is_late(self, query: RowQuery) -> bool:
-        """Whether a query's order is of before the last change."""
+        """Return True if a query's order is older than the last change."""
         known = self._orders.get(query)
         return known is None or known.version != self.version
 

@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import contextlib
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Annotated
 
 from aiohttp import web
+from pydantic import Field
 
-from smartcam.exceptions import FrameSourceError, LocalProtocolError
+from smartcam._arguments import check_flag
+from smartcam.exceptions import (
+    FrameFeatureError,
+    FrameSourceError,
+    LocalProtocolError,
+    TriggerError,
+    UnsupportedError,
+)
 from smartcam.web._errors import RefusedError, shown
 from smartcam.web._jpeg import require_encoder
 from smartcam.web._pictures import FILES, SitePictures
-from smartcam.web._routes import CallRequest, Calls
+from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from smartcam.frames import FrameSource
+    from smartcam.frames import Frame, FrameSource
     from smartcam.web._pictures import Viewer
 
 
@@ -32,18 +43,21 @@ class FramesSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        sources: they are opened and closed by who made them; one that is not open is awaited.
-        quality: of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as it is.
+        sources: sources that the caller opens and closes; the page waits for one that is not open.
+        quality: quality of the JPEGs that are made, 1 to 100. A JPEG from a camera stays as it is.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
+        changes: whether who looks may set features of the devices, execute their commands and
+            trigger them; anybody who can open the page may then.
         token: what every call must carry in ``Authorization: Bearer``, as
             :class:`~smartcam.web.LiveSite` has it. A browser's WebSocket, which can carry none,
             names it among its protocols: ``bearer.TOKEN``.
 
     Attributes:
         sources: as given.
-        failures: why a source is not open, by its place in ``sources``; for whoever opens them to
-            say.
+        changes: as given.
+        failures: reason why a source is not open, by its place in ``sources``; set by whoever
+            opens the sources.
 
     Raises:
         ConfigurationError: the token cannot be used, or the quality is none.
@@ -58,8 +72,11 @@ class FramesSite(Site):
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
+        changes: bool = False,
     ) -> None:
-        super().__init__(CALLS, "frames", host=host, port=port, token=token, files=FILES)
+        files = (*FILES, "features.js")
+        super().__init__(CALLS, "frames", host=host, port=port, token=token, files=files)
+        self.changes: bool = check_flag(changes, "changes", "FramesSite")
         self.pictures: SitePictures = SitePictures(sources, quality)
         require_encoder()
         self.sources: tuple[FrameSource, ...] = self.pictures.sources
@@ -93,9 +110,50 @@ def _place(site: FramesSite, call: CallRequest) -> int:
     return int(given)
 
 
+class _NameBody(CallBody):
+    """The name of a feature."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class _FeatureBody(_NameBody):
+    """A feature, and the value that it is to have."""
+
+    value: bool | int | Annotated[float, Field(allow_inf_nan=False)] | str
+
+
+def _changing(site: FramesSite, call: CallRequest) -> int:
+    """Return the place of a source that may be changed here."""
+    if not site.changes:
+        raise RefusedError(
+            403, "a change of a device", "one that was started with --changes, or changes=True"
+        )
+    return _place(site, call)
+
+
+@contextlib.contextmanager
+def _refused(site: FramesSite, place: int) -> Iterator[None]:
+    """Have the error of a device refuse a call."""
+    try:
+        yield
+    except LocalProtocolError as exc:
+        failure = site.pictures.state(place)["failure"]
+        raise RefusedError(409, failure, "a source that is there") from exc
+    except (FrameFeatureError, UnsupportedError) as exc:
+        raise RefusedError(422, str(exc), "what the device has") from exc
+    except (FrameSourceError, TriggerError) as exc:
+        raise RefusedError(409, str(exc), "a source that gives frames") from exc
+
+
+async def _as_jpeg(site: FramesSite, place: int, frame: Frame) -> web.Response:
+    data = await site.pictures.press(place).jpeg(frame)
+    headers = {"Frame-Sequence": str(frame.sequence), "Frame-Age": f"{frame.age:.4f}"}
+    return web.Response(body=data, content_type="image/jpeg", headers=headers)
+
+
 @CALLS.add("GET", API)
 def _calls(_site: FramesSite, _call: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 
@@ -105,20 +163,57 @@ def _sources(site: FramesSite, _call: CallRequest) -> object:
     return {"sources": [site.pictures.state(place) for place in range(len(site.sources))]}
 
 
+@CALLS.add("GET", f"{API}/sources/{{place}}/features")
+async def _features(site: FramesSite, call: CallRequest) -> object:
+    """The features of a source's device, with value and range; and whether they may be set here."""
+    place = _place(site, call)
+    with _refused(site, place):
+        found = await site.sources[place].features.describe()
+    features = [{**dataclasses.asdict(one), "range": one.range} for one in found.values()]
+    for one in features:
+        if isinstance(one["value"], float) and not math.isfinite(one["value"]):
+            one["value"] = None
+    return {"settable": site.changes, "features": features}
+
+
+@CALLS.add(
+    "POST",
+    f"{API}/sources/{{place}}/feature",
+    body=_FeatureBody,
+    sample='{"name": "Gain", "value": 6.0}',
+)
+async def _set_feature(site: FramesSite, call: CallRequest) -> object:
+    """Set a feature, where the page may; answers the value that the device has then."""
+    place = _changing(site, call)
+    with _refused(site, place):
+        return {"value": await site.sources[place].features[call.body.name].set(call.body.value)}
+
+
+@CALLS.add(
+    "POST", f"{API}/sources/{{place}}/command", body=_NameBody, sample='{"name": "UserSetLoad"}'
+)
+async def _command(site: FramesSite, call: CallRequest) -> object:
+    """Execute a command, where the page may; answers when the device has done it."""
+    place = _changing(site, call)
+    with _refused(site, place):
+        await site.sources[place].features[call.body.name].execute()
+    return {}
+
+
+@CALLS.add("POST", f"{API}/sources/{{place}}/trigger")
+async def _trigger(site: FramesSite, call: CallRequest) -> web.Response:
+    """Trigger the device, where the page may; answers the picture that this caused, as a JPEG."""
+    place = _changing(site, call)
+    with _refused(site, place):
+        return await _as_jpeg(site, place, await site.sources[place].trigger())
+
+
 @CALLS.add("GET", f"{API}/sources/{{place}}/picture")
 async def _picture(site: FramesSite, call: CallRequest) -> web.Response:
     """The newest frame, as a JPEG; the device streams for it."""
     place = _place(site, call)
-    try:
-        frame = await site.sources[place].newest()
-        data = await site.pictures.press(place).jpeg(frame)
-    except LocalProtocolError as exc:
-        failure = site.pictures.state(place)["failure"]
-        raise RefusedError(409, failure, "a source that is there") from exc
-    except FrameSourceError as exc:
-        raise RefusedError(409, str(exc), "a source that gives frames") from exc
-    headers = {"Frame-Sequence": str(frame.sequence), "Frame-Age": f"{frame.age:.4f}"}
-    return web.Response(body=data, content_type="image/jpeg", headers=headers)
+    with _refused(site, place):
+        return await _as_jpeg(site, place, await site.sources[place].newest())
 
 
 @CALLS.add(

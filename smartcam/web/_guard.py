@@ -1,10 +1,10 @@
-"""Who may use a site: checks of Host, Origin and token, and the headers of every answer.
+"""Guard a site: checks of Host, Origin and token, and the headers of every answer.
 
 A page of another web site runs in the same browser and can send requests to this machine. It must
 neither read nor change anything here, whatever name it gives this machine:
 
-- *Host* must name this machine's loopback where no token is required. A name that was made to
-  point here (DNS rebinding) is another one.
+- *Host* must name this machine where no token is required; where it listens on loopback alone, a
+  name of that. A name that was made to point here (DNS rebinding) is another one.
 - *Origin*, which a browser sends with whatever changes something, must be the site itself;
   *Sec-Fetch-Site* must not tell of another.
 - With a token, each call carries it in ``Authorization``; a WebSocket, for which a browser's page
@@ -20,11 +20,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
+from smartcam._accepting import is_loopback
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._errors import RefusedError, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from aiohttp import web
 
@@ -45,7 +46,7 @@ HEADERS: Mapping[str, str] = {
     "Cache-Control": "no-store",
     "Server": "smartcam",
 }
-"""Of every answer: nothing from elsewhere is loaded, nobody frames the page, nothing is kept."""
+"""Headers of every answer: load nothing from elsewhere, allow no framing, keep nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +64,7 @@ class Guard:
             RefusedError: 403 for another site's, 401 for a missing or wrong token.
         """
         if self.token is None:
-            _check_host(request.host)
+            check_host(request.host)
         if is_call:
             _check_origin(request)
             self._check_token(_authorization(request))
@@ -92,13 +93,35 @@ def _authorization(request: web.Request) -> str | None:
     return given
 
 
-def _check_host(given: str) -> None:
+def check_host(given: str, names: Collection[str] | None = None) -> None:
+    """Refuse a request that names another machine: a page whose name was made to point here does.
+
+    Args:
+        given: what the request has in its head.
+        names: names of this machine, in small letters, that are allowed beside loopback and any
+            address; None: only names and addresses of loopback are.
+
+    Raises:
+        RefusedError: 403.
+    """
     try:
         name = urlsplit(f"//{given}").hostname or ""
     except ValueError:
         name = ""
-    if not is_loopback(name):
-        raise RefusedError(403, f"Host {shown(given)}", "localhost or another name of loopback")
+    if is_loopback(name) or (names is not None and (name in names or _is_address(name))):
+        return
+    expected = "localhost or another name of loopback"
+    if names is not None:
+        expected = f"an address, localhost, {', '.join(sorted(names))}, or one of operations.names"
+    raise RefusedError(403, f"Host {shown(given)}", expected)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 def _check_origin(request: web.Request) -> None:
@@ -108,16 +131,6 @@ def _check_origin(request: web.Request) -> None:
     site = request.headers.get("Sec-Fetch-Site", "none")
     if site not in {"none", "same-origin"}:
         raise RefusedError(403, f"Sec-Fetch-Site {shown(site)}", "the page's own calls")
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a host's name or address is that of this machine for itself alone."""
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def new_token() -> str:

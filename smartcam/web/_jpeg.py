@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
-from smartcam.frames._layouts import Planes, YuvPairs
-from smartcam.frames._optional_imports import load
-from smartcam.frames._pictures import decoded, to_jpeg, with_pixels
+from smartcam.frames._inside import Planes, YuvPairs, decoded, to_jpeg, with_pixels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,12 +27,13 @@ READY: Final = frozenset({"Mono8", "RGB8", "BGR8", "MJPEG"})
 
 
 def jpeg(frame: Frame, quality: int) -> bytes:
-    """Return a frame as a JPEG; one that is a whole JPEG already as it came, its quality too.
+    """Return a frame as a JPEG; a frame that is a whole JPEG is returned as it came.
 
-    More than 8 bits are scaled, so that the brightest pixel becomes white: to be looked at.
+    Pixels of more than 8 bits are scaled, so that the brightest one becomes white. This takes
+    milliseconds: call it in a thread.
 
     Args:
-        frame: it; it takes milliseconds, and belongs into a thread.
+        frame: frame to encode.
         quality: 1 to 100.
 
     Raises:
@@ -67,13 +67,13 @@ def require_encoder() -> None:
 
 
 def is_whole_jpeg(frame: Frame) -> bool:
-    """Tell whether a frame came as a JPEG that any program can read."""
+    """Return True if a frame came as a JPEG that any program can read."""
     head = bytes(frame.data[:HEAD])
     return frame.format.name == "MJPEG" and head.startswith(START) and TABLES in head
 
 
 def picture(frame: Frame, *, grey: bool = False) -> NDArray[Any]:
-    """Return what is to be seen: (H, W, 3), red first; (H, W) where there is no colour.
+    """Return the pixels to show: (H, W, 3), red first; (H, W) for a frame without colours.
 
     Raises:
         FrameFormatError: its bytes are wrong, or it has no brightness, which ``grey`` asks for.

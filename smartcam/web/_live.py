@@ -16,9 +16,10 @@ from smartcam.web._pictures import FILES
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site
 from smartcam.web._streams import PERIOD, News
+from smartcam.web._units import PageUnits
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
 
     from smartcam.camera import Camera
     from smartcam.web._live_camera import ShowsCamera
@@ -39,21 +40,24 @@ class LiveSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        camera: it; opened and closed by who made it. Made before it is opened, the page sees all.
+        camera: camera that the caller opens and closes. A page made before the camera is opened
+            sees all.
         control: whether the page may trigger, start, stop and switch. Without it nothing that a
             reader does reaches the camera, but that it is asked for its picture where it has one.
+        units: names of the units that the page shows instead of SI from its beginning, such as
+            ``("mm", "deg")``. None: it begins with SI, and its switch shows these two.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
             and ``_`` at least. None: nothing on a loopback address; on any other one is made.
 
     Attributes:
-        view: what it shows.
-        frames: of the camera, where it has some.
+        view: view of the camera that the page shows.
+        frames: frames of the camera, where it has some.
         control: as given.
 
     Raises:
-        ConfigurationError: the token cannot be used.
+        ConfigurationError: the token cannot be used, or a unit is unknown.
     """
 
     def __init__(
@@ -61,12 +65,14 @@ class LiveSite(Site):
         camera: Camera[Any],
         *,
         control: bool = False,
+        units: Sequence[str] | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
         token: str | None = None,
     ) -> None:
         super().__init__(CALLS, "live", host=host, port=port, token=token, files=FILES)
         self.control: bool = control
+        self.units: PageUnits = PageUnits(units)
         self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)))
         self.frames: LiveFrames = LiveFrames(lambda: self.view.camera)
 
@@ -83,12 +89,12 @@ class LiveSite(Site):
         await super().stop()
 
     def state(self) -> dict[str, Any]:
-        """Return how the camera is, and what the page may do, as JSON."""
+        """Return the state of the camera and the rights of the page, as values for JSON."""
         return state_of(self)
 
 
 class LiveReader:
-    """What one reader knows."""
+    """The state of the camera as one reader knows it."""
 
     def __init__(self, site: ShowsCamera, since: int | None = None) -> None:
         self._site = site
@@ -97,9 +103,10 @@ class LiveReader:
         self._serial = oldest if since is None else since
         self._known: dict[str, Any] = {}
         self._looks = 0
+        self._history = -1  # version of the history that was told
 
     def look(self) -> Iterator[News]:
-        """Yield what changed since the last look; the first one tells everything."""
+        """Yield the changes since the last look; the first look yields everything."""
         view = self._view
         yield from self._changed("camera", self._site.state())
         yield from self._results()
@@ -109,6 +116,9 @@ class LiveReader:
             yield from self._changed("account", view.account())
             points = list(view.series) if self._looks == 0 else list(view.series)[-1:]
             yield News("clock", {"series": points})
+            if self._history != view.history.version:
+                self._history = view.history.version
+                yield News("history", view.history.as_json())
         self._looks += 1
 
     def _results(self) -> Iterator[News]:
@@ -162,13 +172,13 @@ async def _commanded(site: ShowsCamera, do: Callable[[], Awaitable[Any]]) -> Any
 
 @CALLS.add("GET", API)
 def _calls(_site: ShowsCamera, _call: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 
 @CALLS.add("GET", f"{API}/camera")
 def _camera(site: ShowsCamera, _call: CallRequest) -> object:
-    """How the camera is, and what was counted."""
+    """Return the camera's state, and its counts."""
     return {**site.state(), "account": site.view.account()}
 
 
@@ -178,14 +188,40 @@ def _results(site: ShowsCamera, _call: CallRequest) -> object:
     return {"results": [one.as_json() for one in site.view.entries]}
 
 
+@CALLS.add("GET", f"{API}/history")
+def _history(site: ShowsCamera, _call: CallRequest) -> object:
+    """Outcomes in bars of five minutes, the last failures, and since when it fails."""
+    return site.view.history.as_json()
+
+
+@CALLS.add("GET", f"{API}/failures/{{serial}}")
+def _failure(site: ShowsCamera, call: CallRequest) -> web.Response:
+    """The picture of a failure, as the camera sent it."""
+    serial = call.path["serial"]
+    known = serial.isdecimal() and len(serial) < 12
+    picture = site.view.history.picture(int(serial)) if known else None
+    if picture is None:
+        raise RefusedError(404, "no picture of it", "one of the last failures that have one")
+    return _image(picture)
+
+
 @CALLS.add("GET", f"{API}/picture")
 def _picture(site: ShowsCamera, _call: CallRequest) -> web.Response:
     """The last picture that was fetched, as the camera sends it."""
     picture = site.view.picture
     if picture is None:
         raise RefusedError(404, "no picture", site.view.picture_error or "one that was fetched")
-    kind = "image/bmp" if picture.data.startswith(b"BM") else "application/octet-stream"
-    return web.Response(body=picture.data, content_type=kind)
+    return _image(picture.data)
+
+
+_UNKNOWN = "application/octet-stream"
+_KINDS = ((b"BM", "image/bmp"), (b"\x89PNG", "image/png"), (b"\xff\xd8", "image/jpeg"))
+"""First bytes of the files that a camera sends a picture as, and their types."""
+
+
+def _image(data: bytes) -> web.Response:
+    kind = next((kind for mark, kind in _KINDS if data.startswith(mark)), _UNKNOWN)
+    return web.Response(body=data, content_type=kind)
 
 
 @CALLS.add("POST", f"{API}/picture")
@@ -210,7 +246,7 @@ async def _frames(site: ShowsCamera, call: CallRequest) -> web.StreamResponse:
 @CALLS.add(
     "GET",
     f"{API}/events",
-    about="What happens, as server-sent events: camera, results, picture, account, clock.",
+    about="What happens, as server-sent events: camera, results, picture, account, clock, history.",
 )
 def _events(site: ShowsCamera, call: CallRequest) -> object:
     last = call.request.headers.get("Last-Event-ID", "")
@@ -231,6 +267,17 @@ async def _trigger(site: ShowsCamera, call: CallRequest) -> object:
 async def _switch(site: ShowsCamera, call: CallRequest) -> object:
     """Load another application."""
     await _commanded(site, lambda: site.view.camera.switch_application(call.body.application))
+    return site.view.state()
+
+
+@CALLS.add("POST", f"{API}/take_back")
+async def _take_back(site: ShowsCamera, _call: CallRequest) -> object:
+    """Have a fleet's agent take the camera back from another client."""
+    camera = site.view.camera
+    take_back = getattr(camera, "take_back", None)
+    if take_back is None:
+        raise RefusedError(409, "a camera of no fleet", "one of a fleet: its agent takes it back")
+    await _commanded(site, take_back)
     return site.view.state()
 
 

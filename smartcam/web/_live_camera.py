@@ -1,4 +1,4 @@
-"""What the live page shows of one camera, on whichever site that page is."""
+"""Show one camera on the live page, on whichever site that page is."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from smartcam.web._streams import Streams
 
 if TYPE_CHECKING:
     from smartcam.camera import Camera
+    from smartcam.web._fleet_rows import FleetRow
+    from smartcam.web._units import PageUnits
 
 
 class ShowsCamera(Protocol):
-    """What the live page's calls are done to."""
+    """The camera on which the live page's calls act."""
 
     control: bool  # whether the page may command the camera
+    units: PageUnits  # those that the page can show instead of SI
     view: LiveView
     frames: LiveFrames
     streams: Streams
 
     def state(self) -> dict[str, Any]:
-        """Return how the camera is, and what the page may do, as JSON."""
+        """Return the state of the camera and the rights of the page, as values for JSON."""
         ...
 
 
@@ -29,23 +32,36 @@ class WatchedCamera:
     """One camera of a site of many, while somebody looks at it.
 
     Args:
-        camera: it; opened and closed by whoever made it.
-        control: whether the page may command it.
+        camera: camera that the caller opens and closes.
+        control: whether the page may command the camera.
+        units: units that the page can show instead of SI.
+        row: row of the camera in the fleet's table; None: the page writes a history of its own.
 
     Attributes:
-        used_at: when a call was made last, on the loop's clock.
+        used_at: time of the last call, on the loop's clock.
     """
 
-    def __init__(self, camera: Camera[Any], *, control: bool) -> None:
+    def __init__(
+        self,
+        camera: Camera[Any],
+        *,
+        control: bool,
+        units: PageUnits,
+        row: FleetRow | None = None,
+    ) -> None:
         self.control: bool = control
+        self.units: PageUnits = units
         self.streams: Streams = Streams()
-        self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)))
+        history = None if row is None else row.history
+        self.view: LiveView = LiveView(camera, lambda: bool(len(self.streams)), history)
+        if row is not None:
+            self.view.changed_at, self.view.changed_seen = row.changed_at, row.changed_seen
         self.frames: LiveFrames = LiveFrames(lambda: self.view.camera)
         self.used_at: float = 0.0
 
     @property
     def watched(self) -> bool:
-        """Whether anybody looks."""
+        """True while anybody looks."""
         pictures = self.frames.pictures
         return bool(len(self.streams)) or (pictures is not None and bool(pictures.viewers))
 
@@ -61,11 +77,16 @@ class WatchedCamera:
         await self.view.stop()
 
     def state(self) -> dict[str, Any]:
-        """Return how the camera is, and what the page may do, as JSON."""
+        """Return the state of the camera and the rights of the page, as values for JSON."""
         return state_of(self)
 
 
 def state_of(shown: ShowsCamera) -> dict[str, Any]:
-    """Return how a camera is, and what the page may do, as JSON."""
+    """Return the state of a camera and the rights of its page, as values for JSON."""
     has_frames = shown.frames.pictures is not None
-    return {**shown.view.state(), "control": shown.control, "frames": has_frames}
+    return {
+        **shown.view.state(),
+        "control": shown.control,
+        "frames": has_frames,
+        "units": shown.units.as_json(),
+    }

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.web")
 
-QUALITY: Final = 80
-"""Of the JPEGs; the agent makes them, so that nothing larger crosses the bus."""
+JPEG_QUALITY: Final = 80
+"""Quality, 1 to 100, of the JPEGs that the agent makes, so that little crosses the bus."""
 
 LOOK: Final = 0.1
 """Seconds between two looks at which camera the page shows, and whether it has frames."""
@@ -28,11 +28,11 @@ class HasFrames(Protocol):
 
     @property
     def has_frames(self) -> bool:
-        """Whether it has some."""
+        """True if the camera has frames."""
         ...
 
     def frame_source(self, encoding: Any, quality: int | None) -> FrameSource:
-        """Return what gives them, unopened."""
+        """Return the source of the camera's frames, unopened."""
         ...
 
 
@@ -73,7 +73,7 @@ class LiveFrames:
 
     async def _show(self, camera: HasFrames) -> None:
         """Have its frames there until the page shows another camera."""
-        pictures = SitePictures([camera.frame_source("jpeg", QUALITY)], QUALITY)
+        pictures = SitePictures([camera.frame_source("jpeg", JPEG_QUALITY)], JPEG_QUALITY)
         pictures.start()
         keeping = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")
         self.pictures = pictures

@@ -1,4 +1,4 @@
-"""What the live page knows of a camera: its last results, how fast they come, its last picture."""
+"""Keep the live page's data: the last results, how fast they come, the last picture."""
 
 from __future__ import annotations
 
@@ -6,17 +6,21 @@ import asyncio
 import collections
 import json
 import math
-import re
 import time
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
+from smartcam._client._inside import own_interpreter
 from smartcam.exceptions import ConnectionTakenError, InterpretationError, SmartCamError
+from smartcam.layout._inside import units_of
 from smartcam.models import Connected, Disconnected, Localization, Reconnected, Result, jsonable
+from smartcam.web._history import ShiftHistory
+from smartcam.web._verdicts import verdicts
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from smartcam.camera import Camera
+    from smartcam.layout import Layout
 
 MAX_RESULTS = 100
 """Results that the page can show: those before are on it no more."""
@@ -37,12 +41,22 @@ IMAGE_PERIOD = 1.0
 """Seconds between two pictures that are fetched for the page, at least."""
 
 
+@runtime_checkable
+class DrawsPictures(Protocol):
+    """A camera that draws what its programs saw into the last picture."""
+
+    async def read_drawn_image(self) -> bytes:
+        """Return the picture as a file's bytes."""
+        ...
+
+
 class ShownResult(NamedTuple):
     """A result, or why there is none."""
 
     serial: int  # counted from 0
     result: Result[Any] | None
     error: str  # why a container could not be read, "" where it could
+    layout: Layout | None = None  # that of tables, which know no units
 
     def as_json(self) -> dict[str, Any]:
         """Return it as the page takes it."""
@@ -58,7 +72,7 @@ class ShownResult(NamedTuple):
             "latency": result.latency,
             "size": len(result.raw),
             "raw": result.raw[:MAX_SHOWN_RAW].hex(" "),
-            **shown_value(result.value),
+            **shown_value(result.value, self.layout),
         }
 
 
@@ -70,25 +84,39 @@ class Picture(NamedTuple):
 
 
 class LiveView:
-    """Follows a camera; the page's readers look at what it has.
+    """Follows a camera and keeps what its page shows.
 
     Args:
-        camera: it; opened and closed by whoever made it.
-        is_watched: whether anybody looks, so that a picture is worth being fetched.
+        camera: camera that the caller opens and closes.
+        is_watched: function that returns True while some page is open, so that pictures are
+            fetched.
+        history: history that somebody else writes; None: the view has one of its own.
+
+    Attributes:
+        history: outcomes and failures of the last hours.
     """
 
-    def __init__(self, camera: Camera[Any], is_watched: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        camera: Camera[Any],
+        is_watched: Callable[[], bool],
+        history: ShiftHistory | None = None,
+    ) -> None:
+        self.history: ShiftHistory = history or ShiftHistory()
+        self._writes = history is None
         self.camera: Camera[Any] = camera
         self.entries: collections.deque[ShownResult] = collections.deque(maxlen=MAX_RESULTS)
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # when it was connected or lost at last
+        self.changed_seen: bool = False  # False: that was before it was followed
         self.loss: str = ""  # why it is not connected, "" where it is
         self._end: SmartCamError | None = None  # why it will never be again
         self._is_watched = is_watched
         self._serial = 0
         self._picture_wanted = True
+        self._asked = 0  # number of the failure whose picture was asked for
         self._latencies: list[float] = []  # of this second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
@@ -136,7 +164,7 @@ class LiveView:
         self._picture_wanted = True
 
     def state(self) -> dict[str, Any]:
-        """Return how the camera is, as JSON."""
+        """Return the state of the camera, as values for JSON."""
         camera = self.camera
         known = camera.active_application is not None
         return {
@@ -146,6 +174,7 @@ class LiveView:
             "loss": self.loss,
             "last_error": "" if camera.connected else camera.statistics().last_error or "",
             "changed_at": self.changed_at,
+            "changed_seen": self.changed_seen,
             "status": camera.status.names if known else [],
             "application": camera.active_application,
             "can": camera.capabilities if known else None,
@@ -157,12 +186,12 @@ class LiveView:
             return "connected"
         if self.camera.active_application is None:
             return "awaited"
-        if isinstance(self._end, ConnectionTakenError):
+        if isinstance(self._end or self.camera.trouble, ConnectionTakenError):
             return "taken"
         return "lost" if self._end is None else "ended"
 
     def account(self) -> dict[str, Any]:
-        """Return what was counted, as JSON."""
+        """Return the counters of results, as values for JSON."""
         counted = self.camera.statistics()
         names = (
             *("received", "triggered", "streamed", "late", "wrong_application"),
@@ -177,7 +206,7 @@ class LiveView:
         return {name: getattr(counted, name) for name in names} | {"not_shown": self._not_shown()}
 
     def _not_shown(self) -> int:
-        """Return how many results came faster than the page takes them."""
+        """Return the number of results dropped since they came faster than the page takes them."""
         return self._results.statistics().dropped
 
     # ------------------------------------------------------------------ tasks
@@ -191,6 +220,9 @@ class LiveView:
                 continue
             except (StopAsyncIteration, SmartCamError):
                 return
+            if self._writes:
+                for result in batch:
+                    self.history.add(result)
             self._serial += max(0, len(batch) - MAX_RESULTS)
             for result in batch[-MAX_RESULTS:]:
                 self._add(result)
@@ -198,18 +230,26 @@ class LiveView:
             self._picture_wanted = True
 
     def _add(self, result: Result[Any] | None, error: str = "") -> None:
-        self.entries.append(ShownResult(self._serial, result, error))
+        layout = None if result is None else layout_of(self.camera, result)
+        self.entries.append(ShownResult(self._serial, result, error, layout))
         self._serial += 1
+        if not self._writes:
+            return
+        if result is None:
+            self.history.add_error(error)
 
     async def _follow_events(self) -> None:
         try:
             async for event in self._events:
                 if isinstance(event, (Connected, Reconnected, Disconnected)):
-                    self.changed_at = event.at.timestamp()
+                    self.changed_at, self.changed_seen = event.at.timestamp(), True
                     self.loss = event.reason if isinstance(event, Disconnected) else ""
+                    if isinstance(event, Disconnected) and not event.expected and self._writes:
+                        self.history.add_loss(self.loss)
                     self._picture_wanted |= not self.loss
         except SmartCamError as exc:
-            self._end, self.changed_at, self.loss = exc, time.time(), str(exc)
+            self._end, self.loss = exc, str(exc)
+            self.changed_at, self.changed_seen = time.time(), True
 
     async def _tick(self) -> None:
         before = self.camera.statistics().received
@@ -225,7 +265,11 @@ class LiveView:
 
     async def _fetch_pictures(self) -> None:
         while True:
-            if self._picture_wanted and self._is_watched() and self.camera.connected:
+            wanted = self._picture_wanted and self._is_watched()
+            failure = self.history.last_failure
+            missing = self._writes and self.history.wants_picture and failure != self._asked
+            if (wanted or missing) and self.camera.connected:
+                self._asked = failure
                 self._picture_wanted = False
                 if self.camera.capabilities.read_image:
                     await self._fetch_picture()
@@ -234,17 +278,34 @@ class LiveView:
 
     async def _fetch_picture(self) -> None:
         """Fetch the camera's last picture; what went wrong is told in the state."""
+        failure = self.history.last_failure
         try:
-            data = await self.camera.read_image()
+            camera: object = self.camera
+            if isinstance(camera, DrawsPictures):
+                data = await camera.read_drawn_image()
+            else:
+                data = await self.camera.read_image()
         except SmartCamError as exc:
             self.picture_error = str(exc)
         else:
             self.picture_error = ""
+            # nothing came meanwhile
+            if self._writes and failure == self.history.last_failure and not self._results.waiting:
+                self.history.attach(failure, data)
             self.picture = Picture(1 + (self.picture.serial if self.picture else 0), data)
 
 
-def shown_value(value: Any) -> dict[str, Any]:
-    """Return a value as the page shows it: parts that it draws, or JSON, cut where it is long."""
+def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
+    """Return the layout by which a camera's result was read; None where it has none."""
+    interpreter = own_interpreter(camera, result.application)
+    return None if interpreter is None else interpreter.layout
+
+
+def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
+    """Return a value as the page shows it: parts that it draws, or JSON, cut where it is long.
+
+    ``units`` are those of its fields, and of the fields of its lists. ``layout``: that of a table.
+    """
     if isinstance(value, list) and all(isinstance(one, Localization) for one in value):
         found: list[Localization] = value
         frame = found[0].pose.header.frame_id if found else ""
@@ -253,10 +314,33 @@ def shown_value(value: Any) -> dict[str, Any]:
             "count": len(found),
             "frame": frame,
         }
-    value = jsonable(value)
+    units = {**units_of(value, layout), **_units_of_lists(value)}
+    value = jsonable(_as_text(value))
     text = json.dumps(value)
-    shown = {"value": value} if len(text) <= MAX_VALUE else {"cut": text[: MAX_VALUE // 10]}
+    shown = (
+        {"value": value, "units": units}
+        if len(text) <= MAX_VALUE
+        else {"cut": text[: MAX_VALUE // 10]}
+    )
     return {"verdicts": verdicts(value), **shown}
+
+
+def _units_of_lists(value: Any) -> dict[str, Mapping[str, str]]:
+    """Return the units of the fields of a record's lists, by the lists' names."""
+    fields = value._asdict() if hasattr(value, "_asdict") else {}
+    lists = {name: units_of(one) for name, one in fields.items() if isinstance(one, list)}
+    return {name: units for name, units in lists.items() if units}
+
+
+def _as_text(value: Any) -> Any:
+    """Return bytes that are a printable text as that, such as the cells of an In-Sight in JSON."""
+    if not isinstance(value, bytes):
+        return value
+    try:
+        text = value.decode()
+    except UnicodeDecodeError:
+        return value
+    return text if text and text.replace("\n", " ").isprintable() else value
 
 
 def _part(one: Localization) -> dict[str, Any]:
@@ -265,38 +349,3 @@ def _part(one: Localization) -> dict[str, Any]:
     theta = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
     part = {"name": one.feature_id, "quality": one.quality, "x": x, "y": y, "z": z, "theta": theta}
     return {name: jsonable(item) for name, item in part.items()}
-
-
-def verdicts(value: Any) -> list[dict[str, Any]]:
-    """Return a value's truth values: ``name``, ``true``, ``of`` and ``verdict``.
-
-    Of a list of records: how many of them are true, and of how many.
-    """
-    rows: list[Any] = value if isinstance(value, list) else [value]
-    if not (rows and all(isinstance(one, dict) for one in rows)):
-        return []
-    names = [str(name) for name, one in rows[0].items() if isinstance(one, bool)]
-    return [_verdict(name, [one.get(name) is True for one in rows]) for name in names]
-
-
-def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
-    good = meaning(name)
-    verdict = None if good is None else "pass" if all(one is good for one in values) else "fail"
-    return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
-
-
-PASS_WORDS = frozenset({"ok", "pass", "passed", "good", "valid", "accept", "accepted", "io"})
-FAIL_WORDS = frozenset(
-    {"nok", "fail", "failed", "bad", "defect", "reject", "rejected", "error", "nio"}
-)
-NOT_WORDS = frozenset({"not", "no"})
-
-
-def meaning(name: str) -> bool | None:
-    """Return which of its values is the good one, by a field's name; None where it does not tell.
-
-    ``ok`` is good when true, ``defect`` and ``not_ok`` when false. Of ``present`` nobody knows.
-    """
-    words = set(re.findall(r"[a-z]+", name.lower()))
-    known = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
-    return None if known != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)

@@ -6,33 +6,37 @@ import asyncio
 import contextlib
 import json
 import logging
-from typing import TYPE_CHECKING, Any
+import socket
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from aiohttp import web
 
+from smartcam._accepting import is_loopback
+from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.fleet._metric_families import exposition, require_client
-from smartcam.fleet._metrics import read_numbers
-from smartcam.fleet._operations_file import OperationsSection
+from smartcam.fleet._inside import OperationsSection, exposition, read_numbers, require_client
 from smartcam.settings import validated
 from smartcam.web._connections import visitor_of
-from smartcam.web._guard import HEADERS
+from smartcam.web._errors import RefusedError
+from smartcam.web._guard import HEADERS, check_host
 from smartcam.web._site import OpenPort, open_port
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Collection
 
     from smartcam.fleet import FleetServer
 
 _log = logging.getLogger("smartcam.web")
 
-MOST_TOLD = 100
-"""Cameras that are named as not connected."""
+_Handler: TypeAlias = "Callable[[web.Request], Awaitable[web.StreamResponse]]"
+
+MAX_CAMERAS_LISTED = 100
+"""Cameras at most that an answer names as not connected."""
 
 
 class OperationsSite(Server):
-    """What watches an agent asks here; nothing can be changed, and nobody has to say who they are.
+    """A site that answers those who watch an agent; nothing can be changed, and nobody logs in.
 
     ::
 
@@ -61,6 +65,7 @@ class OperationsSite(Server):
         if section.place is None:
             raise ConfigurationError("operations.listen: null: there is nowhere to listen")
         self._host, self._port = section.place
+        self._names = {socket.gethostname().lower(), *(one.lower() for one in section.names)}
         self._each = section.latency == "camera"
         self._tried = False
         self._open: OpenPort | None = None
@@ -81,7 +86,8 @@ class OperationsSite(Server):
         """
         if self._open is not None:
             return
-        application = web.Application(middlewares=[_placed], client_max_size=0)
+        names = None if is_loopback(self._host) else self._names
+        application = web.Application(middlewares=[_guarded(names)], client_max_size=0)
         application.on_response_prepare.append(_add_headers)
         for path, handler in self._pages().items():
             application.router.add_get(path, handler)
@@ -98,12 +104,8 @@ class OperationsSite(Server):
         opened, self._open = self._open, None
         if opened is None:
             return
-        closing = asyncio.ensure_future(opened.close())
         try:
-            await asyncio.shield(closing)
-        except asyncio.CancelledError:
-            await asyncio.wait({closing})
-            raise
+            await finish(opened.close)
         finally:
             making, self._making = self._making, None
             if making is not None:
@@ -128,7 +130,7 @@ class OperationsSite(Server):
         )
 
     def readiness(self) -> dict[str, Any]:
-        """Return whether the agent is on the bus and has tried every camera once; for JSON.
+        """Return the readiness: the agent is on the bus and has tried each camera once; for JSON.
 
         A camera that is not connected, or that a reload brings later, changes nothing about it.
         """
@@ -139,8 +141,12 @@ class OperationsSite(Server):
         self._tried = started and (self._tried or tried == len(hosts))
         missing = [host.name for host in hosts if not host.connected]
         reason = None
-        if not started:
+        if not server.reached:
             reason = "the agent is not on the bus"
+            if started:
+                reason += f": nobody answers at {', '.join(server.file.endpoints[1])}"
+        elif server.agent is not None and server.agent.retired_by is not None:
+            reason = str(server.agent.retired_by)
         elif not self._tried:
             reason = f"{tried} of {len(hosts)} cameras were tried"
         return {
@@ -149,7 +155,7 @@ class OperationsSite(Server):
             "agent": server.name or None,
             "cameras": len(hosts),
             "connected": len(hosts) - len(missing),
-            "not_connected": missing[:MOST_TOLD],
+            "not_connected": missing[:MAX_CAMERAS_LISTED],
         }
 
     async def _metrics(self, _request: web.Request) -> web.Response:
@@ -166,29 +172,44 @@ class OperationsSite(Server):
         return await exposition(numbers, each=self._each)
 
 
-@web.middleware
-async def _placed(
-    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+def _guarded(names: Collection[str] | None) -> Any:
+    """Return the middleware of all handlers: the connection's place, the guard, refusals as text.
+
+    Args:
+        names: names of this machine that requests may use; None: only those of loopback.
+    """
+
+    @web.middleware
+    async def guarded(request: web.Request, handler: _Handler) -> web.StreamResponse:
+        visitor = visitor_of(request)
+        with contextlib.ExitStack() as stack:
+            if visitor is not None:
+                stack.enter_context(visitor.request(request))
+                stack.enter_context(visitor.answer())
+            response = await _answered(request, handler, names)
+        if not request.content.is_eof():
+            response.force_close()
+        return response
+
+    return guarded
+
+
+async def _answered(
+    request: web.Request, handler: _Handler, names: Collection[str] | None
 ) -> web.StreamResponse:
-    """Give the connection its place, and have nothing of a fault go out."""
-    visitor = visitor_of(request)
-    with contextlib.ExitStack() as stack:
-        if visitor is not None:
-            stack.enter_context(visitor.request(request))
-            stack.enter_context(visitor.answer())
-        try:
-            response = await handler(request)
-        except web.HTTPException as exc:
-            response = web.Response(
-                status=exc.status,
-                text=f"{exc.status} {exc.reason}: there are /healthz, /readyz, /metrics\n",
-            )
-        except Exception:  # noqa: BLE001 - the last place
-            _log.exception("! %s %s: a fault of ours", request.method, request.path)
-            response = web.Response(status=500, text="500 a fault of ours: see the log\n")
-    if not request.content.is_eof():
-        response.force_close()
-    return response
+    """Return the answer to a request; nothing of a fault goes out."""
+    try:
+        check_host(request.host, names)
+        return await handler(request)
+    except RefusedError as exc:
+        text = f"{exc.status} {exc.came}: expected {exc.expected}\n"
+        return web.Response(status=exc.status, text=text)
+    except web.HTTPException as exc:
+        text = f"{exc.status} {exc.reason}: there are /healthz, /readyz, /metrics\n"
+        return web.Response(status=exc.status, text=text)
+    except Exception:  # noqa: BLE001 - the last place
+        _log.exception("! %s %s: a fault of ours", request.method, request.path)
+        return web.Response(status=500, text="500 a fault of ours: see the log\n")
 
 
 async def _add_headers(_request: web.Request, response: web.StreamResponse) -> None:

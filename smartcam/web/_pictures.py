@@ -15,6 +15,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
+from smartcam._extras import from_part
 from smartcam.backoff import Backoff
 from smartcam.exceptions import (
     ConfigurationError,
@@ -24,7 +25,6 @@ from smartcam.exceptions import (
     LocalProtocolError,
     UnsupportedError,
 )
-from smartcam.web._jpeg import jpeg
 from smartcam.web._sockets import PageSocket, check_websocket
 from smartcam.web._streams import SLOW
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 _log = logging.getLogger("smartcam.web")
 
 FILES: Final = ("pictures.css", "pictures.js")
-"""What pages with pictures have beside their own."""
+"""Files that pages with pictures have beside their own."""
 
 MAX_VIEWERS: Final = 32
 """WebSockets at a time: eight people before four cameras."""
 
 PROTOCOL: Final = "smartcam.frames"
-"""Of the WebSockets."""
+"""Subprotocol of the WebSockets that send pictures."""
 
 MAX_PICTURE: Final = 1 << 24
 """Bytes of a picture that is sent; what a camera sends as a JPEG may be of any size."""
@@ -54,10 +54,10 @@ ACCOUNT_PERIOD: Final = 1.0
 """Seconds without a frame after which the page is told the account all the same."""
 
 THREADS: Final = 2
-"""That make JPEGs; with more they wait for the processor instead."""
+"""Threads that make JPEGs; more threads would wait for the processor."""
 
 AGAIN: Final = Backoff(initial=0.5, maximum=5.0)
-"""When a source that ended with an error is read again."""
+"""Seconds before a source that ended with an error is read again."""
 
 
 def _heard(_error: SmartCamError | None) -> None:
@@ -65,16 +65,16 @@ def _heard(_error: SmartCamError | None) -> None:
 
 
 class SitePictures:
-    """The sources of a site, and who looks at them.
+    """The sources of a site, and their viewers.
 
     Args:
-        sources: they are opened and closed by who made them; one that is not open is awaited.
-        quality: of the JPEGs that are made. What comes as a JPEG stays as it is.
+        sources: sources that the caller opens and closes; the site waits for one that is not open.
+        quality: quality of the JPEGs that are made. A frame that comes as a JPEG stays as it is.
 
     Attributes:
         sources: as given.
-        failures: why a source is not open, by its place in ``sources``.
-        viewers: who looks.
+        failures: reason why a source is not open, by its place in ``sources``.
+        viewers: sockets of the pages that show a source.
     """
 
     def __init__(self, sources: Iterable[FrameSource], quality: int) -> None:
@@ -111,11 +111,11 @@ class SitePictures:
             await asyncio.to_thread(threads.shutdown)
 
     def press(self, place: int) -> Press:
-        """Return what makes JPEGs of a source."""
+        """Return the maker of JPEGs of a source."""
         return self._presses[place]
 
     def state(self, place: int) -> dict[str, Any]:
-        """Return how a source is."""
+        """Return the state of a source, as values for JSON."""
         source = self.sources[place]
         try:
             streams: str | None = str(source.format)
@@ -132,6 +132,7 @@ class SitePictures:
             "started": account.started,
             "frames": account.frames,
             "lost": account.lost,
+            "features": source.has_features,
         }
 
     def _failure(self, place: int) -> str:
@@ -198,6 +199,8 @@ class Press:
 
 
 def _pressed(frame: Frame, quality: int) -> bytes:
+    with from_part("frames", "pictures on a page need"):
+        from smartcam.web._jpeg import jpeg
     data = jpeg(frame, quality)
     if len(data) > MAX_PICTURE:
         raise FrameFormatError(
@@ -213,7 +216,7 @@ def _seen(made: asyncio.Future[bytes]) -> None:
 
 
 class Viewer(PageSocket):
-    """One who looks at a source.
+    """The WebSocket of a page that shows a source.
 
     Attributes:
         place: of the source.
@@ -305,7 +308,7 @@ class Viewer(PageSocket):
 
 
 def _about(frame: Frame) -> dict[str, Any]:
-    """Return what a page says of a frame; its age is that of now."""
+    """Return the description of a frame for a page, with the frame's present age."""
     return {
         "sequence": frame.sequence,
         "width": frame.width,
@@ -317,7 +320,7 @@ def _about(frame: Frame) -> dict[str, Any]:
 
 
 def _account(reader: FrameReader, bad: int) -> dict[str, Any]:
-    """Return what became of the frames since one looks; ``at`` in seconds of a clock."""
+    """Return the counts of a viewer's frames so far; ``at``: seconds of ``time.monotonic()``."""
     account = reader.statistics()
     return {
         "at": time.monotonic(),

@@ -53,7 +53,7 @@ class CallBody(BaseModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CallRequest:
-    """What a call was asked with."""
+    """The request of a call, with its checked arguments."""
 
     request: web.Request  # the request; its body was read
     path: Mapping[str, str]  # the variable parts of the path

@@ -6,23 +6,20 @@ import functools
 import sys
 from typing import TYPE_CHECKING, Any
 
-from smartcam.emulator._line_camera import LineCamera
-from smartcam.emulator._scene import TABLE_SIZE, Observation, TablePose
+from smartcam.emulator import LineCamera, TablePose
+from smartcam.emulator._inside import TABLE_SIZE, DeviceFault, Observation
 from smartcam.emulator.faults import FAULTS
-from smartcam.emulator.faults._base import DeviceFault
 from smartcam.exceptions import InterpretationError
 from smartcam.models import jsonable
+from smartcam.protocols import BVS
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import BVS
 from smartcam.web._shapes import OUTLINES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from smartcam.emulator import Application, FiredFault, LogEntry, TableScene, WireCamera
-    from smartcam.emulator._bvs.device import Device
-    from smartcam.emulator.faults._base import BaseFault
-    from smartcam.emulator.faults._wire_effects import WireCodec
+    from smartcam.emulator import Application, Device, FiredFault, LogEntry, TableScene, WireCamera
+    from smartcam.emulator._inside import BaseFault, WireCodec
     from smartcam.models import ByteOrder
 
 SENSOR = (1280, 1024)
@@ -39,7 +36,7 @@ MAX_TOLD = 1 << 18
 end the list; an answer stays a few megabytes of JSON, and no more than its entries is ever made."""
 
 MAX_LISTED = 1000
-"""Faults that a list shows."""
+"""Faults that a list shows at most."""
 
 LOOKING = {"tangram": False, "tangram_pixels": True}
 """Generators that look at the table, and whether they tell pixels."""
@@ -57,13 +54,13 @@ OPERATOR = (
     "set_endian",
     "reboot",
 )
-"""What an operator may be able to do, as devices have it."""
+"""Actions that an operator may be able to do, as devices name them."""
 
 
 def abilities(emulator: WireCamera) -> list[str]:
-    """Return what the operator of a camera can do; ``scene`` and ``clock`` where it has them."""
+    """Return the names of what an operator can do, with ``scene`` and ``clock`` if present."""
     able = [one for one in OPERATOR if hasattr(emulator.device, one)]
-    has = {"scene": emulator.scene, "clock": emulator.clock_time}
+    has = {"scene": emulator.table, "clock": emulator.clock_time}
     return able + [name for name, one in has.items() if one is not None]
 
 
@@ -332,7 +329,7 @@ def _reported(emulator: WireCamera, scene: TableScene) -> dict[str, Any] | None:
 
 
 def _looks(application: Application) -> bool:
-    """Return whether an application looks at the table, and tells where the parts are."""
+    """Return True if an application looks at the table and reports the places of the parts."""
     layout = application.result_layout
     fields = set[str]() if layout is None else {field.name for field in layout.fields}
     return str(application.generator) in LOOKING and {"x", "y", "theta"} <= fields

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import asyncio
-import importlib.resources
 import logging
 import socket
 from typing import TYPE_CHECKING, Any, cast
 
 from aiohttp import web
 
-from smartcam._accepting import Acceptor
+from smartcam._accepting import is_loopback, listening
+from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
-from smartcam.web._connections import KEEP_ALIVE, Places
-from smartcam.web._guard import HEADERS, Guard, checked_token, is_loopback, new_token
+from smartcam.web._connections import KEEP_ALIVE, Visitors
+from smartcam.web._guard import HEADERS, Guard, checked_token, new_token
+from smartcam.web._pages import page_html, read_file
 from smartcam.web._routes import MAX_BODY, middleware, routes
 from smartcam.web._streams import Streams
 
@@ -31,12 +31,6 @@ API = "/api"
 FAREWELL = 0.2
 """Seconds that an answer under way gets when the site stops, twice."""
 
-BACKLOG = 128
-"""Connections that wait for being accepted; the system keeps them."""
-
-RESOLVE_TIMEOUT = 10.0
-"""Seconds that the look-up of the host's address may take."""
-
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css"}
 _ANY = frozenset({"", "0.0.0.0", "::"})  # noqa: S104  names, nothing is bound here
 
@@ -45,11 +39,11 @@ class Site(Server):
     """A page and its calls on a port; the calls' handlers get the site.
 
     Args:
-        page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css.
-            Pages may use ``base.css`` and ``base.js``, too.
+        page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css, and
+            of its row in ``PAGES``. Pages may use ``base.css`` and ``base.js``, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
         files: of others that the page uses beside these.
-        pages: files that are pages of their own, by their path, as aiohttp's router takes it.
+        pages: other pages of the site, by their path, as aiohttp's router takes it.
 
     Attributes:
         host: as given.
@@ -132,12 +126,7 @@ class Site(Server):
         if opened is None:
             return
         self.streams.close()
-        closing = asyncio.ensure_future(opened.close())
-        try:
-            await asyncio.shield(closing)
-        except asyncio.CancelledError:
-            await asyncio.wait({closing})
-            raise
+        await finish(opened.close)
 
     def _application(self) -> web.Application:
         guard = Guard(token=self.token)
@@ -146,11 +135,10 @@ class Site(Server):
         )
         application.on_response_prepare.append(_add_headers)
         application.router.add_routes(routes(self._calls, self))
-        application.router.add_get("/", _file(f"{self._page}.html"))
-        for path, name in self._pages.items():
-            application.router.add_get(path, _file(name))
+        for path, page in {"/": self._page, **self._pages}.items():
+            application.router.add_get(path, _served(page_html(page).encode(), "html"))
         for name in self._files:
-            application.router.add_get(f"/{name}", _file(name))
+            application.router.add_get(f"/{name}", _served(read_file(name), name))
         return application
 
 
@@ -164,19 +152,19 @@ class OpenPort:
     def __init__(self, runner: web.AppRunner, listener: socket.socket) -> None:
         if runner.server is None:
             raise RuntimeError("the runner is not set up")
-        self.places: Places = Places(runner.server)
+        self._visitors = Visitors(runner.server)
+        self.places = self._visitors.places
         self._runner = runner
         self._listener = listener
         self.port: int = listener.getsockname()[1]
-        self._acceptor = Acceptor(self.places, _log, name="smartcam.web")
-        self._acceptor.open(listener)
+        self._visitors.acceptor.open(listener)
 
     async def close(self) -> None:
         """Close port and connections."""
-        self.places.closed = True
-        self._acceptor.close()
+        self._visitors.closed = True
+        self._visitors.acceptor.close()
         self._listener.close()
-        await self._acceptor.wait_closed()
+        await self._visitors.acceptor.wait_closed()
         await self._runner.cleanup()
 
 
@@ -189,7 +177,7 @@ class _Calm(logging.LoggerAdapter[logging.Logger]):
 
 
 def calm(logger: logging.Logger) -> logging.Logger:
-    """Return what aiohttp logs to, as if it was ``logger``."""
+    """Return a logger for aiohttp that writes to ``logger``."""
     return cast("logging.Logger", _Calm(logger))
 
 
@@ -197,9 +185,8 @@ async def _add_headers(_request: web.Request, response: web.StreamResponse) -> N
     response.headers.update(HEADERS)
 
 
-def _file(name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
-    """Return a handler that serves one of the page's files, which is read now."""
-    body = importlib.resources.files("smartcam.web").joinpath("page", name).read_bytes()
+def _served(body: bytes, name: str) -> Callable[[web.Request], Awaitable[web.Response]]:
+    """Return a handler that serves a file whose name ends like ``name``."""
     content_type = _TYPES[name.rpartition(".")[2]]
 
     async def serve(_request: web.Request) -> web.Response:
@@ -225,7 +212,7 @@ async def open_port(
         keepalive_timeout=KEEP_ALIVE,
         logger=calm(_log),
     )
-    listener = await _listening(host, port, local=local)
+    listener = await listening(host, port, local=local)
     try:
         await runner.setup()
     except BaseException:
@@ -233,20 +220,3 @@ async def open_port(
         await runner.cleanup()
         raise
     return OpenPort(runner, listener)
-
-
-async def _listening(host: str, port: int, *, local: bool) -> socket.socket:
-    """Return a listening socket.
-
-    Raises:
-        OSError, ValueError, OverflowError: it cannot be had, or it is not ``local``.
-    """
-    loop = asyncio.get_running_loop()
-    async with asyncio.timeout(RESOLVE_TIMEOUT):
-        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    family, _, _, _, address = found[0]
-    if local and not is_loopback(str(address[0])):
-        raise ValueError(f"{host} is {address[0]} here, which needs a token")
-    listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
-    listener.setblocking(False)
-    return listener

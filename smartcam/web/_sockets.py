@@ -37,14 +37,14 @@ def check_websocket(request: web.Request, protocol: str, viewers: int, most: int
 
 
 class PageSocket(ABC):
-    """One who looks.
+    """The WebSocket of a page.
 
     Args:
-        request: that asks for the WebSocket.
-        protocol: of it.
-        what: is shown, for the log.
-        heartbeat: seconds between pings, by which one that vanished is noticed; None: none.
-        longest: bytes of what it may say.
+        request: request that asks for the WebSocket.
+        protocol: subprotocol of the WebSocket.
+        what: word for what is shown, for the log.
+        heartbeat: seconds between pings, by which a vanished page is noticed; None: no pings.
+        longest: bytes of a message from the page at most.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class PageSocket(ABC):
         self._ending = asyncio.Event()
 
     def end(self) -> None:
-        """Have it end."""
+        """End the socket."""
         self._ending.set()
 
     async def serve(self) -> web.WebSocketResponse:

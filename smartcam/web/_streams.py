@@ -101,7 +101,7 @@ class Streams:
 
 
 def is_open(request: web.Request) -> bool:
-    """Whether the client is still there."""
+    """Return True while the client is still there."""
     transport = request.transport
     return transport is not None and not transport.is_closing()
 

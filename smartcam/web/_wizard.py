@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from smartcam.calibration._codes import Code
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Code
 from smartcam.web._errors import RefusedError
 from smartcam.web._routes import CallBody, CallRequest, Calls
 from smartcam.web._site import API, Site
@@ -19,7 +19,7 @@ from smartcam.web._site import API, Site
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from smartcam.calibration.wizards._services import CalibrationService
+    from smartcam.calibration.wizards import CalibrationService
 
     Handler = Callable[[CalibrationService, Any], object | Awaitable[object]]
 
@@ -150,7 +150,7 @@ def _call(
 
 @CALLS.add("GET", API)
 def _calls(_site: WizardSite, _ask: CallRequest) -> object:
-    """These calls."""
+    """List the calls of this page."""
     return {"calls": CALLS.as_json()}
 
 
@@ -171,15 +171,17 @@ def _start(service: CalibrationService, body: _StartBody) -> object:
     """Start a wizard under a name, or go on with the one that was broken off; answers its step.
 
     `wizard` is `plane`, `drift` to check a calibration, `sheet` or `hand-eye`, which look at
-    pictures. With `fresh` begin anew in any case.
+    pictures. With `fresh` begin anew in any case. `resumed` says since when there is one, and its
+    answers.
     """
-    return service.start(body.name, body.wizard, body.parameters, fresh=body.fresh)
+    view = service.start(body.name, body.wizard, body.parameters, fresh=body.fresh)
+    return {**view, "resumed": service.session.resumed}
 
 
 @_call("GET", "/step")
 def _step(service: CalibrationService, _body: object) -> object:
     """The current step: what to show, and the JSON Schema of what is asked for."""
-    return service.session.current
+    return {**service.session.current, "resumed": service.session.resumed}
 
 
 @_call("POST", "/step", writes="journal", body=_Answers, sample='{"token": "...", "answers": {}}')

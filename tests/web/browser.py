@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from tests.web.sitekit import TOKEN
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
@@ -40,6 +42,30 @@ async def new_page(width: int = 1200, height: int = 900) -> AsyncIterator[Page]:
         page.set_default_timeout(1000 * PATIENCE)
         yield page
         await browser.close()
+
+
+async def see(page: Page, selector: str, text: str = "") -> None:
+    """Wait until something is to be seen, with a text."""
+    await page.locator(selector).filter(has_text=text).first.wait_for()
+
+
+HIDE = """
+hidden => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+  document.dispatchEvent(new Event("visibilitychange"));
+}
+"""
+"""Tells a page that nobody looks at it, or that somebody does."""
+
+
+async def pass_gate(page: Page) -> None:
+    """See that a page asks for the token, refuses another one, and takes it."""
+    await see(page, "#gate")
+    await page.fill("#token", "not-the-token_of-24-chars")
+    await page.click("#gate button")
+    await see(page, "#gate-error", "Refused")
+    await page.fill("#token", TOKEN)
+    await page.click("#gate button")
 
 
 @contextlib.contextmanager

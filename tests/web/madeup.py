@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, cast
 
+from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError, LinkError
 from smartcam.fleet import AgentJoined, AgentLeft, CameraJoined, CameraLeft, FleetEvent
 from smartcam.models import Disconnected, Result, Status, StatusChanged
@@ -27,6 +28,8 @@ class MadeUpCamera:
         self.status, self.active_application = READY, 7
         self.trouble: LinkError | None = None
         self.sent = 0
+        self._default: Interpretation
+        self.read_as(None)
         self._results: Subscribers[Result[Any]] = Subscribers()
         self._events: Subscribers[CameraEvent] = Subscribers()
 
@@ -46,6 +49,10 @@ class MadeUpCamera:
         stream = Subscription[Any]("events", max_queue=max_queue, overflow="drop_oldest")
         self._events.add(stream)
         return stream
+
+    def read_as(self, spec: Any) -> None:
+        """Have results that are read like this; none is read by this camera itself."""
+        self._default = Interpretation(spec, lenient=False, y_down=False)
 
     def send(self, value: Any, *, raw: bytes = b"", at: datetime | None = None) -> None:
         """Have a result come."""

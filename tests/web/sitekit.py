@@ -76,7 +76,10 @@ class Listener:
         async with asyncio.timeout(60):
             while True:
                 block = (await self.response.content.readuntil(b"\n\n")).decode()
+                assert block, "the stream has ended"
                 fields = dict(line.split(": ", 1) for line in block.splitlines() if line)
+                if "event" not in fields:
+                    continue  # a sign of life
                 told = Told(fields["event"], json.loads(fields["data"]), fields.get("id"))
                 if kind in {None, told.kind}:
                     return told
@@ -155,10 +158,3 @@ class Raw:
                 if line.lower().startswith("content-length:")
             )
             return int(head.split()[1]), await self.reader.readexactly(size)
-
-
-async def until(condition: Callable[[], object], seconds: float = 60) -> None:
-    """Let the loop run until something is true."""
-    async with asyncio.timeout(seconds):
-        while not condition():  # noqa: ASYNC110 - whatever the condition is
-            await asyncio.sleep(0)

@@ -18,7 +18,8 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.web import CloudSite
 from smartcam.web import _clouds as clouds_module
 from smartcam.web._clouds import MAX_VIEWERS, PROTOCOL, SLOW, packed, thinned
-from tests.web.sitekit import TOKEN, Caller, until
+from tests.handmade import until
+from tests.web.sitekit import TOKEN, Caller
 
 
 def line(count: int, place: float = 0, colours: bool = True) -> Cloud:
@@ -160,7 +161,7 @@ def test_large_cloud_is_thinned() -> None:
 
 
 async def test_thinned_cloud_is_said_to_be_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clouds_module, "MOST_POINTS", 100)
+    monkeypatch.setattr(clouds_module, "MAX_CLOUD_POINTS", 100)
     async with world(line(1000)) as one, one.looking() as looker:
         about, points, _ = await looker.cloud()
         state = await one.caller.get("/api/cloud")

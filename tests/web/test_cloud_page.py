@@ -13,9 +13,10 @@ import pytest_asyncio
 from smartcam.depth import Cloud
 from smartcam.web import CloudSite
 from smartcam.web import _clouds as clouds_module
+from tests.handmade import until
 from tests.processes import free_port
 from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
-from tests.web.sitekit import TOKEN, until
+from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from playwright.async_api import Page
 
-    from smartcam.web._clouds import Up
+    from smartcam.web._inside import Up
 
 imagecodecs: Any = pytest.importorskip("imagecodecs", reason="needs the extra frames")
 
@@ -215,7 +216,7 @@ async def test_newer_cloud_takes_the_place(page: Page, monkeypatch: pytest.Monke
         where(pixels, (1, 200, 250))
         with pytest.raises(AssertionError, match="nothing of"):
             where(pixels, GREEN)
-        monkeypatch.setattr(clouds_module, "MOST_POINTS", 1000)
+        monkeypatch.setattr(clouds_module, "MAX_CLOUD_POINTS", 1000)
         site.show(SCENE)
         await page.locator("#thinned").filter(has_text="Thinned for this page").wait_for()
         assert await page.inner_text("#points") == f"{len(SCENE):,}"

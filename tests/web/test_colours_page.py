@@ -14,8 +14,9 @@ import pytest_asyncio
 from smartcam.depth import ColourRange
 from smartcam.web import ColourSite
 from tests.frames.drivers import GoneError, ScriptedDriver, scripted
-from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
-from tests.web.sitekit import TOKEN, until
+from tests.handmade import until
+from tests.web.browser import BROWSER_MARKS, HIDE, PATIENCE, new_page, nothing_wrong, pass_gate, see
+from tests.web.sitekit import TOKEN
 from tests.web.test_colours import SIZE, coloured, picture
 
 if TYPE_CHECKING:
@@ -33,11 +34,6 @@ async def page() -> AsyncIterator[Page]:
     """The one page of all tests; each opens a site of its own in it."""
     async with new_page(1280, 800) as page:
         yield page
-
-
-async def see(page: Page, selector: str, text: str = "") -> None:
-    """Wait until something is to be seen, with a text."""
-    await page.locator(selector).filter(has_text=text).first.wait_for()
 
 
 class Camera:
@@ -183,16 +179,12 @@ async def test_source_that_dies_is_said_and_comes_back(page: Page) -> None:
 
 
 async def test_hidden_page_lets_the_device_rest(page: Page) -> None:
-    hide = """hidden => {
-      Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
-      document.dispatchEvent(new Event("visibilitychange"));
-    }"""
     async with shown(page) as (camera, site):
         await see(page, LIVE)
-        await page.evaluate(hide, True)
+        await page.evaluate(HIDE, True)
         await until(lambda: camera.driver.sink is None, PATIENCE)
         assert site.source.statistics().readers == 0
-        await page.evaluate(hide, False)
+        await page.evaluate(HIDE, False)
         await until(lambda: camera.driver.sink is not None, PATIENCE)
         await see(page, LIVE)
 
@@ -203,12 +195,7 @@ async def test_token_is_asked_for(page: Page) -> None:
     async with source, ColourSite(source, token=TOKEN) as site:
         giving = asyncio.create_task(camera.run())
         await page.goto(site.api)
-        await see(page, "#gate")
-        await page.fill("#token", "not-the-token_of-24-chars")
-        await page.click("#gate button")
-        await see(page, "#gate-error", "Refused")
-        await page.fill("#token", TOKEN)
-        await page.click("#gate button")
+        await pass_gate(page)
         await see(page, LIVE)
         await page.goto("about:blank")
         giving.cancel()

@@ -15,20 +15,22 @@ import aiohttp
 import pytest
 
 import smartcam
+from smartcam._accepting import Places
 from smartcam.web import _connections as connections
 from smartcam.web import _emulator as emulator
 from smartcam.web import _routes as routes
-from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD, Places
-from smartcam.web._emulator import MAX_WAITING
+from smartcam.web._connections import MAX_CONNECTIONS, MAX_HEAD, Visitor
+from smartcam.web._emulator import MAX_WAITING_CHANGES
 from smartcam.web._routes import MAX_BODY
 from smartcam.web._streams import MAX_STREAMS
-from tests.web.sitekit import TOKEN, Raw, World, served, until
+from tests.handmade import until
+from tests.web.sitekit import TOKEN, Raw, World, served
 
 HALF = b"GET /api HTTP/1.1\r\nHost: localhost\r\nX-Slow: "
 UNFINISHED = b"POST /api HTTP/1.1\r\nHost: localhost\r\nContent-Length: 9\r\n\r\n"
 
 
-def places_of(world: World) -> Places:
+def places_of(world: World) -> Places[Visitor]:
     opened = world.site._open
     assert opened is not None
     return opened.places
@@ -96,10 +98,12 @@ async def test_connection_that_was_used_last_goes_last() -> None:
 
 
 async def test_streams_and_calls_that_wait_leave_places_free() -> None:
-    assert MAX_STREAMS + MAX_WAITING <= MAX_CONNECTIONS // 2
+    assert MAX_STREAMS + MAX_WAITING_CHANGES <= MAX_CONNECTIONS // 2
     async with served() as world:
-        waiting = [asyncio.create_task(world.caller.get("log?wait=30")) for _ in range(MAX_WAITING)]
-        await until(lambda: world.site._waiting == MAX_WAITING)
+        waiting = [
+            asyncio.create_task(world.caller.get("log?wait=30")) for _ in range(MAX_WAITING_CHANGES)
+        ]
+        await until(lambda: world.site._waiting == MAX_WAITING_CHANGES)
         answer = await world.caller.call("GET", "log?wait=30")
         assert (answer.status, answer.value["expected"]) == (503, "16 at one time")
         assert (await world.caller.get("log"))["entries"] == []
@@ -239,7 +243,7 @@ async def test_client_that_goes_in_the_middle_of_its_body_is_no_error(
         async with served() as world:
             async with Raw.connected(world.site) as raw:
                 raw.writer.write(UNFINISHED.replace(b"/api ", b"/api/cameras/camera/endian "))
-                await until(lambda: any(one._head is None for one in places_of(world)._visitors))
+                await until(lambda: any(one._head is None for one in places_of(world)))
                 for _ in range(5):  # until the body is awaited
                     await asyncio.sleep(0)
             await until(lambda: not len(places_of(world)))
@@ -332,7 +336,7 @@ async def main():
         await asyncio.to_thread(sys.stdin.read)
 
 soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-resource.setrlimit(resource.RLIMIT_NOFILE, (128, hard))
+resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), hard))
 asyncio.run(main())
 """
 
@@ -340,9 +344,10 @@ asyncio.run(main())
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="descriptors are bounded elsewhere only")
 @pytest.mark.real_time
-async def test_half_requests_do_not_take_the_process_its_descriptors() -> None:
+@pytest.mark.parametrize("most", [128, 64])  # more than all places take, and fewer
+async def test_half_requests_do_not_take_the_process_its_descriptors(most: int) -> None:
     process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-c", ATTACKED),
+        *(sys.executable, "-c", ATTACKED, str(most)),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -22,7 +22,6 @@ from smartcam.web import _emulator as emulator
 from smartcam.web import _routes as routes
 from smartcam.web import _serialize as serialize
 from smartcam.web import _streams as streams
-from smartcam.web._emulator import CALLS
 from smartcam.web._fleet import CALLS as FLEET_CALLS
 from smartcam.web._fleet import LINGER, MAX_CAMERAS
 from smartcam.web._fleet import MAX_VIEWERS as MAX_FLEET_VIEWERS
@@ -30,10 +29,12 @@ from smartcam.web._fleet_rows import BAD_SECONDS, MAX_QUEUE
 from smartcam.web._fleet_socket import ALIVE, MAX_ROWS
 from smartcam.web._fleet_view import BUCKET, PERIOD, SERIES, SORTS, Filter
 from smartcam.web._frames import CALLS as FRAMES_CALLS
+from smartcam.web._history import BAR_SECONDS, MAX_BARS, MAX_PICTURES
 from smartcam.web._live import CALLS as LIVE_CALLS
 from smartcam.web._live import MAX_NEWS
-from smartcam.web._live_view import FAIL_WORDS, MAX_RESULTS, NOT_WORDS, PASS_WORDS
+from smartcam.web._live_view import MAX_RESULTS
 from smartcam.web._pictures import MAX_VIEWERS
+from smartcam.web._verdicts import FAIL_WORDS, NOT_WORDS, PASS_WORDS
 from smartcam.web._wizard import CALLS as WIZARD_CALLS
 from tests import ROOT
 from tests.web.sitekit import TOKEN
@@ -56,6 +57,8 @@ CURL = [
 
 def test_live_page_has_its_numbers() -> None:
     assert f"The last {MAX_RESULTS}." in LIVE_PAGE
+    assert MAX_BARS * BAR_SECONDS == 10 * 3600  # "Last ten hours"
+    assert f"the last {MAX_PICTURES} such pictures" in LIVE_PAGE
     assert f"faster than {MAX_NEWS / streams.PERIOD:g} a second" in LIVE_PAGE
     words = PASS_WORDS | FAIL_WORDS
     named = set(
@@ -92,13 +95,12 @@ def test_frames_page_has_its_numbers() -> None:
 @pytest.mark.parametrize(
     ("page", "calls"),
     [
-        (PAGE, CALLS),
         (LIVE_PAGE, LIVE_CALLS),
         (FLEET_PAGE, [one for one in FLEET_CALLS if "{camera}" not in one.path]),
         (WIZARD_PAGE, WIZARD_CALLS),
         (FRAMES_PAGE, FRAMES_CALLS),
     ],
-    ids=["control", "live", "fleet", "calibrating", "frames"],
+    ids=["live", "fleet", "calibrating", "frames"],
 )
 def test_table_has_every_call(page: str, calls: Iterable[Any]) -> None:
     table = page.partition("\n## Calls\n")[2].partition("\n`GET /api")[0]

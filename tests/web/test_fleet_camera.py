@@ -11,13 +11,16 @@ import aiohttp
 import pytest
 
 import smartcam.fleet
+from smartcam.emulator import EmulatedCamera
+from smartcam.exceptions import ConnectionTakenError
 from smartcam.fleet import Fleet, FleetFile
-from smartcam.fleet._bus import MemoryBus
+from smartcam.fleet._bus.bus import MemoryBus
 from smartcam.web import FleetSite
 from smartcam.web import _fleet as fleet_module
 from smartcam.web._fleet import LINGER, MAX_CAMERAS
 from tests.fleet.fleetkit import FAST, LAYOUT, NAME, Plant
-from tests.web.sitekit import Answer, Caller, Listener, until
+from tests.handmade import until
+from tests.web.sitekit import Answer, Caller, Listener
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -89,7 +92,7 @@ async def test_result_of_before_somebody_looked_is_shown() -> None:
         assert [one["number"] for one in told["results"]] == [1]
 
 
-@pytest.mark.parametrize("call", ["/trigger", "/start", "/stop", "/switch"])
+@pytest.mark.parametrize("call", ["/trigger", "/start", "/stop", "/switch", "/take_back"])
 async def test_without_control_a_camera_is_not_commanded(call: str) -> None:
     async with served(smartcam.fleet.open(CELL)) as world:
         answer = await world.post(call, {"application": 8} if call == "/switch" else None)
@@ -200,3 +203,19 @@ async def test_bus_of_nobody_is_an_empty_table() -> None:
     async with served(fleet) as world:
         told = await world.caller.get("/api/fleet")
         assert (told["totals"]["cameras"], told["agents"]) == (0, [])
+
+
+async def test_camera_that_another_client_took_is_shown_and_taken_back() -> None:
+    async with EmulatedCamera() as box:
+        cell = FleetFile.model_validate({"cameras": {"line1/cam1": {"url": box.url}}})
+        async with served(smartcam.fleet.open(cell), control=True) as world:
+            camera = world.fleet["line1/cam1"]
+            for _ in range(2):
+                await until(lambda: camera.connected)
+                async with smartcam.connect(box.url, reconnect=None):
+                    await until(lambda: not camera.connected)
+            await until(lambda: isinstance(camera.trouble, ConnectionTakenError))
+            state = await world.caller.get(world.path())
+            assert state["connection"] == "taken"
+            assert (await world.post("/take_back")).status == 200
+            await until(lambda: camera.connected)

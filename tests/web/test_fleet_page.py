@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest_asyncio
@@ -11,15 +12,17 @@ import pytest_asyncio
 import smartcam.fleet
 from smartcam.exceptions import InterpretationError
 from smartcam.fleet import FleetFile
+from smartcam.layout import Layout
 from smartcam.models import Status
 from smartcam.web import FleetSite
 from tests.processes import free_port
-from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
+from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong, see
 from tests.web.madeup import MadeUpFleet, names
 from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
 
     from playwright.async_api import Page
 
@@ -38,6 +41,11 @@ CELL = FleetFile.model_validate(
         }
     }
 )
+
+MEASURED = """\
+applications:
+  - {id: 5, layout: "(x: real32 mm, a: real32 deg)*", constant: [{x: 0.0125, a: 1.5707964}]}
+"""
 
 
 class Checked(NamedTuple):
@@ -63,11 +71,6 @@ async def opened(page: Page, fleet: Fleet, **options: Any) -> AsyncIterator[Flee
             await page.locator(".camera").first.wait_for()
             yield site
             await page.goto("about:blank")
-
-
-async def see(page: Page, selector: str, text: str = "") -> None:
-    """Wait until something is to be seen, with a text."""
-    await page.locator(selector).filter(has_text=text).first.wait_for()
 
 
 async def gone(page: Page, selector: str) -> None:
@@ -256,6 +259,57 @@ async def test_without_control_there_is_no_trigger_and_an_unknown_camera_is_told
         assert not await page.locator("#trigger").is_visible()
         await page.goto(f"{site.url}camera/line1/cm2")
         await see(page, "#alarm", "no camera 'line1/cm2'")
+
+
+async def test_switch_of_units_holds_for_the_table_and_the_page_of_a_camera(
+    page: Page, tmp_path: Path
+) -> None:
+    (tmp_path / "measured.yaml").write_text(MEASURED, encoding="utf-8")
+    entry = {
+        "emulated": {"scenario": str(tmp_path / "measured.yaml")},
+        "application": 5,
+        "interpret_as": "table: (x: real32 mm, a: real32 deg)*",
+    }
+    cell = FleetFile.model_validate({"cameras": {"line1/table": entry}})
+    async with smartcam.fleet.open(cell) as fleet, opened(page, fleet):
+        await fleet["line1/table"].trigger()
+        await see(page, f"{row('line1/table')} .last", "1: x 0.0125 m, a 1.5708 rad")
+        await page.check("#practical")
+        await see(page, f"{row('line1/table')} .last", "1: x 12.5 mm, a 90 deg")
+        await page.click(f"{row('line1/table')} a")
+        await see(page, "#last th", "x, mm")
+        await see(page, "#last td", "12.5")
+        assert await page.is_checked("#practical")
+        await page.uncheck("#practical")
+        await see(page, "#last th", "x, m")
+        await page.go_back()
+        await see(page, f"{row('line1/table')} .last", "1: x 0.0125 m, a 1.5708 rad")
+        assert not await page.is_checked("#practical")
+
+
+async def test_row_says_since_when_its_camera_fails_or_is_lost(page: Page) -> None:
+    fleet = MadeUpFleet(names(2))
+    failing, lost = (fleet[name] for name in names(2))
+    async with opened(page, fleet.as_fleet):
+        failing.send(Checked(True))
+        failing.send(Checked(False), at=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC))
+        lost.lose("cable unplugged")
+        await see(page, f"{row(failing.name)} .last", ":04:05, 1 in a row · ")
+        assert "fails since Jan 2" in await page.inner_text(f"{row(failing.name)} .last")
+        await see(page, f"{row(lost.name)} .state", "since ")
+        await see(page, f"{row(lost.name)} .state", ": cable unplugged")
+        assert await page.locator(f"{row(failing.name)} .trend rect.failed").count() == 1
+        label = await page.get_attribute(f"{row(failing.name)} .trend svg", "aria-label")
+        assert label is not None
+        assert label.startswith("Last ten hours: 1 passed, 1 failed")
+
+
+async def test_page_begins_with_the_units_of_its_command(page: Page) -> None:
+    fleet = MadeUpFleet(names(1))
+    async with opened(page, fleet.as_fleet, units=("um",)):
+        fleet[names(1)[0]].send(Layout("x: real32 mm, a: real32 deg").parse(bytes(8)))
+        await see(page, f"{row(names(1)[0])} .last", "x 0 um, a 0 rad")
+        await see(page, "#units", "um")
 
 
 async def test_server_that_ends_and_comes_back_is_told(page: Page) -> None:

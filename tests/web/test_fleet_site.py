@@ -5,24 +5,29 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import struct
 import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import aiohttp
 import pytest
 
-from smartcam.exceptions import InterpretationError
+from smartcam.exceptions import ConfigurationError, InterpretationError
+from smartcam.layout import Layout
+from smartcam.layout._inside import ShownUnits
 from smartcam.models import Header, Localization, Pose, Position, Quaternion, Status
 from smartcam.web import FleetSite
 from smartcam.web import _fleet as site_module
 from smartcam.web import _fleet_view as view_module
 from smartcam.web._fleet import CALLS, MAX_VIEWERS
-from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT, MAX_QUEUE, judged
+from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT, MAX_QUEUE, line_of
 from smartcam.web._fleet_socket import ALIVE, MAX_ROWS, PROTOCOL
 from smartcam.web._fleet_view import BUCKET
 from smartcam.web._streams import SLOW
+from smartcam.web._verdicts import judged
+from tests.handmade import until
 from tests.web.madeup import AT, READY, MadeUpFleet, names
-from tests.web.sitekit import TOKEN, Caller, Raw, until
+from tests.web.sitekit import TOKEN, Caller, Raw
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -494,3 +499,35 @@ async def test_head_of_no_request_is_as_everywhere() -> None:
     async with served(3) as world, Raw.connected(world.site) as raw:
         status, _ = await raw.call("GET /api/fleet HTTP/1.1", "Host: elsewhere.example")
         assert status == 403
+
+
+def test_line_of_a_result_has_units() -> None:
+    value = {"ok": True, "x": 0.0125, "n": 3, "parts": [{"a": 1.5}, {"a": 2.0}]}
+    units = {"x": "m", "parts": {"a": "rad"}}
+    assert line_of(value, units) == "ok true, x 0.0125 m, n 3, parts 2: a 1.5 rad | a 2 rad"
+    assert line_of([{"x": 1.0}], {}) == "1: x 1"
+    practical = ShownUnits(("mm", "deg"))
+    text = "ok true, x 12.5 mm, n 3, parts 2: a 85.944 deg | a 114.59 deg"
+    assert line_of(value, units, practical) == text
+
+
+async def test_row_has_its_result_in_si_and_in_the_units_of_the_switch() -> None:
+    layout = "(x: real32 mm, a: real32 deg)*"
+    rows = Layout(layout).parse_table(struct.pack("<ff", 12.5, 90.0))
+    async with served(2) as world, world.looking() as looker:
+        assert looker.said["units"]["instead"]["m"] == ["mm", 1000.0]
+        assert looker.said["units"]["first"] is False
+        table, plain = (world.fleet[name] for name in names(2))
+        table.read_as({7: f"table: {layout}"})
+        table.send(rows)
+        plain.send({"n": 3})
+        await looker.until(lambda: all(row["last"] for row in looker.rows.values()))
+        last = looker.rows[table.name]["last"]
+        assert last["text"] == "1: x 0.0125 m, a 1.5708 rad"
+        assert last["practical"] == "1: x 12.5 mm, a 90 deg"
+        assert "practical" not in looker.rows[plain.name]["last"]
+
+
+async def test_units_that_cannot_be_are_refused_before_anything_listens() -> None:
+    with pytest.raises(ConfigurationError, match="unit 'mn' is unknown"):
+        FleetSite(MadeUpFleet(names(1)).as_fleet, units=("mn",))

@@ -17,14 +17,16 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError, FrameFormatError, MissingExtraError
 from smartcam.frames import Frame, FrameSource, find_format
-from smartcam.web import FramesSite
+from smartcam.web import FramesSite, _jpeg
 from smartcam.web import _pictures as pictures_module
 from smartcam.web._frames import CALLS
-from smartcam.web._jpeg import TABLES, is_whole_jpeg, jpeg, picture
+from smartcam.web._inside import is_whole_jpeg, picture
+from smartcam.web._jpeg import TABLES, jpeg
 from smartcam.web._pictures import MAX_VIEWERS, PROTOCOL, Press
 from smartcam.web._streams import SLOW
 from tests.frames.drivers import GoneError, ScriptedDriver, frame, scripted
-from tests.web.sitekit import TOKEN, Caller, Raw, until
+from tests.handmade import until
+from tests.web.sitekit import TOKEN, Caller, Raw
 
 simplejpeg = pytest.importorskip("simplejpeg", reason="needs the extra frames")
 
@@ -405,7 +407,7 @@ async def test_press_makes_a_frame_once_for_all_and_a_cancelled_one_spoils_nothi
         made.append(one.sequence)
         return b"jpeg"
 
-    monkeypatch.setattr(pictures_module, "jpeg", slow)
+    monkeypatch.setattr(_jpeg, "jpeg", slow)
     with ThreadPoolExecutor(1) as threads:
         press, one = Press(threads, 80), plain(1)
         waiting = [asyncio.create_task(press.jpeg(one)) for _ in range(3)]

@@ -12,12 +12,16 @@ import pytest
 import pytest_asyncio
 
 import smartcam.frames
-from smartcam.frames._synthetic import read_stamp, stripes, write_stamp
+from smartcam.frames._inside import read_stamp
+from smartcam.frames._synthetic import stripes, write_stamp
 from smartcam.web import FramesSite
 from tests.frames.drivers import GoneError, frame, scripted
+from tests.frames.gige import camera as cameras
+from tests.frames.gige.camera import camera
+from tests.handmade import until
 from tests.processes import free_port
-from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
-from tests.web.sitekit import TOKEN, until
+from tests.web.browser import BROWSER_MARKS, HIDE, PATIENCE, new_page, nothing_wrong, pass_gate, see
+from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -30,12 +34,6 @@ if TYPE_CHECKING:
 pytestmark = BROWSER_MARKS
 
 LIVE = "#live[data-state=live]"
-HIDE = """
-hidden => {
-  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
-  document.dispatchEvent(new Event("visibilitychange"));
-}
-"""
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -45,18 +43,17 @@ async def page() -> AsyncIterator[Page]:
         yield page
 
 
-async def see(page: Page, selector: str, text: str = "") -> None:
-    """Wait until something is to be seen, with a text."""
-    await page.locator(selector).filter(has_text=text).first.wait_for()
-
-
 @contextlib.asynccontextmanager
 async def opened(
-    page: Page, sources: Sequence[FrameSource], *, token: str | None = None
+    page: Page,
+    sources: Sequence[FrameSource],
+    *,
+    token: str | None = None,
+    changes: bool = False,
 ) -> AsyncIterator[FramesSite]:
     """Show sources; what the browser finds wrong with the page fails the test."""
     with nothing_wrong(page):
-        async with FramesSite(sources, token=token) as site:
+        async with FramesSite(sources, token=token, changes=changes) as site:
             await page.goto(site.url)
             await see(page, LIVE)
             yield site
@@ -202,12 +199,7 @@ async def test_token_is_asked_for_and_opens_the_sockets(page: Page) -> None:
     driver, source = scripted(stall=None)
     async with source, FramesSite([source], token=TOKEN) as site:
         await page.goto(site.api)
-        await see(page, "#gate")
-        await page.fill("#token", "not-the-token_of-24-chars")
-        await page.click("#gate button")
-        await see(page, "#gate-error", "Refused")
-        await page.fill("#token", TOKEN)
-        await page.click("#gate button")
+        await pass_gate(page)
         await see(page, LIVE)
         await driver.streams()
         driver.give(stamped(3))
@@ -344,3 +336,33 @@ async def test_picture_that_is_scrolled_away_stops(page: Page) -> None:
         await page.evaluate("document.querySelector('.source').scrollIntoView()")
         await until(lambda: bool(site.viewers), PATIENCE)
         await see(page, "[data-place='0'][data-state=live]")
+
+
+@pytest.mark.parametrize("changes", [True, False])
+async def test_features_are_listed_and_set_where_the_page_may(page: Page, changes: bool) -> None:
+    async with (
+        camera() as there,
+        smartcam.frames.open(
+            f"gige://127.0.0.1:{there.port}?packet_size=576&trigger=software", linger=10
+        ) as source,
+        opened(page, [source], changes=changes),
+    ):
+        await page.click("details.device summary")
+        await page.fill("details.device input[type=search]", "black")
+        await see(page, "[data-name=blacklevel] small", "0 to 25.5 DN")
+        assert not await page.is_visible("[data-name=width]")
+        assert await page.is_visible("details.device > button") == changes
+        if not changes:
+            assert await page.inner_text("[data-name=blacklevel] output") == "0 DN"
+            return
+        field = "[data-name=blacklevel] input"
+        await page.fill(field, "1.23")
+        await page.press(field, "Enter")
+        await until(lambda: there.words[cameras.BLACK] == 12)
+        await page.fill("details.device input[type=search]", "triggersource")
+        await page.select_option("[data-name=triggersource] select", "Line1")
+        await until(lambda: there.words[cameras.TRIGGERS + 4] == 1)
+        await page.select_option("[data-name=triggersource] select", "Software")
+        await until(lambda: there.words[cameras.TRIGGERS + 4] == 0)
+        await page.click("details.device > button")
+        await see(page, "[data-count=number]", "1")

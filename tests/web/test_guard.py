@@ -10,10 +10,11 @@ import sys
 import aiohttp
 import pytest
 
+from smartcam._accepting import is_loopback
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError
 from smartcam.web import EmulatorSite
-from smartcam.web._guard import HEADERS, is_loopback
+from smartcam.web._guard import HEADERS
 from tests.web.sitekit import TOKEN, Raw, served
 
 

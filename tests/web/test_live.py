@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import aiohttp
@@ -12,8 +13,19 @@ import pytest
 
 import smartcam
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
+from smartcam.fleet import FleetFile
+from smartcam.layout import Layout
 from smartcam.models import Localization, Pose, Position, Quaternion, Result
-from smartcam.web import LiveSite
+from smartcam.web import FleetSite, LiveSite
+from smartcam.web._history import (
+    BAR_SECONDS,
+    MAX_BARS,
+    MAX_FAILURES,
+    MAX_PICTURES,
+    SHIFT_SECONDS,
+    SLOT_SECONDS,
+    ShiftHistory,
+)
 from smartcam.web._live import CALLS, MAX_NEWS
 from smartcam.web._live_view import (
     MAX_PARTS,
@@ -21,10 +33,11 @@ from smartcam.web._live_view import (
     MAX_SHOWN_RAW,
     MAX_VALUE,
     ShownResult,
-    meaning,
-    verdicts,
+    shown_value,
 )
-from tests.web.sitekit import TOKEN, Caller, Listener, Raw, until
+from smartcam.web._verdicts import meaning, verdicts
+from tests.handmade import until
+from tests.web.sitekit import TOKEN, Caller, Listener, Raw
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -372,3 +385,188 @@ async def test_camera_without_pictures_is_asked_for_none(emulator: EmulatedCamer
         await events.next("clock")
         assert world.site.view.picture is None
         assert world.site.view.picture_error == ""
+
+
+def test_units_are_told_beside_the_value() -> None:
+    layout = Layout("ok: bool, x: real32 mm, parts: (a: real32 deg)*")
+    value = layout.parse(bytes.fromhex("ff 00004841 0000b442"))
+    told = ShownResult(0, result_of(value), "").as_json()
+    assert told["units"] == {"x": "m", "parts": {"a": "rad"}}
+    table = Layout("(x: real32 mm)*")
+    rows = table.parse_table(bytes(4))
+    assert ShownResult(0, result_of(rows), "", table).as_json()["units"] == {"x": "m"}
+
+
+# ---------------------------------------------------------------------- a shift
+
+SHIFT_BEGIN = datetime(2026, 3, 2, 6, 0, tzinfo=UTC)
+SHIFT_CHECK = Layout("ok: bool, width: real32")
+
+
+def shift_result(number: int, ok: bool, seconds: float = 0.0) -> Result[Any]:
+    """Return a result of the shift."""
+    return Result(
+        value=SHIFT_CHECK.parse(SHIFT_CHECK.build({"ok": ok, "width": 1.0})),
+        camera="cell", application=5, number=number, sequence=None,
+        received_at=SHIFT_BEGIN + timedelta(seconds=seconds),
+        triggered_at=None, latency=None, raw=b"",
+    )  # fmt: skip
+
+
+def test_it_fails_since_the_first_failure_after_the_last_pass() -> None:
+    history = ShiftHistory()
+    for number, ok in enumerate([True, False, True, False, False, False]):
+        history.add(shift_result(number, ok, 10.0 * number))
+    found = history.as_json()
+    assert found["failed_since"] == SHIFT_BEGIN.timestamp() + 30
+    assert (found["in_a_row"], found["failed"]) == (3, 4)
+    assert [(one["number"], one["count"]) for one in found["failures"]] == [(1, 1), (3, 3)]
+    assert found["failures"][0]["what"] == "ok is false, expected true"
+    assert found["failures"][1]["until"] == SHIFT_BEGIN.timestamp() + 50
+    assert found["bars"] == [[SHIFT_BEGIN.timestamp(), 2, 4, 0, 0]]
+    history.add(shift_result(9, ok=True))
+    assert history.as_json()["failed_since"] is None
+
+
+def test_what_is_kept_is_bounded() -> None:
+    history = ShiftHistory()
+    for number in range(2 * MAX_BARS):
+        history.add(shift_result(number, ok=False, seconds=BAR_SECONDS * number))
+        history.attach(history.last_failure, b"BM" + bytes([number]))
+        history.add(shift_result(number, ok=True, seconds=BAR_SECONDS * number))
+    found = history.as_json()
+    assert (len(found["bars"]), len(found["failures"])) == (MAX_BARS, MAX_FAILURES)
+    assert history.totals == [MAX_BARS, MAX_BARS, 0, 0]
+    assert sum(one["picture"] for one in found["failures"]) == MAX_PICTURES
+    assert history.picture(found["failed"]) == b"BM" + bytes([2 * MAX_BARS - 1])
+    assert history.picture(1) is None
+
+
+def test_bars_of_before_the_shift_are_dropped_though_few_came_since() -> None:
+    history = ShiftHistory()
+    history.add(shift_result(1, ok=False))
+    history.add(shift_result(2, ok=True, seconds=SHIFT_SECONDS))
+    assert [bar[1:] for bar in history.as_json()["bars"]] == [[1, 0, 0, 0]]
+    assert history.totals == [1, 0, 0, 0]
+
+
+def test_picture_belongs_to_no_failure_once_anything_came_after_it() -> None:
+    history = ShiftHistory()
+    history.add(shift_result(1, ok=False))
+    assert history.wants_picture
+    history.add(shift_result(2, ok=False)._replace(value=b"no verdict"))
+    assert not history.wants_picture
+    history.attach(history.last_failure, b"BM of another part")
+    assert history.as_json()["failures"][0]["picture"] is False
+
+
+def test_losses_and_missed_results_are_failures_with_their_time() -> None:
+    history = ShiftHistory()
+    history.add_loss("cable unplugged")
+    history.add_loss("cable unplugged")
+    history.add_missed(7, "7 results did not come")
+    found = history.as_json()
+    told = [(one["what"], one["count"]) for one in found["failures"]]
+    assert told == [("connection lost: cable unplugged", 2), ("7 results did not come", 1)]
+    assert (history.totals, found["failed_since"]) == ([0, 0, 0, 7], None)
+
+
+def test_short_trend_tells_how_many_of_ten_were_bad() -> None:
+    history = ShiftHistory()
+    assert history.trend() == {"end": 0, "places": ""}
+    for number, ok in enumerate([True] * 39 + [False]):
+        history.add(shift_result(number, ok))
+    later = 2 * SLOT_SECONDS
+    history.add(shift_result(40, ok=True, seconds=later)._replace(value=b"no verdict"))
+    history.add(shift_result(41, ok=False, seconds=later + SLOT_SECONDS))
+    begin = SHIFT_BEGIN.timestamp()
+    assert history.trend() == {"end": begin + 4 * SLOT_SECONDS, "places": "1 -X"}
+
+
+def test_a_text_is_shown_as_text_and_not_as_hex() -> None:
+    cells = b'{"A2": 12.5, "B2": "bolt"}'
+    assert shown_value(cells)["value"] == cells.decode()
+    assert shown_value(b"\x00\x01")["value"] == "0001"
+    assert shown_value(b"")["value"] == ""
+
+
+async def test_page_of_a_camera_tells_its_failures() -> None:
+    bad = Application(id=5, layout="ok: bool", constant={"ok": False}, load_time=0)
+    async with EmulatedCamera([bad], active=5, running=True) as emulator:
+        camera = smartcam.connect(emulator.url, interpret_as="ok: bool")
+        async with LiveSite(camera) as site, camera, aiohttp.ClientSession() as session:
+            caller = Caller(site, session, "")
+            await camera.trigger()
+            await until(lambda: site.view.history.version)
+            told = await caller.get("/api/history")
+            assert (told["failed"], told["in_a_row"]) == (1, 1)
+            assert told["failures"][0]["what"] == "ok is false, expected true"
+            assert (await caller.call("GET", "/api/failures/1")).status == 404
+
+
+async def test_failure_has_its_picture_though_nobody_looks() -> None:
+    job = {"file": "1check.job", "cells": {"A2": 0}}
+    async with EmulatedInSight(jobs=[job]) as emulator:
+        camera = smartcam.connect(f"{emulator.url}?cells=A2", interpret_as=lambda r: Failed())
+        async with LiveSite(camera) as site, camera:
+            await camera.start()
+            await camera.trigger()
+            await until(lambda: site.view.history.picture(1))
+            assert site.view.history.as_json()["failures"][0]["picture"] is True
+            async with (
+                aiohttp.ClientSession() as session,
+                session.get(f"{site.api}/api/failures/1") as answer,
+            ):
+                assert (answer.status, (await answer.read())[:2]) == (200, b"BM")
+
+
+class Failed:
+    """A value with a truth value that says that it failed."""
+
+    def _asdict(self) -> dict[str, bool]:
+        return {"ok": False}
+
+
+async def test_fleet_has_the_picture_of_a_failure_though_nobody_looks() -> None:
+    job = {"file": "1check.job", "cells": {"A2": 0}}
+    async with EmulatedInSight(jobs=[job]) as emulator:
+        entry = {"url": f"{emulator.url}?cells=A2", "interpret_as": "ok: bool"}
+        file = FleetFile.model_validate({"cameras": {"a": entry}})
+        async with smartcam.fleet.open(file) as fleet, FleetSite(fleet) as site:
+            await fleet["a"].start()
+            await fleet["a"].trigger()
+            history = site.view.rows["a"].history
+            await until(lambda: history.picture(1))
+            assert history.as_json()["failures"][0]["picture"] is True
+
+
+async def test_page_of_a_fleets_camera_knows_since_when_it_is_lost() -> None:
+    async with EmulatedCamera(active=21, running=True) as emulator:
+        file = FleetFile.model_validate({"cameras": {"a": {"url": emulator.url}}})
+        async with smartcam.fleet.open(file) as fleet, FleetSite(fleet) as site:
+            assert site.live("a").state()["changed_seen"] is False
+            await site.live("a").stop()
+            site._live.clear()
+            await emulator.stop()
+            row = site.view.rows["a"]
+            await until(lambda: row.mode == "lost")
+            lost_at = row.changed_at
+            await asyncio.sleep(0.05)
+            told = site.live("a").state()
+            assert (told["changed_at"], told["changed_seen"]) == (lost_at, True)
+            assert row.fields()["changed_seen"] is True
+            (failure,) = row.history.as_json()["failures"]
+            assert failure["what"].startswith("connection lost: ")
+
+
+async def test_fleet_keeps_the_failures_of_a_camera_at_which_nobody_looks() -> None:
+    scenario = {"emulated": {}, "application": 21, "interpret_as": "text: string[20]"}
+    file = FleetFile.model_validate({"cameras": {"a": scenario}})
+    async with smartcam.fleet.open(file) as fleet, FleetSite(fleet) as site:
+        await fleet["a"].trigger(timeout=5.0)
+        row = site.view.rows["a"]
+        await until(lambda: row.history.version)
+        assert row.history.as_json()["bars"][0][3] == 1
+        async with aiohttp.ClientSession() as session:
+            told = await Caller(site, session, "a").get("history")
+        assert told["bars"][0][3] == 1

@@ -15,9 +15,10 @@ import smartcam.fleet
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
 from smartcam.fleet import FleetFile
 from smartcam.web import LiveSite
+from tests.handmade import until
 from tests.processes import free_port
-from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
-from tests.web.sitekit import TOKEN, until
+from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong, see
+from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -44,11 +45,6 @@ async def page() -> AsyncIterator[Page]:
     """The one page of all tests; each opens a site of its own in it."""
     async with new_page(1280, 800) as page:
         yield page
-
-
-async def see(page: Page, selector: str, text: str = "") -> None:
-    """Wait until something is to be seen, with a text."""
-    await page.locator(selector).filter(has_text=text).first.wait_for()
 
 
 @contextlib.asynccontextmanager
@@ -129,7 +125,9 @@ async def test_pass_and_fail_are_told_in_words(page: Page) -> None:
         await see(page, "[data-name=ok][data-verdict=pass]", "PASS")
         await see(page, "[data-name=defect][data-verdict=fail]", "FAIL")
         await see(page, "[data-name=here][data-verdict='']", "true")
-        await see(page, "#rows b[data-verdict=fail]", "defect FAIL")
+        await see(page, "#rows b[data-verdict=fail]", "FAIL")
+        await see(page, "#failed-since", "fails since ")
+        await see(page, "#failures td", "defect is true")
         colours = [
             await page.eval_on_selector(
                 f"#verdicts [data-name={name}]", "e => getComputedStyle(e).color"
@@ -137,6 +135,19 @@ async def test_pass_and_fail_are_told_in_words(page: Page) -> None:
             for name in ("ok", "defect", "here")
         ]
         assert len(set(colours)) == 3
+
+
+async def test_failure_shows_the_picture_that_the_camera_had_then(page: Page) -> None:
+    job = {"file": "1check.job", "cells": {"A2": 0}}
+    async with (
+        EmulatedInSight(jobs=[job]) as emulator,
+        opened(page, f"{emulator.url}?cells=A2", interpret_as="ok: bool") as site,
+    ):
+        await site.view.camera.start()
+        await page.click("#trigger")
+        await page.click("#failures button")
+        await see(page, "#failure-caption", "ok is false, expected true")
+        await page.wait_for_function("document.querySelector('#failure').naturalWidth > 0")
 
 
 async def test_lost_camera_and_lost_server_are_said(page: Page) -> None:
@@ -168,7 +179,7 @@ async def test_camera_that_is_taken_is_said(page: Page) -> None:
         opened(page, emulator.url),
         smartcam.connect(emulator.url, reconnect=FAST),
     ):
-        await see(page, "#alarm", "Another client has taken the camera")
+        await see(page, "#alarm", "Another client has the camera since")
 
 
 async def test_looking_only_has_no_buttons_and_commands_switch(page: Page) -> None:
@@ -311,3 +322,19 @@ async def test_nothing_is_cut(page: Page, width: int, height: int) -> None:
             assert wide == []
     finally:
         await page.set_viewport_size({"width": 1280, "height": 800})
+
+
+async def test_values_have_units_and_a_switch_shows_practical_ones(page: Page) -> None:
+    application = Application(
+        id=5, layout="x: real32 mm, a: real32 deg", constant={"x": 0.0125, "a": 1.5707964}
+    )
+    async with (
+        EmulatedCamera([application], running=True) as emulator,
+        opened(page, emulator.url, interpret_as="x: real32 mm, a: real32 deg"),
+    ):
+        await page.click("#trigger")
+        await see(page, "#last", "0.0125 m")
+        await see(page, "#rows tr", "x 0.0125 m, a 1.5708 rad")
+        await page.check("#practical")
+        await see(page, "#last", "12.5 mm")
+        await see(page, "#rows tr", "x 12.5 mm, a 90 deg")

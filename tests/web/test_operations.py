@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import re
 import socket
 import sys
 from collections.abc import AsyncIterator
@@ -14,17 +15,20 @@ import pytest
 
 import smartcam
 import smartcam.exceptions
+from smartcam._cli.log_lines import FIELDS
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConfigurationError, MissingExtraError, SmartCamError
 from smartcam.fleet import Fleet, FleetFile, FleetServer
-from smartcam.fleet import _metrics as metrics
-from smartcam.fleet._bus import MemoryBus
-from smartcam.fleet._metric_families import exposition
-from smartcam.fleet._metrics import read_numbers
-from smartcam.fleet._trigger_counts import OUTCOMES, outcome_of
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._inside import exposition, read_numbers
+from smartcam.fleet._operations import metrics
+from smartcam.fleet._operations.metric_families import _SUMS as SUM_NAMES
+from smartcam.fleet._operations.trigger_counts import OUTCOMES, outcome_of
 from smartcam.web import OperationsSite
 from smartcam.web._connections import MAX_CONNECTIONS
+from tests import ROOT
 from tests.fleet.fleetkit import PATIENCE, NumberedCamera, until
+from tests.processes import free_place
 
 parser = pytest.importorskip("prometheus_client.parser")
 
@@ -33,7 +37,7 @@ ANYWHERE = {"listen": "127.0.0.1:0"}
 
 async def ask(site: OperationsSite, path: str, method: str = "GET") -> tuple[int, str]:
     reader, writer = await asyncio.open_connection("127.0.0.1", site.port)
-    head = f"{method} {path} HTTP/1.1\r\nHost: agent\r\nConnection: close\r\n\r\n"
+    head = f"{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
     writer.write(head.encode())
     async with asyncio.timeout(PATIENCE):
         answer = (await reader.read(-1)).decode()
@@ -107,6 +111,64 @@ async def test_it_is_ready_once_each_camera_was_tried_and_stays_so() -> None:
                 assert (status, said["ready"]) == (503, False)
 
 
+@pytest.mark.real_time
+async def test_agent_whose_router_is_gone_is_not_ready_until_that_is_back() -> None:
+    hub = FleetFile.model_validate(
+        {"agent": "hub", "listen": free_place(), "cameras": {"x": {"emulated": {}}}}
+    )
+    said = {"agent": "a1", "connect": hub.endpoints[0][0], "operations": ANYWHERE}
+    server = FleetServer(FleetFile.model_validate({**said, "cameras": {"one": {"emulated": {}}}}))
+    async with contextlib.AsyncExitStack() as stack:
+        async with FleetServer(hub):
+            site = await stack.enter_async_context(OperationsSite(server))
+            await stack.enter_async_context(server)
+            await server.wait_tried()
+            assert (await ask(site, "/readyz"))[0] == 200
+        await until(lambda: not site.readiness()["ready"])
+        status, text = await ask(site, "/readyz")
+        assert (status, json.loads(text)["connected"]) == (503, 1)
+        assert f"nobody answers at {said['connect']}" in json.loads(text)["reason"]
+        async with FleetServer(hub):
+            await until(lambda: site.readiness()["ready"])
+
+
+PAGE = (ROOT / "docs" / "operations.md").read_text(encoding="utf-8")
+
+
+def words_of(title: str, column: int = 0) -> set[str]:
+    """Return the words in code of a column of the page's table whose head begins with a title."""
+    table = PAGE.partition(f"\n| {title} |")[2].partition("\n\n")[0].splitlines()[2:]
+    cells = [row.strip("| ").split(" | ")[column] for row in table]
+    return {word for cell in cells for word in re.findall(r"`([^`]+)`", cell)}
+
+
+async def test_page_lists_every_number_and_no_other() -> None:
+    said = {
+        word.partition("{")[0]
+        for title in ("of each camera", "of the agent")
+        for word in words_of(title)
+    }
+    async with watched("one", latency="camera") as (_, site, fleet, _boxes):
+        await fleet["one"].trigger()
+        families = [*parser.text_string_to_metric_families((await ask(site, "/metrics"))[1])]
+    there = {f"{one.name}_total" if one.type == "counter" else one.name for one in families}
+    frames = {"smartcam_frames_total", "smartcam_frames_lost_total", "smartcam_frame_viewers"}
+    outlets = {one for one in said if one == "outlet" or one.startswith("smartcam_outlet_")}
+    assert said <= there | frames | outlets  # this agent has none of both
+    # those that the page has together as "and others"
+    others = {f"{name}_total" for name, _ in SUM_NAMES.values()}
+    own = {name for name in there if name.startswith("smartcam_")}
+    assert own - said - others == set()
+
+
+def test_page_has_the_words_of_outcomes_readiness_and_log() -> None:
+    outcomes = words_of("of each camera", 1) & set(OUTCOMES)
+    assert outcomes == set(OUTCOMES)
+    server = FleetServer(file({"one": "bvs://127.0.0.1:1"}), bus=MemoryBus().end())
+    assert set(OperationsSite(server).readiness()) <= words_of("path", 1)
+    assert words_of("field") == set(FIELDS)
+
+
 async def test_numbers_are_those_of_the_account() -> None:
     async with watched("one", "two") as (server, site, fleet, boxes):
         for _ in range(3):
@@ -120,6 +182,7 @@ async def test_numbers_are_those_of_the_account() -> None:
         found = samples(text)
         assert status == 200
         assert found["smartcam_connected", "a1", "one"] == 1
+        assert found["smartcam_taken", "a1", "one"] == 0
         assert found["smartcam_triggers_total", "a1", "one", "result"] == 3
         assert found["smartcam_triggers_total", "a1", "two", "not_running"] == 1
         assert found["smartcam_triggers_total", "a1", "two", "result"] == 0
@@ -139,6 +202,21 @@ async def test_numbers_are_those_of_the_account() -> None:
             host.camera.statistics().bytes_received for host in server.hosts.values()
         )
         assert found["smartcam_agent_info", "a1", "plant", smartcam.__version__] == 1
+
+
+async def test_camera_that_another_client_took_is_in_the_numbers() -> None:
+    async with watched("one") as (server, site, _, boxes):
+        host = server.hosts["one"]
+        for _ in range(2):
+            await until(lambda: host.connected)
+            async with smartcam.connect(boxes["one"].url):
+                await until(lambda: not host.connected)
+        await until(lambda: host.camera.taken)
+        found = samples((await ask(site, "/metrics"))[1])
+        assert (found["smartcam_connected", "a1", "one"], found["smartcam_taken", "a1", "one"]) == (
+            0,
+            1,
+        )
 
 
 async def test_sums_do_not_go_down_when_a_camera_goes() -> None:
@@ -180,7 +258,7 @@ async def test_the_text_grows_by_a_few_lines_for_a_camera_and_by_no_labels_of_ot
         )
         return text.count(b"\n")
 
-    assert await lines(101) - await lines(1) == 100 * 11
+    assert await lines(101) - await lines(1) == 100 * 12
     kinds = [getattr(smartcam.exceptions, name) for name in smartcam.exceptions.__all__]
     words = {outcome_of(kind.__new__(kind)) for kind in (*kinds, Exception, TimeoutError)}
     assert words < {*OUTCOMES}
@@ -218,6 +296,55 @@ async def test_nothing_else_is_there_and_connections_are_bounded() -> None:
         assert len(site._open.places) <= MAX_CONNECTIONS
         for _, writer in many:
             writer.close()
+
+
+async def asked_as(port: int, host: str) -> tuple[int, str]:
+    """Ask for the health by a name of the machine; return status and text."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(f"GET /healthz HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
+    async with asyncio.timeout(PATIENCE):
+        head, _, text = (await reader.read(-1)).decode().partition("\r\n\r\n")
+    writer.close()
+    return int(head.split()[1]), text
+
+
+ATTACKER = "attacker.example"
+
+
+@pytest.mark.parametrize(
+    ("listen", "names", "host", "status"),
+    [
+        ("127.0.0.1:0", [], "localhost:9464", 200),
+        ("127.0.0.1:0", [], "127.0.0.1", 200),
+        ("127.0.0.1:0", [], "[::1]:9464", 200),
+        ("127.0.0.1:0", [], ATTACKER, 403),
+        ("127.0.0.1:0", [], "10.0.0.1", 403),
+        ("127.0.0.1:0", ["agent1.plant.example"], "agent1.plant.example", 403),
+        ("127.0.0.1:0", [], "", 403),
+        ("127.0.0.1:0", [], "[::1", 403),
+        ("0.0.0.0:0", [], "10.0.0.1:9464", 200),
+        ("0.0.0.0:0", [], "localhost", 200),
+        ("0.0.0.0:0", [], socket.gethostname(), 200),
+        ("0.0.0.0:0", ["Agent1.plant.example"], "agent1.PLANT.example:9464", 200),
+        ("0.0.0.0:0", ["agent1.plant.example"], ATTACKER, 403),
+        ("0.0.0.0:0", [], f"{socket.gethostname()}.{ATTACKER}", 403),
+    ],
+)
+async def test_who_asks_by_another_machines_name_gets_nothing(
+    listen: str, names: list[str], host: str, status: int
+) -> None:
+    async with watched("one", listen=listen, names=names) as (_, site, _fleet, _boxes):
+        got, text = await asked_as(site.port, host)
+        assert got == status, text
+        if status == 403:
+            assert text.startswith("403 Host ")
+            assert "expected" in text
+
+
+@pytest.mark.parametrize("name", ["", "http://x", "a b", "-x", "x/y"])
+def test_a_name_that_is_none_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="names"):
+        file({}, names=[name])
 
 
 async def test_it_stops_while_somebody_asks_and_starts_again() -> None:

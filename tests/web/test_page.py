@@ -12,14 +12,15 @@ import pytest_asyncio
 
 import smartcam
 from smartcam.emulator import EmulatedCamera, EmulatedInSight, ManualClock, Scenario
-from smartcam.emulator._scene import PIECES
+from smartcam.emulator._inside import PIECES
 from smartcam.emulator.faults import FAULTS
 from smartcam.exceptions import ConnectionLostError
 from smartcam.models import Status
 from smartcam.web import EmulatorSite
+from tests.handmade import until
 from tests.processes import free_port
-from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong
-from tests.web.sitekit import TOKEN, until
+from tests.web.browser import BROWSER_MARKS, PATIENCE, new_page, nothing_wrong, see
+from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -53,7 +54,7 @@ class View(NamedTuple):
 
     async def see(self, selector: str, text: str = "") -> None:
         """Wait until something is to be seen, with a text."""
-        await self.page.locator(selector).filter(has_text=text).first.wait_for()
+        await see(self.page, selector, text)
 
     async def text(self, selector: str) -> str:
         return await self.page.locator(selector).inner_text()

@@ -12,7 +12,7 @@ import pytest
 
 import smartcam
 from smartcam.emulator import EmulatedCamera, LogEntry
-from smartcam.emulator._scene import PIECES, TABLE_SIZE
+from smartcam.emulator._inside import PIECES, TABLE_SIZE
 from smartcam.emulator.faults import FAULTS
 from smartcam.exceptions import ConfigurationError
 from smartcam.models import Status

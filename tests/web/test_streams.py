@@ -14,7 +14,8 @@ from smartcam.models import Status
 from smartcam.web import _streams as streams
 from smartcam.web._feed import MAX_LOG_NEWS, Watcher
 from smartcam.web._streams import MAX_STREAMS, News
-from tests.web.sitekit import Raw, World, served, until
+from tests.handmade import until
+from tests.web.sitekit import Raw, World, served
 
 
 async def test_stream_tells_first_how_everything_is() -> None:

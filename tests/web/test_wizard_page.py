@@ -11,21 +11,26 @@ import numpy as np
 import pytest
 import pytest_asyncio
 
-from smartcam.calibration._files.directory import Folder
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._sheet.calibration import SheetCalibration
-from smartcam.calibration._targets import Checkerboard, target_to_data
-from smartcam.calibration.simulation._images import render
-from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
-from smartcam.calibration.wizards._pictures import PictureFolder
-from smartcam.calibration.wizards._services import CalibrationService
-from smartcam.calibration.wizards._sheet import sheet_wizard
+from smartcam._extras import load
+from smartcam.calibration import (
+    CameraModel,
+    Checkerboard,
+    Folder,
+    SheetCalibration,
+    Transform,
+    target_to_data,
+)
+from smartcam.calibration.simulation import render
+from smartcam.calibration.wizards import (
+    CalibrationService,
+    PictureFolder,
+    hand_eye_wizard,
+    sheet_wizard,
+)
 from smartcam.exceptions import NotRunningError
-from smartcam.web._wizard import WizardSite
+from smartcam.web import WizardSite
 from tests.processes import printed_by
-from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong
+from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong, see
 from tests.web.sitekit import TOKEN
 from tests.web.test_wizard import MARKS, World, run_through, served
 
@@ -56,7 +61,7 @@ class View(NamedTuple):
     world: World
 
     async def see(self, selector: str, text: str = "") -> None:
-        await self.page.locator(selector).filter(has_text=text).first.wait_for()
+        await see(self.page, selector, text)
 
     async def answer(self, title: str, **answers: Any) -> None:
         """Answer the step of that title."""
@@ -108,7 +113,7 @@ async def test_page_drives_the_wizard_to_a_calibration(page: Page, tmp_path: Pat
         await view.answer("What came out", next="accept")
         await view.answer("Save table")
         await view.see("#title", "Done")
-        await view.see("#verdict.good", "Good for 0.")
+        await view.see("#verdict.unknown", "touch 5 or more")
         await view.see("#result", str(tmp_path / "table.json"))
         await view.see("#result", "held-out error")
         assert await view.how_many("#plot .touched") == 4
@@ -134,8 +139,8 @@ async def test_page_says_what_is_wrong_in_words_and_chooses_what_mends_it(
         assert await page.is_checked("#form [name=next][value=redo]")
         await view.answer("What came out")
         await view.answer("Touch point 3 again", x=TOUCHES[2][1], y=TOUCHES[2][0], z=0.0)
-        await view.see("#verdict.good", "Good for 0.")
-        assert await page.is_checked("#form [name=next][value=accept]")
+        await view.see("#verdict.unknown", "touch 5 or more")
+        assert await page.is_checked("#form [name=next][value=more]")
 
 
 async def test_page_s_marks_are_chosen_by_a_click(page: Page, tmp_path: Path) -> None:
@@ -193,7 +198,7 @@ async def test_page_shows_what_is_left_out_as_crosses(page: Page, tmp_path: Path
         await view.answer("Marks in the camera's field")
         await view.answer("Which ones will be touched?")
         for number, (x, y) in enumerate(MARKS):
-            await view.answer("Touch mark", x=y + 0.02 * (number == 1), y=x, z=0.0)
+            await view.answer("Touch mark", x=y + 0.02 * (number == 1), y=x, z=1e-4)
         await view.answer("What came out", next="robust")
         await view.see("#legend", "Crosses: left out.")
         assert await view.how_many("#plot .left-out") == 2
@@ -245,6 +250,22 @@ async def test_page_loaded_again_shows_the_same_step(page: Page, tmp_path: Path)
         await view.see("#title", "Touch mark 1 of 4")
         await page.click("#abort")
         await view.see("#title", "Aborted")
+
+
+async def test_page_of_one_that_was_broken_off_says_since_when_and_begins_anew(
+    page: Page, tmp_path: Path
+) -> None:
+    async with opened(page, tmp_path) as view:
+        await begin(view)
+        await view.see("#number", "Step 4 of about 9")
+    async with opened(page, tmp_path) as view:
+        await page.fill("#name", "table")
+        await page.click("#start-form button")
+        await view.see("#since", "Broken off: begun ")
+        assert await page.locator("#done li").count() == 3
+        await page.click("#anew")
+        await view.see("#number", "Step 1 of about 9")
+        assert await page.locator("#resumed").is_hidden()
 
 
 async def test_page_of_a_step_that_somebody_else_answered_shows_the_new_one(

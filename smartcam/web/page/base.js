@@ -44,6 +44,21 @@ const TOKEN = "smartcam-token"; // in the tab's memory
 export const token = () => sessionStorage.getItem(TOKEN);
 export const headers = () => (token() ? { Authorization: `Bearer ${token()}` } : {});
 
+export class Refused extends Error {
+  constructor(status, answer) {
+    super(answer.came ?? `HTTP ${status}`);
+    this.status = status;
+    this.answer = answer;
+  }
+}
+
+export async function call(path, body) {
+  const more = body ? { "Content-Type": "application/json" } : {};
+  const response = await fetch(path, { method: body ? "POST" : "GET", headers: { ...headers(), ...more }, cache: "no-store", body: body && JSON.stringify(body) });
+  if (response.ok) return response;
+  throw new Refused(response.status, await response.json());
+}
+
 // Take the token out of the address, and go on whenever one was entered at the gate.
 export function atGate(goOn) {
   const given = new URLSearchParams(location.hash.slice(1)).get("token");
@@ -69,6 +84,37 @@ export function live(mode, text) {
   $("live").dataset.state = mode;
   setText("live", text);
 }
+
+// ---------------------------------------------------------------------- units
+
+const UNITS = "smartcam-units"; // in the browser's memory, for all pages of this server
+let instead = {}; // what is shown instead of an SI unit: name and factor
+
+// Take the units of the server; the switch stands as this browser left it, else as the server says.
+export function takeUnits(units, changed) {
+  if (JSON.stringify(units.instead) === JSON.stringify(instead)) return;
+  instead = units.instead;
+  const chosen = localStorage.getItem(UNITS);
+  $("practical").checked = chosen === null ? units.first : chosen === "true";
+  setText("practical-names", Object.values(instead).map(([name]) => name).join(", "));
+  $("practical").onchange = () => {
+    localStorage.setItem(UNITS, String($("practical").checked));
+    changed();
+  };
+}
+
+export const isPractical = () => $("practical").checked;
+export const shownUnit = (unit) => (isPractical() && instead[unit]) || [unit, 1];
+
+// A moment as people read it: the time, and the day where that is not today.
+export function clock(seconds) {
+  const at = new Date(1000 * seconds);
+  const time = at.toLocaleTimeString([], { hour12: false });
+  return at.toDateString() === new Date().toDateString() ? time : `${at.toLocaleDateString([], { day: "numeric", month: "short" })} ${time}`;
+}
+
+// Since when something is so; `seen`: whether it was seen to begin.
+export const since = (seconds, seen) => `${seen ? "since" : "at least since"} ${clock(seconds)}`;
 
 // The events of a stream, as they come.
 export async function* events(body) {

@@ -1,7 +1,7 @@
 // The page of colours: a picture, the mask of a range, and the range. The next picture is asked for
 // when the last one was shown. A page that is not looked at, as in a hidden tab, asks for none.
 
-import { $, askToken, atGate, headers, make, setText } from "./base.js";
+import { $, askToken, atGate, call, make, Refused, setText } from "./base.js";
 
 const CHANNELS = [["hue", 179], ["saturation", 255], ["value", 255]];
 const OLD_S = 2;
@@ -12,21 +12,6 @@ let range = null; // what the sliders say
 let shown = null; // what is on the page: sequence, size, range, age when it was sent, and when it came
 let ended = false; // whether the source gives nothing more
 let told = null; // why no picture comes
-
-class Refused extends Error {
-  constructor(status, answer) {
-    super(answer.came ?? `HTTP ${status}`);
-    this.status = status;
-    this.answer = answer;
-  }
-}
-
-async function call(path, body) {
-  const more = body ? { "Content-Type": "application/json" } : {};
-  const response = await fetch(path, { method: body ? "POST" : "GET", headers: { ...headers(), ...more }, cache: "no-store", body: body && JSON.stringify(body) });
-  if (response.ok) return response;
-  throw new Refused(response.status, await response.json());
-}
 
 // ---------------------------------------------------------------------- pictures
 

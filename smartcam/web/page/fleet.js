@@ -1,6 +1,6 @@
 // The fleet's page: a table of which only the rows in sight are in the document, and cross the wire.
 
-import { $, askToken, atGate, headers, live, make, setText, token } from "./base.js";
+import { $, askToken, atGate, headers, live, make, setText, takeUnits, token } from "./base.js";
 import { drawChart, drawLegend } from "./fleet_chart.js";
 import { Row } from "./fleet_row.js";
 
@@ -9,7 +9,7 @@ const SILENT_MS = 12000; // the server says every five seconds that nothing has 
 const MAX_ROWS = 120; // that the server tells at a time
 const AHEAD = 12; // rows above and below those on the screen
 
-const FILTERS = { all: "All", connected: "Connected", errors: "Errors", busy: "Busy", stopped: "Stopped" };
+const FILTERS = { all: "All", connected: "Connected", errors: "In trouble", busy: "Busy", stopped: "Stopped" };
 const COLUMNS = [
   ["", "Last", false],
   ["name", "Camera", false],
@@ -18,10 +18,11 @@ const COLUMNS = [
   ["rate", "Per second", true],
   ["", "Results", true],
   ["errors", "Errors", true],
+  ["", "Last ten hours", false],
 ];
 const SORTS = { name: "name", state: "state, worst first", rate: "rate", last: "last result", errors: "errors" };
 const DOWN = new Set(["rate", "last", "errors"]); // the most first
-const TOTALS = { cameras: "cameras", connected: "connected", rate: "results/s", failures: "errors" };
+const TOTALS = { cameras: "cameras", connected: "connected", rate: "results/s", failures: "errors so far" };
 
 let socket = null;
 let wanted = { search: "", filter: "all", sort: "name", down: false }; // which rows, in which order
@@ -121,6 +122,9 @@ function take(news) {
   if (news.now) offset = Date.now() / 1000 - news.now;
   if (news.fleet !== undefined) {
     outlines = news.outlines;
+    takeUnits(news.units, () => {
+      for (const [name, row] of shown) if (fields.has(name)) row.show(fields.get(name), outlines, now());
+    });
     setText("name", news.fleet);
   }
   if (news.totals) showTotals(news.totals);

@@ -4,7 +4,7 @@ import { draw } from "./base.js";
 
 const SECONDS = 600;
 const BAR = 5;
-const KINDS = [["passed", "passed"], ["other", "tell neither"], ["failed", "failed"], ["errors", "errors"]];
+const KINDS = [["passed", "passed"], ["other", "no verdict"], ["failed", "failed"], ["errors", "errors"]];
 const PLACES = { passed: 1, failed: 2, other: 3, errors: 4 }; // in a bar, behind its time
 
 // What failed is hatched, errors have dots: they can be told apart without colours.

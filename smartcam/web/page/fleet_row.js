@@ -1,6 +1,6 @@
 // A row of the fleet's page: one camera.
 
-import { draw, make } from "./base.js";
+import { clock, draw, isPractical, make, since } from "./base.js";
 
 const MODES = { // what is said of a camera, with a sign that tells it without colours
   running: ["●", "running", "good"],
@@ -15,6 +15,7 @@ const MODES = { // what is said of a camera, with a sign that tells it without c
 const OUTCOMES = { passed: "✓ pass", failed: "✗ fail" };
 const SIGNS = { passed: "✓", failed: "✗" };
 const [WIDTH, HEIGHT, EDGE] = [82, 46, 4]; // pixels of a picture
+const [SLOTS, SLOT_S, SLOT, HIGH] = [20, 1800, 5, 26]; // places of the trend, seconds and pixels of one
 
 let count = 0;
 
@@ -36,8 +37,10 @@ export class Row {
     this.rate = cell("number rate");
     this.count = cell("number count");
     this.errors = cell("number errors-count");
+    this.trend = cell("trend");
+    this.failing = null; // since when, and how often
     this.element = make("div", { className: "camera", role: "row", id: `camera-${count}`, "data-camera": name },
-      this.picture, cell("called", this.link, this.agents), cell("state", this.mode, this.reason), cell("last", this.said, this.when), this.rate, this.count, this.errors);
+      this.picture, cell("called", this.link, this.agents), cell("state", this.mode, this.reason), cell("last", this.said, this.when), this.rate, this.count, this.errors, this.trend);
     this.element.addEventListener("click", (event) => event.target !== this.link && this.open());
   }
 
@@ -61,15 +64,18 @@ export class Row {
     Object.assign(this.element.dataset, { mode: one.mode, tone });
     text(this.agents, one.agents.join(", "));
     text(this.mode, `${sign} ${word}`);
-    const application = one.application === null ? "" : `application ${one.application}`;
-    text(this.reason, one.reason || application);
-    this.reason.title = one.reason;
+    const application = one.application === null ? "" : one.application < 0 ? "application without an id" : `application ${one.application}`;
+    const when = tone === "bad" && one.mode !== "error" ? since(one.changed_at, one.changed_seen) : "";
+    text(this.reason, [when, one.reason || (when ? "" : application)].filter(Boolean).join(": "));
+    this.reason.title = this.reason.textContent;
     text(this.rate, one.rate ? `${one.rate.toLocaleString("en")}/s` : "");
     text(this.count, one.count.toLocaleString("en"));
     text(this.errors, one.errors ? one.errors.toLocaleString("en") : "");
     this.errors.classList.toggle("wrong", one.errors > 0);
     if (one.last && one.last.at !== this.last?.at) this.picture.replaceChildren(picture(one.last, outlines));
+    this.trend.replaceChildren(trend(one, now));
     this.last = one.last;
+    this.failing = one.failed_since ? `fails since ${clock(one.failed_since)}, ${one.in_a_row.toLocaleString("en")} in a row · ` : "";
     this.said.className = one.last ? `said-${one.last.outcome}` : "";
     text(this.said, one.last ? says(one.last) : "");
     this.said.title = this.said.textContent;
@@ -77,15 +83,33 @@ export class Row {
   }
 
   age(now) {
-    if (this.last) text(this.when, ago(Math.max(0, now - this.last.at)));
+    if (this.last) text(this.when, `${this.failing}${ago(Math.max(0, now - this.last.at))}`);
   }
 }
 
 function says(last) {
   const outcome = OUTCOMES[last.outcome] ? `${OUTCOMES[last.outcome]} · ` : "";
-  if (last.parts === undefined) return outcome + last.text;
+  if (last.parts === undefined) return outcome + ((isPractical() && last.practical) || last.text);
   if (!last.parts_count) return "no part";
   return `${last.parts_count} ${last.parts_count === 1 ? "part" : "parts"}: ${last.parts.slice(0, 3).map(([name]) => name).join(", ")}${last.parts_count > 3 ? " …" : ""}`;
+}
+
+// The outcomes of ten hours, half an hour each: how many of those with a verdict were bad.
+function trend({ shift, trend: { end, places } }, now) {
+  const counts = shift.map((count, index) => `${count.toLocaleString("en")} ${["passed", "failed", "without a verdict", "errors"][index]}`);
+  const svg = draw("svg", { viewBox: `0 0 ${SLOTS * SLOT} ${HIGH}`, role: "img", "aria-label": `Last ten hours: ${counts.join(", ")}` }, draw("title", {}, counts.join(", ")));
+  svg.append(draw("line", { class: "rule", x1: 0, x2: SLOTS * SLOT, y1: HIGH - 0.5, y2: HIGH - 0.5 }));
+  const late = Math.max(0, Math.ceil((now - end) / SLOT_S)); // places that have gone by since
+  [...places].forEach((place, index) => {
+    const x = (SLOTS - late - places.length + index) * SLOT;
+    if (place === " " || x < 0) return;
+    const bar = (kind, y, high) => high > 0 && svg.append(draw("rect", { class: kind, x, y, width: SLOT - 1, height: high }));
+    if (place === "-") return bar("other", HIGH / 2, HIGH / 2);
+    const bad = ((place === "X" ? 10 : Number(place)) / 10) * HIGH;
+    bar("passed", bad, HIGH - bad);
+    bar("failed", 0, bad);
+  });
+  return svg;
 }
 
 function ago(seconds) {

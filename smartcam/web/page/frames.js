@@ -1,6 +1,7 @@
 // The page of frames: the sources side by side, or one of them enlarged.
 
 import { $, askToken, atGate, headers, live, setText } from "./base.js";
+import { Features } from "./features.js";
 import { Source } from "./pictures.js";
 
 let sources = [];
@@ -34,6 +35,7 @@ function arrange(told) {
     for (const one of sources) one.end();
     sources = told.map(({ place, name }) => new Source({ name, place, path: `/api/sources/${place}/pictures`, lost: look }));
     for (const one of sources) one.view.addEventListener("click", () => enlarge($("main").dataset.large ? null : one));
+    sources.forEach((one, place) => told[place].features && one.panel.append(new Features(`/api/sources/${place}`).panel));
     $("main").replaceChildren(...sources.map((one) => one.panel));
     enlarge(null);
   }

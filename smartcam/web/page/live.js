@@ -1,6 +1,6 @@
 // The live page: shows what a camera sends. Everything it does is one of the HTTP calls of GET /api.
 
-import { $, BITS, SILENT_MS, askToken, atGate, draw, events, headers, live, make, setText } from "./base.js";
+import { $, BITS, SILENT_MS, askToken, atGate, clock, draw, events, headers, live, make, setText, shownUnit, since, takeUnits } from "./base.js";
 import { Source } from "./pictures.js";
 
 const MAX_ROWS = 100; // results in the document
@@ -84,7 +84,7 @@ async function listen() {
   }
 }
 
-const TAKE = { camera: takeState, results: takeResults, account: showAccount, picture: takePicture, clock: takeClock };
+const TAKE = { camera: takeState, results: takeResults, account: showAccount, picture: takePicture, clock: takeClock, history: takeHistory };
 
 // ---------------------------------------------------------------------- how it is
 
@@ -95,7 +95,6 @@ const CONNECTIONS = {
   taken: ["rebooting", "taken by another client"],
   ended: ["rebooting", "given up"],
 };
-const clock = (seconds) => new Date(1000 * seconds).toLocaleTimeString([], { hour12: false });
 
 function takeState(value) {
   state = value;
@@ -113,11 +112,12 @@ function takeState(value) {
   $("status").replaceChildren(...rows);
   const can = state.can ?? {};
   const facts = {
-    Application: state.application ?? "not known yet",
+    Application: state.application < 0 ? "without an id" : (state.application ?? "not known yet"),
     Speaks: can.dialect ?? "not known yet",
-    [state.connection === "connected" ? "Connected since" : "Not connected since"]: clock(state.changed_at),
+    [state.connection === "connected" ? "Connected" : "Not connected"]: since(state.changed_at, state.changed_seen),
   };
   $("facts").replaceChildren(...list(facts));
+  takeUnits(state.units, showUnits);
   showControls(can);
   takeFrames();
   $("image-panel").hidden = !can.read_image;
@@ -131,8 +131,9 @@ function showControls(can) {
   const ready = state.connection === "connected";
   $("control").hidden = !state.control;
   for (const [id, able] of [["trigger", true], ["start", can.start_stop], ["stop", can.start_stop]]) $(id).disabled = !(ready && able);
+  $("take-back").hidden = !(FLEETS && state.connection === "taken");
   for (const one of $("switch").querySelectorAll("input, button")) one.disabled = !(ready && can.switch);
-  if (document.activeElement !== $("application")) $("application").placeholder = state.application ?? "";
+  if (document.activeElement !== $("application")) $("application").placeholder = state.application < 0 ? "" : (state.application ?? "");
   const mute = can.unasked_results === false && !state.control ? " This camera sends no results by itself." : "";
   setText("looking", `Looking only: --control lets this page trigger and switch.${mute}`);
   $("looking").hidden = state.control;
@@ -141,6 +142,7 @@ function showControls(can) {
 $("trigger").addEventListener("click", () => act("", `${API}/trigger`, {}));
 $("start").addEventListener("click", () => act("It runs.", `${API}/start`));
 $("stop").addEventListener("click", () => act("It has stopped.", `${API}/stop`));
+$("take-back").addEventListener("click", () => act("The agent has it back.", `${API}/take_back`));
 $("switch").addEventListener("submit", (event) => {
   event.preventDefault();
   act("Loaded.", `${API}/switch`, { application: $("application").valueAsNumber });
@@ -152,14 +154,14 @@ function showAlarm() {
   if (unknown) text = `${unknown} It is asked for again.`;
   else if (!reached) text = `This page's server does not answer: ${SERVED} has ended, or the network is gone. What is shown is of before.`;
   else if (state && state.connection !== "connected") {
-    const since = clock(state.changed_at);
+    const when = since(state.changed_at, state.changed_seen);
     const why = state.loss ? ` (${state.loss})` : "";
-    const tried = state.last_error && !state.loss.includes(state.last_error) ? ` Last try: ${state.last_error}` : "";
+    const tried = state.last_error && !state.loss.includes(state.last_error) ? ` Last try: ${state.last_error.replace(/\.?$/, ".")}` : "";
     text = {
       awaited: state.loss ? `The camera is not reached yet; it is tried again. ${state.loss}` : "The camera is being connected.",
-      lost: `The camera is lost since ${since}${why}; it is tried again.${tried} What is shown is of before.`,
-      taken: `Another client has taken the camera, at ${since}. ${FLEETS ? "Its agent can take it back." : "Start smartcam live again to take it back."}`,
-      ended: `The camera is given up, at ${since}${why}.${FLEETS ? "" : " Start smartcam live again."}`,
+      lost: `The camera is lost ${when}${why}; it is tried again.${tried} What is shown is of before.`,
+      taken: `Another client has the camera ${when}. ${FLEETS ? "Its agent tries again now and then; Take back does it now." : "Start smartcam live again to take it back."}`,
+      ended: `The camera is given up ${when}${why}.${FLEETS ? "" : " Start smartcam live again."}`,
     }[state.connection];
   }
   if ($("gate").hidden) $("alarm").hidden = !text;
@@ -199,14 +201,26 @@ function takeResults(value) {
 
 const number = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5))));
 
-function short(value) {
+const scaled = (value, unit) => (typeof value === "number" && typeof unit === "string" ? value * shownUnit(unit)[1] : value);
+
+// `units`: the value's own unit, or those of its fields by their names.
+function short(value, units = {}) {
   if (value === null || value === undefined) return "none";
-  if (Array.isArray(value)) return `${value.length} records${value.length ? ": " : ""}${value.slice(0, 3).map(short).join(" | ")}${value.length > 3 ? " …" : ""}`;
-  if (typeof value === "object") return Object.entries(value).map(([key, one]) => `${key} ${short(one)}`).join(", ");
-  return typeof value === "number" ? number(value) : String(value);
+  if (value === "") return '""';
+  if (Array.isArray(value)) return `${value.length} records${value.length ? ": " : ""}${value.slice(0, 3).map((one) => short(one, units)).join(" | ")}${value.length > 3 ? " …" : ""}`;
+  if (typeof value === "object") return Object.entries(value).map(([key, one]) => `${key} ${short(one, units[key])}`).join(", ");
+  if (typeof value !== "number") return String(value);
+  return typeof units === "string" ? `${number(scaled(value, units))} ${shownUnit(units)[0]}` : number(value);
+}
+
+function showUnits() {
+  $("rows").replaceChildren(...results.map(makeRow));
+  showLast();
 }
 
 const WORDS = { pass: "PASS", fail: "FAIL" };
+// a badge says PASS or FAIL first, and then of what
+const badge = (one) => (one.verdict ? [make("b", { textContent: WORDS[one.verdict] }), ` ${one.name}: ${one.of === 1 ? (one.true ? "true" : "false") : `${one.true} of ${one.of} true`}`] : [one.name, make("b", { textContent: word(one) })]);
 const word = ({ true: count, of, verdict }) => (of === 1 ? (WORDS[verdict] ?? (count ? "true" : "false")) : `${verdict ? `${WORDS[verdict]} ` : ""}${count} of ${of} true`);
 const mm = (metres) => (metres === null ? "?" : (metres * MM).toFixed(1));
 const degrees = (theta) => (theta === null ? "?" : `${((theta * 180) / Math.PI).toFixed(1)}°`);
@@ -215,15 +229,16 @@ function says(one) {
   if (one.error !== undefined) return `not readable: ${one.error}`;
   if (one.parts) return one.count ? `${one.count} ${one.count === 1 ? "part" : "parts"}: ${one.parts.slice(0, 4).map((part) => `${part.name} ${mm(part.x)}, ${mm(part.y)} mm, ${degrees(part.theta)}`).join(" | ")}${one.count > 4 ? " …" : ""}` : "no part";
   if (one.cut !== undefined) return `${one.cut} … (${one.size} bytes, too long for this page)`;
-  const text = short(one.value);
+  const text = short(one.value, one.units);
   return text.length > 300 ? `${text.slice(0, 300)} …` : text;
 }
 
 function makeRow(one) {
   const cells = one.error === undefined
-    ? [one.number, clock(one.received_at), one.latency === null ? "" : `${(one.latency * MM).toFixed(1)} ms`, one.application ?? ""]
+    ? [one.number, clock(one.received_at), one.latency === null ? "" : `${(one.latency * MM).toFixed(1)} ms`, one.application < 0 ? "" : (one.application ?? "")]
     : ["", "", "", ""];
-  const marks = (one.verdicts ?? []).filter((each) => each.verdict).map((each) => make("b", { "data-verdict": each.verdict, textContent: `${each.name} ${word(each)} ` }));
+  const judged = (one.verdicts ?? []).filter((each) => each.verdict);
+  const marks = judged.map((each) => make("b", { "data-verdict": each.verdict, className: "badge", textContent: judged.length > 1 ? `${WORDS[each.verdict]}: ${each.name}` : WORDS[each.verdict] }));
   return make("tr", { className: one.error === undefined ? "" : "marked", "data-serial": one.serial },
     ...cells.map((text, index) => make("td", { className: index ? "" : "time", textContent: String(text) })), make("td", {}, ...marks, says(one)));
 }
@@ -232,8 +247,9 @@ function showLast() {
   const last = results[0];
   if (!last) return;
   $("verdicts").replaceChildren(...(last.verdicts ?? []).map((one) =>
-    make("span", { "data-verdict": one.verdict ?? "", "data-name": one.name }, one.name, make("b", { textContent: word(one) }))));
+    make("span", { "data-verdict": one.verdict ?? "", "data-name": one.name }, ...badge(one))));
   $("last").replaceChildren(makeValue(last));
+  $("units").hidden = !results.some((one) => Object.keys(one.units ?? {}).length);
   if (results.some((one) => one.parts?.length)) {
     $("scene-panel").hidden = false;
     arrange();
@@ -245,16 +261,16 @@ function makeValue(one) {
   if (one.error !== undefined) return make("p", { className: "error", textContent: says(one) });
   if (one.parts) return makeTable(one.parts.slice(0, 20).map((part) => ({ part: part.name, "x, mm": mm(part.x), "y, mm": mm(part.y), ...(one.parts.some((each) => each.z) ? { "z, mm": mm(part.z) } : {}), θ: degrees(part.theta), quality: part.quality === null ? "" : part.quality.toFixed(3) })), one.count, "No part was found.");
   const { value } = one;
-  if (Array.isArray(value) && value.every((each) => each !== null && typeof each === "object" && !Array.isArray(each))) return makeTable(value.slice(0, 20), value.length, "No record.");
-  if (value !== null && typeof value === "object" && !Array.isArray(value)) return make("dl", {}, ...list(Object.fromEntries(Object.entries(value).map(([key, each]) => [key, short(each)]))));
+  if (Array.isArray(value) && value.every((each) => each !== null && typeof each === "object" && !Array.isArray(each))) return makeTable(value.slice(0, 20), value.length, "No record.", one.units);
+  if (value !== null && typeof value === "object" && !Array.isArray(value)) return make("dl", {}, ...list(Object.fromEntries(Object.entries(value).map(([key, each]) => [key, short(each, one.units[key])]))));
   return make("code", { textContent: says(one) });
 }
 
-function makeTable(rows, count, none) {
+function makeTable(rows, count, none, units = {}) {
   if (!count) return make("p", { textContent: none });
   const names = Object.keys(rows[0]);
-  const table = make("table", {}, make("thead", {}, make("tr", {}, ...names.map((name) => make("th", { scope: "col", textContent: name })))),
-    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...names.map((name) => make("td", { textContent: short(row[name]) }))))));
+  const table = make("table", {}, make("thead", {}, make("tr", {}, ...names.map((name) => make("th", { scope: "col", textContent: typeof units[name] === "string" ? `${name}, ${shownUnit(units[name])[0]}` : name })))),
+    make("tbody", {}, ...rows.map((row) => make("tr", {}, ...names.map((name) => make("td", { textContent: short(scaled(row[name], units[name]), typeof units[name] === "string" ? {} : units[name]) }))))));
   return make("div", {}, table, ...(count > rows.length ? [make("p", { className: "note", textContent: `and ${count - rows.length} more` })] : []));
 }
 
@@ -384,13 +400,7 @@ async function takePicture({ serial }) {
   try {
     while (newest && newest !== shown) {
       const wanted = newest;
-      const data = await (await ask(`${API}/picture`)).blob();
-      $("image").src = await new Promise((done, failed) => {
-        const reader = new FileReader();
-        reader.onload = () => done(reader.result);
-        reader.onerror = failed;
-        reader.readAsDataURL(data);
-      });
+      $("image").src = await pictureAt(`${API}/picture`);
       $("image").hidden = false;
       shown = wanted;
       setText("image-note", `Fetched at ${clock(Date.now() / 1000)}.`);
@@ -399,6 +409,17 @@ async function takePicture({ serial }) {
     setText("image-note", error.message);
   }
   fetching = false;
+}
+
+// The page may show data: but no blob:, which the server's policy forbids.
+async function pictureAt(path) {
+  const data = await (await ask(path)).blob();
+  return new Promise((done, failed) => {
+    const reader = new FileReader();
+    reader.onload = () => done(reader.result);
+    reader.onerror = failed;
+    reader.readAsDataURL(data);
+  });
 }
 
 $("fetch").addEventListener("click", () => act("", `${API}/picture`));
@@ -453,6 +474,65 @@ function plot(id, points) {
   const visible = points.map(at);
   drawn.push(draw("path", { d: visible.map(([x, y], index) => `${index && points[index][0] - points[index - 1][0] < 3 ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("") }));
   if (visible.length) drawn.push(draw("circle", { cx: visible.at(-1)[0], cy: visible.at(-1)[1], r: 2.5 }));
+  svg.replaceChildren(...drawn);
+}
+
+// ---------------------------------------------------------------------- the shift
+
+const KINDS = ["passed", "failed", "no verdict", "errors"]; // of a bar, behind its time
+const BAR_S = 300;
+const SHIFT_S = 36000; // seconds that the trend shows
+
+function takeHistory({ bars: told, failures, failed, failed_since: begin, in_a_row: row }) {
+  const bars = told.filter(([at]) => at > Date.now() / 1000 - offset - SHIFT_S);
+  setText("failed-since", begin ? `fails since ${clock(begin)}, ${row} in a row` : failed ? `${failed} failed; the last one that tells has passed` : bars.length ? "nothing has failed" : "");
+  $("failed-since").classList.toggle("bad", Boolean(begin));
+  drawTrend(bars);
+  const counts = KINDS.map((_, index) => bars.reduce((sum, bar) => sum + bar[index + 1], 0));
+  const totals = KINDS.map((kind, index) => `${counts[index]} ${counts[index] === 1 ? kind.replace(/errors$/, "error") : kind}`);
+  setText("trend-legend", bars.length ? totals.join(" · ") : "");
+  $("trend").setAttribute("aria-label", `Last ten hours: ${totals.join(", ")}`);
+  $("failures").hidden = !failures.length;
+  $("failures").querySelector("tbody").replaceChildren(...[...failures].reverse().map(failureRow));
+}
+
+function failureRow(one) {
+  const picture = one.picture ? [make("button", { type: "button", className: "quiet", textContent: "Show", onclick: () => showFailure(one) })] : [];
+  const what = one.count > 1 ? `${one.what} (${one.count.toLocaleString("en")} in a row, until ${clock(one.until)})` : one.what;
+  return make("tr", { "data-serial": one.serial }, ...[clock(one.at), one.number ?? "", what].map((text) => make("td", { textContent: String(text) })), make("td", {}, ...picture));
+}
+
+async function showFailure({ serial, at, what }) {
+  try {
+    $("failure").src = await pictureAt(`${API}/failures/${serial}`);
+    setText("failure-caption", `The picture of ${clock(at)}: ${what}`);
+    $("failure-box").hidden = false;
+  } catch (error) {
+    tell(error.message, true);
+  }
+}
+
+function drawTrend(bars) {
+  const svg = $("trend");
+  const { clientWidth: width, clientHeight: height } = svg;
+  if (!width || !bars.length) return;
+  svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
+  const end = Math.max(bars.at(-1)[0] + BAR_S, Date.now() / 1000 - offset);
+  const span = Math.max(3600, Math.min(SHIFT_S, end - bars[0][0]));
+  const most = Math.max(1, ...bars.map((bar) => bar.slice(1).reduce((sum, one) => sum + one, 0)));
+  const [left, top, low] = [34, 8, height - 16];
+  const x = (at) => left + (1 + (at - end) / span) * (width - left - 4);
+  const drawn = [draw("text", { x: left - 4, y: top + 6, "text-anchor": "end" }, number(most)), draw("line", { class: "rule", x1: left, x2: width, y1: low, y2: low })];
+  for (const [at, anchor] of [[end - span, "start"], [end, "end"]]) drawn.push(draw("text", { x: x(at), y: height - 3, "text-anchor": anchor }, clock(at).slice(0, -3)));
+  for (const [at, passed, failed, other, errors] of bars.filter((bar) => bar[0] >= end - span)) {
+    let y = low;
+    for (const [kind, many] of [["passed", passed], ["other", other], ["failed", failed], ["errors", errors]]) {
+      if (!many) continue;
+      const high = Math.max(1, (many / most) * (low - top));
+      y -= high;
+      drawn.push(draw("rect", { class: `bar-${kind}`, x: x(at).toFixed(1), y: y.toFixed(1), width: Math.max(1, x(at + BAR_S) - x(at) - 0.6).toFixed(1), height: high.toFixed(1) }));
+    }
+  }
   svg.replaceChildren(...drawn);
 }
 

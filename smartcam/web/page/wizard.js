@@ -149,7 +149,8 @@ function show(next, given) {
   $("step").hidden = false;
   $("form").hidden = !asking;
   $("again").hidden = asking;
-  $("number").textContent = asking ? `Step ${view.number}` : "";
+  $("number").textContent = asking ? counted() : "";
+  showResumed(view.resumed);
   $("title").textContent = asking ? view.title : view.type === "result" ? "Done" : "Aborted";
   $("description").textContent = asking ? view.description
     : view.type === "abort" ? "What was measured stands in the journal." : "";
@@ -170,18 +171,35 @@ function show(next, given) {
   if (moved) ($("inputs").querySelector("input") ?? $("title")).focus();
 }
 
+const counted = () => `Step ${view.number}${view.of ? ` of about ${view.of}` : ""}`;
+
+// what was answered before it was broken off: marks may have been moved since
+function showResumed(resumed) {
+  $("resumed").hidden = !resumed;
+  if (!resumed) return;
+  const at = (moment) => moment ? new Date(moment).toLocaleString() : "an unknown time";
+  $("since").textContent = `Broken off: begun ${at(resumed.since)}, answered last ${at(resumed.last)}. ` +
+    "Go on below, or begin anew if camera, marks or sheet may have been moved since.";
+  $("done").replaceChildren(...resumed.done.map(({ step, answers }) => {
+    const said = Object.entries(answers).filter(([, value]) => value !== null && value !== "");
+    const item = document.createElement("li");
+    item.textContent = `${step}: ${said.map(([name, value]) => `${name} ${value}`).join(", ") || "done"}`;
+    return item;
+  }));
+}
+
 async function act(path, body, given) {
   const buttons = ["go", "undo", "repeat"].map($);
   for (const button of buttons) button.disabled = true;
   $("base").textContent = "";
-  $("number").textContent = `Step ${view.number}: under way ...`;
+  $("number").textContent = `${counted()}: under way ...`;
   $("waiting").textContent = path === "/step" ? view.waiting ?? "" : "";
   try {
     show(await call("POST", path, body), given);
   } catch (error) {
     if (error.status === 409) await current();
     $("base").textContent = error.message;
-    $("number").textContent = `Step ${view.number}`;
+    $("number").textContent = counted();
   } finally {
     $("waiting").textContent = "";
     for (const button of buttons) button.disabled = false;
@@ -430,6 +448,15 @@ $("form").addEventListener("submit", (event) => {
 for (const what of ["undo", "repeat", "abort"]) {
   $(what).addEventListener("click", () => act(`/${what}`, { token: view.token }));
 }
+$("anew").addEventListener("click", async () => {
+  try {
+    const name = $("under").textContent;
+    const { parameters } = view.resumed;
+    show(await call("POST", "/start", { name, wizard: view.wizard, parameters, fresh: true }));
+  } catch (error) {
+    $("base").textContent = error.message;
+  }
+});
 $("again").addEventListener("click", async () => start(await call("GET", "/calibrations")));
 $("start-form").addEventListener("submit", async (event) => {
   event.preventDefault();

@@ -1,0 +1,76 @@
+"""Fetch the pictures of a fleet's failures, whether anybody looks or not."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+from typing import TYPE_CHECKING, Final
+
+from smartcam.exceptions import SmartCamError
+
+if TYPE_CHECKING:
+    from smartcam.web._fleet_rows import FleetRow
+    from smartcam.web._fleet_view import FleetView
+
+PERIOD: Final = 0.2
+"""Seconds between two looks at the rows that fail."""
+
+CAMERA_PERIOD: Final = 10.0
+"""Seconds between two pictures of one camera, at least."""
+
+SETTLING: Final = 0.2
+"""Seconds in which a newer result would arrive that the camera had when it sent the picture."""
+
+MAX_BYTES: Final = 1 << 28
+"""Bytes that the pictures of all cameras may have together."""
+
+MAX_PICTURES: Final = 10_000
+"""Pictures of all cameras that are kept."""
+
+
+class FailurePictures:
+    """Asks failing cameras for their pictures, one after the other.
+
+    A picture is kept only where no newer result has come when it is there: else it would show
+    another part.
+
+    Args:
+        view: view of the fleet, which says who fails.
+    """
+
+    def __init__(self, view: FleetView) -> None:
+        self._view = view
+        self._kept: collections.deque[tuple[FleetRow, int, int]] = collections.deque()
+        self._bytes = 0
+
+    async def run(self) -> None:
+        """Fetch pictures until it is cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(PERIOD)
+            for row in list(self._view.failing):
+                if loop.time() - row.picture_at < CAMERA_PERIOD:
+                    continue
+                self._view.failing.pop(row, None)
+                if row.failure and row.history.wants_picture:
+                    row.picture_at = loop.time()
+                    await self._fetch(row, row.failure)
+
+    async def _fetch(self, row: FleetRow, serial: int) -> None:
+        camera = row.camera
+        try:
+            if camera is None or not camera.connected or not camera.capabilities.read_image:
+                return
+            data = await camera.read_image()
+        except SmartCamError:
+            return  # the live page says what is wrong with the camera
+        await asyncio.sleep(SETTLING)
+        if row.failure != serial:
+            return
+        row.history.attach(serial, data)
+        self._kept.append((row, serial, len(data)))
+        self._bytes += len(data)
+        while self._bytes > MAX_BYTES or len(self._kept) > MAX_PICTURES:
+            oldest, number, size = self._kept.popleft()
+            oldest.history.drop_picture(number)
+            self._bytes -= size

@@ -1,0 +1,224 @@
+"""Keep the outcomes of a camera's results over a shift: a trend, and the last failures."""
+
+from __future__ import annotations
+
+import collections
+import time
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from smartcam.web._verdicts import failing, judged
+
+if TYPE_CHECKING:
+    from smartcam.models import Result
+    from smartcam.web._verdicts import Outcome
+
+SHIFT_SECONDS: Final = 36_000
+"""Seconds for which outcomes are kept."""
+
+BAR_SECONDS: Final = 300
+"""Seconds of results that a bar of the trend has."""
+
+MAX_BARS: Final = SHIFT_SECONDS // BAR_SECONDS
+"""Bars that are kept at most."""
+
+SLOT_SECONDS: Final = 1800
+"""Seconds of results that a place of the short trend has."""
+
+MAX_FAILURES: Final = 50
+"""Failures that are kept; equal ones in a row are one."""
+
+MAX_PICTURES: Final = 12
+"""Pictures of failures that are kept."""
+
+MAX_PICTURE_BYTES: Final = 1 << 25
+"""Bytes that the pictures of failures may have together."""
+
+MAX_TEXT: Final = 300
+"""Characters that say what failed."""
+
+KINDS: Final = ("passed", "failed", "other", "errors")
+"""Outcomes of a result, in the order of a bar's numbers."""
+
+
+@dataclass(slots=True)
+class Failure:
+    """Results in a row that failed alike, or could not be read, or the loss of a connection.
+
+    Attributes:
+        serial: number of the failure, from 1.
+        at: time of the first one, seconds since 1970.
+        until: time of the last one.
+        number: number of the first result; None where there is no result.
+        what: what failed, in words.
+        count: how many there were.
+    """
+
+    serial: int
+    at: float
+    until: float
+    number: int | None
+    what: str
+    count: int = 1
+
+
+class ShiftHistory:
+    """Outcomes and failures of one camera, bounded.
+
+    Attributes:
+        version: number of changes.
+        failed_since: when the first failure after the last pass came, seconds since 1970; None
+            where the last one that tells has passed.
+        in_a_row: number of results that failed since then.
+        totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
+    """
+
+    def __init__(self) -> None:
+        self.version: int = 0
+        self.failed_since: float | None = None
+        self.in_a_row: int = 0
+        self.totals: list[int] = [0, 0, 0, 0]
+        self._bars: collections.deque[list[int]] = collections.deque()
+        self._failures: collections.deque[Failure] = collections.deque(maxlen=MAX_FAILURES)
+        self._pictures: collections.OrderedDict[int, bytes] = collections.OrderedDict()
+        self._serial = 0  # of the last failure
+        self._newest = 0  # serial of the failure that the newest result is, 0 where it is none
+        self._failed = 0
+        self._passed = False  # since the last failure
+
+    def add(self, result: Result[Any]) -> Outcome:
+        """Count a result; return how it turned out."""
+        outcome = judged(result.value)
+        at = result.received_at.timestamp()
+        self._count_up(outcome, at)
+        self._newest = 0
+        if outcome == "failed":
+            self._fail(at, result.number, failing(result.value))
+        elif outcome == "passed":
+            self.failed_since, self.in_a_row, self._passed = None, 0, True
+        return outcome
+
+    def add_error(self, text: str) -> None:
+        """Count a container that could not be read."""
+        at = time.time()
+        self._count_up("errors", at)
+        self._fail(at, None, f"not readable: {text}")
+
+    def add_missed(self, count: int, text: str) -> None:
+        """Count results that did not come; ``text`` says so."""
+        at = time.time()
+        self._count_up("errors", at, count)
+        self._newest = 0
+        self._tell(at, None, text)
+
+    def add_loss(self, reason: str) -> None:
+        """Note that the connection was lost."""
+        self._newest = 0
+        self._tell(time.time(), None, f"connection lost: {reason}")
+
+    def _count_up(self, outcome: Outcome, at: float, count: int = 1) -> None:
+        self.version += 1
+        begin = int(at // BAR_SECONDS * BAR_SECONDS)
+        if not self._bars or self._bars[-1][0] < begin:
+            self._bars.append([begin, 0, 0, 0, 0])
+            while self._bars[0][0] <= begin - SHIFT_SECONDS:
+                for index, old in enumerate(self._bars.popleft()[1:]):
+                    self.totals[index] -= old
+        self._bars[-1][1 + KINDS.index(outcome)] += count
+        self.totals[KINDS.index(outcome)] += count
+
+    def _fail(self, at: float, number: int | None, what: str) -> None:
+        self._failed += 1
+        self.in_a_row += 1
+        if self.failed_since is None:
+            self.failed_since = at
+        self._tell(at, number, what)
+        self._newest = self._serial
+
+    def _tell(self, at: float, number: int | None, what: str) -> None:
+        self.version += 1
+        last = self._failures[-1] if self._failures else None
+        if last is not None and last.what == what[:MAX_TEXT] and not self._passed:
+            last.count += 1
+            last.until = at
+            return
+        self._passed = False
+        self._serial += 1
+        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT]))
+
+    # ------------------------------------------------------------------ pictures
+
+    @property
+    def wants_picture(self) -> bool:
+        """True if the newest result is a failure that has no picture yet."""
+        return self._newest > 0 and self._newest not in self._pictures
+
+    def attach(self, serial: int, picture: bytes) -> None:
+        """Keep the first picture of a failure; the oldest failures' make room."""
+        if not serial or serial in self._pictures or len(picture) > MAX_PICTURE_BYTES:
+            return
+        self._pictures[serial] = picture
+        while (
+            len(self._pictures) > MAX_PICTURES
+            or sum(map(len, self._pictures.values())) > MAX_PICTURE_BYTES
+        ):
+            self._pictures.popitem(last=False)
+        self.version += 1
+
+    def drop_picture(self, serial: int) -> None:
+        """Keep the picture of a failure no more."""
+        if self._pictures.pop(serial, None) is not None:
+            self.version += 1
+
+    @property
+    def last_failure(self) -> int:
+        """Number of the failure that the newest result is; 0 where that is none."""
+        return self._newest
+
+    def picture(self, serial: int) -> bytes | None:
+        """Return the picture of a failure, None where none is kept."""
+        return self._pictures.get(serial)
+
+    # ------------------------------------------------------------------ for the page
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as the page takes it: bars, and the failures, the oldest first."""
+        failures = [
+            {**asdict(one), "picture": one.serial in self._pictures} for one in self._failures
+        ]
+        return {
+            "bars": [*self._bars],
+            "failures": failures,
+            "failed": self._failed,
+            "failed_since": self.failed_since,
+            "in_a_row": self.in_a_row,
+        }
+
+    def trend(self) -> dict[str, Any]:
+        """Return the short trend, for a row of a table.
+
+        ``end`` is the end of its last place, seconds since 1970. Each place has
+        :data:`SLOT_SECONDS`, and is a character: how many of ten results with a verdict were bad,
+        rounded up (X: all); ``-`` where none had a verdict, a space where none came.
+        """
+        if not self._bars:
+            return {"end": 0, "places": ""}
+        last = self._bars[-1][0] // SLOT_SECONDS
+        count = SHIFT_SECONDS // SLOT_SECONDS
+        slots = [[0, 0, 0, 0] for _ in range(count)]
+        for at, *outcomes in self._bars:
+            place = at // SLOT_SECONDS - last + count - 1
+            if place >= 0:
+                slots[place] = [
+                    one + more for one, more in zip(slots[place], outcomes, strict=True)
+                ]
+        return {"end": (last + 1) * SLOT_SECONDS, "places": "".join(map(_place, slots)).lstrip(" ")}
+
+
+def _place(outcomes: list[int]) -> str:
+    """Return the character of a place of the short trend."""
+    passed, failed, other, errors = outcomes
+    bad, told = failed + errors, passed + failed + errors
+    if told:
+        return "0123456789X"[-(-10 * bad // told)]
+    return "-" if other else " "

@@ -1,0 +1,33 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.web._clouds import Up
+    from smartcam.web._guard import new_token
+    from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
+    from smartcam.web._verdicts import meaning
+
+__all__ = [
+    "Up",
+    "encoded",
+    "is_whole_jpeg",
+    "meaning",
+    "new_token",
+    "picture",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_clouds": "Up",
+            "_guard": "new_token",
+            "_jpeg": "encoded is_whole_jpeg picture",
+            "_verdicts": "meaning",
+        },
+    )

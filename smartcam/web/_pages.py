@@ -1,0 +1,63 @@
+"""The pages of the sites: each is put together of what all have in common and of its own file."""
+
+from __future__ import annotations
+
+import importlib.resources
+from string import Template
+from typing import Final, NamedTuple
+
+
+class Page(NamedTuple):
+    """The contents of a page's head.
+
+    Attributes:
+        title: what the page shows.
+        printed: the command that prints the page's address, as HTML; empty for a page whose own
+            file has a top of its own.
+        styles: names of the style sheets in front of its own.
+        beside: what stands beside the title, as HTML.
+        does: what the page does by calls.
+    """
+
+    title: str
+    printed: str = ""
+    styles: tuple[str, ...] = ("base",)
+    beside: str = '<p id="name"></p>'
+    does: str = "does"
+
+
+PAGES: Final = {
+    "cloud": Page("cloud", "<code>smartcam depth show</code>"),
+    "colours": Page("colours", "<code>smartcam frames colours</code>"),
+    "emulator": Page(
+        "emulator",
+        "<code>smartcam-emulator</code>",
+        beside='<nav id="cameras" aria-label="Cameras"></nav>',
+    ),
+    "fleet": Page("fleet", "<code>smartcam fleet page</code>", does="shows"),
+    "frames": Page("frames", "<code>smartcam frames</code>", ("base", "pictures")),
+    "live": Page(
+        "live",
+        '<code id="gate-served">smartcam live</code>',
+        ("base", "pictures"),
+        '<a id="back" href="/" hidden>All cameras</a>\n    <p id="name"></p>',
+    ),
+    "teach": Page("teach", "<code>smartcam teach</code>"),
+    "wizard": Page("calibration", styles=()),
+}
+"""The pages, by the name of their files."""
+
+
+def read_file(name: str) -> bytes:
+    """Return one of the files that pages are made of."""
+    return importlib.resources.files("smartcam.web").joinpath("page", name).read_bytes()
+
+
+def page_html(name: str) -> str:
+    """Return a page: head and top are the same for all, what follows is its own."""
+    page = PAGES[name]
+    sheets = [f'  <link rel="stylesheet" href="/{one}.css">' for one in (*page.styles, name)]
+    own = page._asdict() | {"styles": "\n".join(sheets), "script": name}
+    parts = ("head.html", "top.html") if page.printed else ("head.html",)
+    common = [Template(read_file(part).decode()).substitute(own) for part in parts]
+    return "".join((*common, "\n" if page.printed else "", read_file(f"{name}.html").decode()))

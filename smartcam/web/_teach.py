@@ -1,0 +1,294 @@
+"""The site on which an application is taught: pictures, regions, tools, what they find at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from aiohttp import web
+from pydantic import Field
+
+from smartcam._extras import from_part, load
+from smartcam.exceptions import ConfigurationError, FrameSourceError, SmartCamError
+from smartcam.models import jsonable
+from smartcam.web._errors import RefusedError
+from smartcam.web._routes import CallBody, CallRequest, Calls
+from smartcam.web._site import API
+from smartcam.web._threaded_site import ThreadedSite
+
+with from_part("inspection", "teaching needs"):
+    from smartcam.inspection import Picture
+    from smartcam.inspection._inside import learned, read_settings, setting_text, tool_settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from smartcam.frames import FrameSource
+    from smartcam.inspection import Drawing, Inspection, Teaching
+
+MAX_PICTURES: Final = 200
+"""Pictures on the page; of a source the oldest one makes room."""
+
+MAX_TOOLS: Final = 32
+"""Tools that the page may try at once."""
+
+MAX_MARKS: Final = 400
+"""Marks of a picture that the page draws."""
+
+MAX_POINTS: Final = 200
+"""Points of a mark that the page draws."""
+
+SHOT_TIMEOUT: Final = 5.0
+"""Seconds that a picture of the camera is waited for."""
+
+T = TypeVar("T")
+
+
+class NamedPicture:
+    """A picture on the page.
+
+    Args:
+        name: name of the picture for people.
+        picture: pixels of the picture.
+    """
+
+    def __init__(self, name: str, picture: Picture) -> None:
+        self.name = name
+        self.picture = picture
+
+
+class TeachSite(ThreadedSite):
+    """A page that teaches an application of a software camera.
+
+    Args:
+        teaching: the application and its file.
+        files: files with pictures.
+        source: open source of the camera's frames, for pictures of now; None: files only.
+        host: address to listen on; nothing but this.
+        port: port to listen on, 0 for a free one.
+        token: what every call must carry in ``Authorization: Bearer``, as
+            :class:`~smartcam.web.LiveSite` has it.
+
+    Raises:
+        ConfigurationError: the token cannot be used, or there are too many files.
+        FrameFormatError: a file is no picture.
+
+    Attributes:
+        teaching: the application and its file.
+        pictures: pictures on the page, by their numbers.
+    """
+
+    def __init__(
+        self,
+        teaching: Teaching,
+        files: Iterable[str | Path] = (),
+        *,
+        source: FrameSource | None = None,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+    ) -> None:
+        super().__init__(CALLS, "teach", host=host, port=port, token=token)
+        self.teaching: Teaching = teaching
+        self.source: FrameSource | None = source
+        paths = [Path(one) for one in files]
+        if len(paths) > MAX_PICTURES:
+            raise ConfigurationError(f"teach: expected {MAX_PICTURES} pictures at most")
+        made = [NamedPicture(path.name, Picture.read(path)) for path in paths]
+        self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
+        self._number = len(made)
+        self._tried: dict[int, Inspection] = {}  # by picture, by the tools that were tried last
+
+    async def work(self, what: Callable[..., T], *args: object) -> T:
+        """Have the thread do something.
+
+        Raises:
+            RefusedError: it cannot be done, or the site is stopped.
+
+        Cancellation: safe; a thread that has begun goes on to the end.
+        """
+        try:
+            return await self.in_thread(what, *args)
+        except SmartCamError as exc:
+            raise RefusedError(422, str(exc), "tools that can work") from exc
+
+    async def shoot(self) -> int:
+        """Add the camera's next frame to the pictures; return its number.
+
+        Raises:
+            RefusedError: there is none.
+        """
+        if self.source is None:
+            raise RefusedError(409, "a picture of now", "a camera; these are files")
+        try:
+            frame = await self.source.newest(max_age=0.5, timeout=SHOT_TIMEOUT)
+        except FrameSourceError as exc:
+            raise RefusedError(409, str(exc), "a source that gives frames") from exc
+        picture = await self.work(Picture.of, frame)
+        self._number += 1
+        self.pictures[self._number] = NamedPicture(f"picture {self._number}", picture)
+        if len(self.pictures) > MAX_PICTURES:
+            del self.pictures[next(iter(self.pictures))]
+        return self._number
+
+    def picture(self, number: str) -> NamedPicture:
+        """Return a picture by its number.
+
+        Raises:
+            RefusedError: there is none.
+        """
+        found = self.pictures.get(int(number)) if number.isdecimal() else None
+        if found is None:
+            raise RefusedError(404, f"picture {number:.20}", "one of those that are listed")
+        return found
+
+    def try_tools(self, given: dict[str, dict[str, str]]) -> list[dict[str, Any]]:
+        """Return the verdicts and values of every picture; it belongs into a thread.
+
+        Raises:
+            ConfigurationError: a tool or setting is wrong.
+        """
+        program = self.teaching.program(read_settings(given))
+        found: list[dict[str, Any]] = []
+        tried: dict[int, Inspection] = {}
+        for number, one in list(self.pictures.items()):
+            try:
+                seen = tried[number] = program.inspect(one.picture)
+            except SmartCamError as exc:
+                found.append({"picture": number, "ok": False, "reason": str(exc), "marks": []})
+                continue
+            found.append(
+                {
+                    "picture": number,
+                    "ok": seen.ok,
+                    "reason": seen.reason,
+                    "values": jsonable(seen.value),
+                    "milliseconds": 1e3 * sum(seen.seconds.values()),
+                    "marks": _marks(seen),
+                }
+            )
+        self._tried = tried
+        return found
+
+    def learn(self, given: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
+        """Return the tools' settings, as texts, by which the good pictures are good.
+
+        Raises:
+            ConfigurationError: a tool or setting is wrong.
+        """
+        self.try_tools(given)
+        seen = [self._tried[number] for number in good if number in self._tried]
+        if not seen:
+            raise ConfigurationError("expected good pictures to learn from, got none")
+        return texts_of(learned(read_settings(given), seen))
+
+    def state(self) -> dict[str, Any]:
+        """Return the beginning of the page, as values for JSON."""
+        teaching = self.teaching
+        return {
+            "file": str(teaching.path),
+            "camera": teaching.camera,
+            "application": teaching.application,
+            "name": teaching.name,
+            "tools": texts_of(teaching.tools),
+            "kinds": tool_settings(),
+            "live": self.source is not None,
+            "pictures": [
+                {"number": number, "name": one.name, "size": one.picture.size}
+                for number, one in self.pictures.items()
+            ],
+        }
+
+
+def texts_of(tools: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
+    """Return the settings of tools as texts in YAML."""
+    return {
+        key: {name: setting_text(value) for name, value in settings.items()}
+        for key, settings in tools.items()
+    }
+
+
+def _marks(seen: Inspection) -> list[dict[str, Any]]:
+    """Return the marks of the tools, as values for JSON."""
+    drawn = [one for finding in seen.findings.values() for one in finding.drawings]
+    return [_mark(one) for one in drawn[:MAX_MARKS]]
+
+
+def _mark(one: Drawing) -> dict[str, Any]:
+    points = [[round(x, 2), round(y, 2)] for x, y in one.points[:MAX_POINTS]]
+    return {"kind": one.kind, "role": one.role, "text": one.text, "points": jsonable(points)}
+
+
+def _png(picture: Picture) -> bytes:
+    pixels = picture.rgb[:, :, ::-1] if picture.has_colours else picture.grey
+    cv2 = load("cv2", "inspection needs")
+    _, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return bytes(data)
+
+
+# ---------------------------------------------------------------------- what calls do
+
+CALLS: Calls[TeachSite] = Calls()
+"""All calls."""
+
+
+class ToolsBody(CallBody):
+    """Tools by their keys; each setting is a text in YAML."""
+
+    tools: dict[str, dict[str, str]] = Field(max_length=MAX_TOOLS)
+
+
+class LearnBody(ToolsBody):
+    """Tools, and the pictures of good parts to learn their tolerances from."""
+
+    good: list[int] = Field(max_length=MAX_PICTURES)
+
+
+_SAMPLE = '{"tools": {"present": {"region": "[10, 10, 80, 60]", "grey": "[0, 90]"}}}'
+
+
+@CALLS.add("GET", API)
+def _calls(_site: TeachSite, _call: CallRequest) -> object:
+    """List the calls of this page."""
+    return {"calls": CALLS.as_json()}
+
+
+@CALLS.add("GET", f"{API}/state")
+def _state(site: TeachSite, _call: CallRequest) -> object:
+    """The application as the file has it, the kinds of tools, and the pictures."""
+    return site.state()
+
+
+@CALLS.add("GET", f"{API}/pictures/{{number}}")
+async def _picture(site: TeachSite, call: CallRequest) -> web.Response:
+    """A picture, as a PNG."""
+    data = await site.work(_png, site.picture(call.path["number"]).picture)
+    return web.Response(body=data, content_type="image/png")
+
+
+@CALLS.add("POST", f"{API}/pictures")
+async def _shoot(site: TeachSite, _call: CallRequest) -> object:
+    """Take a picture with the camera now."""
+    return {"number": await site.shoot(), **site.state()}
+
+
+@CALLS.add("POST", f"{API}/try", body=ToolsBody, sample=_SAMPLE)
+async def _try(site: TeachSite, call: CallRequest) -> object:
+    """Verdicts and values of the tools for every picture."""
+    return {"found": await site.work(site.try_tools, call.body.tools)}
+
+
+@CALLS.add(
+    "POST", f"{API}/learn", body=LearnBody, sample=_SAMPLE.replace("}}}", '}}, "good": [1]}')
+)
+async def _learn(site: TeachSite, call: CallRequest) -> object:
+    """The tools with tolerances by which all of the good pictures are good."""
+    return {"tools": await site.work(site.learn, call.body.tools, call.body.good)}
+
+
+@CALLS.add("POST", f"{API}/save", body=ToolsBody, sample=_SAMPLE)
+async def _save(site: TeachSite, call: CallRequest) -> object:
+    """Write the tools into the file; its comments stay."""
+    settings = read_settings(call.body.tools)
+    await site.work(site.teaching.save, settings)
+    return {"saved": str(site.teaching.path)}

@@ -1,0 +1,82 @@
+"""Pass and fail: what the names of truth values tell of a result."""
+
+from __future__ import annotations
+
+import functools
+import re
+from typing import Any, Final, Literal, TypeAlias
+
+from smartcam.models import Localization, jsonable
+
+MAX_JUDGED: Final = 200
+"""Records of a result that are looked at for pass or fail."""
+
+Outcome: TypeAlias = Literal["passed", "failed", "other", "errors"]
+"""Outcome of a result; one that tells neither good nor bad is "other"."""
+
+
+def verdicts(value: Any) -> list[dict[str, Any]]:
+    """Return a value's truth values: ``name``, ``true``, ``of`` and ``verdict``.
+
+    Of a list of records: how many of them are true, and of how many.
+    """
+    rows: list[Any] = value if isinstance(value, list) else [value]
+    if not (rows and all(isinstance(one, dict) for one in rows)):
+        return []
+    names = [str(name) for name, one in rows[0].items() if isinstance(one, bool)]
+    return [_verdict(name, [one.get(name) is True for one in rows]) for name in names]
+
+
+def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
+    good = meaning(name)
+    verdict = None if good is None else "pass" if all(one is good for one in values) else "fail"
+    return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
+
+
+PASS_WORDS = frozenset({"ok", "pass", "passed", "good", "valid", "accept", "accepted", "io"})
+FAIL_WORDS = frozenset(
+    {"nok", "fail", "failed", "bad", "defect", "reject", "rejected", "error", "nio"}
+)
+NOT_WORDS = frozenset({"not", "no"})
+
+
+def meaning(name: str) -> bool | None:
+    """Return the good value of a truth field, judged by its name; None where that does not tell.
+
+    ``ok`` is good when true, ``defect`` and ``not_ok`` when false. ``present`` may be either.
+    """
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    known = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
+    return None if known != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)
+
+
+_meaning = functools.lru_cache(maxsize=4096)(meaning)
+
+
+def judged(value: Any) -> Outcome:
+    """Return the outcome of a result, judged by the names of its truth values."""
+    rows = value if isinstance(value, list) else [value]
+    verdict: Outcome = "other"
+    for row in rows[:MAX_JUDGED]:
+        if isinstance(row, Localization) or not hasattr(row, "_asdict"):
+            return "other"
+        for name, one in row._asdict().items():
+            if one is True or one is False:
+                good = _meaning(name)
+                if good is not None and one is not good:
+                    return "failed"
+                if good is not None:
+                    verdict = "passed"
+    return verdict
+
+
+def failing(value: Any) -> str:
+    """Return the truth values that are not as they should be, in words; "" where none is."""
+    bad = [one for one in verdicts(jsonable(value)) if one["verdict"] == "fail"]
+    texts = []
+    for one in bad:
+        wanted = "true" if meaning(one["name"]) else "false"
+        of = "" if one["of"] == 1 else f" in {one['true']} of {one['of']} records"
+        got = {"true": "false", "false": "true"}[wanted] if one["of"] == 1 else "true"
+        texts.append(f"{one['name']} is {got}{of}, expected {wanted}")
+    return "; ".join(texts)
