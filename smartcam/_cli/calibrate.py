@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.calibrate_files import OWN, OwnContext, WithFiles, compare, draw
+from smartcam._cli.calibrate_files import (
+    OWN,
+    WIZARDS,
+    OwnContext,
+    WithFiles,
+    WithParts,
+    compare,
+    draw,
+)
 from smartcam._cli.calibrate_lens import lens as calibrate_lens
 from smartcam._cli.calibrate_lens import read_target
 from smartcam._cli.calibrate_terminal import drive, listing_text
@@ -22,11 +30,10 @@ from smartcam.exceptions import CalibrationError, ConfigurationError, Unsupporte
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
-    from smartcam.calibration._files.directory import Folder
-    from smartcam.calibration._lens.model import CameraModel
-    from smartcam.calibration.wizards._sequence import Wizard
-    from smartcam.calibration.wizards._services import CalibrationService
+    from smartcam.calibration import Folder
+    from smartcam.calibration.wizards import CalibrationService, Wizard, WizardSession
     from smartcam.frames import FrameSource
+    from smartcam.geometry import CameraModel
     from smartcam.models import Localization
 
 ABORTED = 130
@@ -43,6 +50,8 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
 
 
 @click.command(
+    cls=WithParts,
+    hidden=True,
     help=f"{HELP}"
     "Asks step by step; an answer is on the disk before the next step is shown, so the same "
     "command goes on where it was broken off. Beside an answer, :undo, :repeat and :abort are "
@@ -54,16 +63,13 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     "With --wizard sheet or hand-eye the camera's own pictures are looked at: those of a camera "
     "that sends them, or those of --pictures, which come into a folder or are the frames of a "
     "source (see smartcam frames); then no URL is needed. "
-    f"The camera is connected for each picture only. {CONNECTS} "
-    "smartcam calibrate lens PICTURES calibrates a lens, smartcam calibrate compare A B compares "
-    "calibrations that are in files, and smartcam calibrate draw FILE draws one; --help behind "
-    "each tells more."
+    f"The camera is connected for each picture only. {CONNECTS}",
 )
 @click.argument("url", required=False)
 @click.option("--name", "called", metavar="NAME", help="Its name.  [default: that of the wizard]")
 @click.option(
     "--wizard",
-    type=click.Choice(["plane", "sheet", "hand-eye"]),
+    type=click.Choice(WIZARDS),
     help="What to calibrate: a plane from what the camera localizes, a plane from a picture of a "
     "printed sheet, or a camera on a robot or beside it.  [default: plane]",
 )
@@ -84,7 +90,8 @@ HELP = "Calibrate a camera against a robot: where its localizations lie in the r
     "--lens",
     metavar="FILE",
     type=click.Path(dir_okay=False),
-    help="The camera's lens: a camera_info of ROS, YAML.",
+    help="The camera's lens: a camera_info of ROS, a calibration of smartcam, or a file of another "
+    "program whose format is known.",
 )
 @click.option("--check", metavar="NAME", help="Check the calibration of that name.")
 @click.option(
@@ -168,7 +175,7 @@ async def _run(
     web: PageOptions,
 ) -> None:
     """Go through the wizard to its end."""
-    from smartcam.calibration.wizards._verification import WIZARD
+    from smartcam.calibration._inside import WIZARD
 
     options = sources.options
     started = WIZARD if check is not None else wizard or "plane"
@@ -185,7 +192,13 @@ async def _run(
             if web.wanted:
                 await _serve(service, options, web)
             else:
-                _exit(await drive(service.session, options))
+
+                def anew() -> WizardSession:
+                    service.start(named, started, parameters, fresh=True)
+                    return service.session
+
+                picture = Path(folder) / f"{named}.step.svg"
+                _exit(await drive(service.session, options, anew, picture))
         finally:
             service.close()
     except CalibrationError as exc:
@@ -193,7 +206,7 @@ async def _run(
 
 
 def _only_frames(url: str) -> bool:
-    """Tell whether a URL is that of a source of frames, and of no camera."""
+    """Return True if a URL is the URL of a source of frames, and not of a camera."""
     from smartcam.registry import FRAMES, PROTOCOLS
     from smartcam.settings import is_fleet
 
@@ -223,8 +236,8 @@ calibrate = WithFiles(
 
 
 def _list(path: str, options: Options) -> None:
-    from smartcam.calibration._files.directory import Folder
-    from smartcam.calibration.wizards._listing import listing
+    from smartcam.calibration import Folder
+    from smartcam.calibration._inside import listing
 
     if not Path(path).is_dir():
         raise ConfigurationError(f"--folder {path}: no such folder")
@@ -252,9 +265,9 @@ async def _serve(service: CalibrationService, options: Options, web: PageOptions
 
 
 def _service(folder: str, sources: _Sources) -> CalibrationService:
-    from smartcam.calibration._files.directory import Folder
-    from smartcam.calibration._optional_imports import load
-    from smartcam.calibration.wizards._services import CalibrationService
+    from smartcam._extras import load
+    from smartcam.calibration import Folder
+    from smartcam.calibration.wizards import CalibrationService
 
     load("scipy")  # before anything is measured
     with naming(f"--folder {folder}"):
@@ -264,7 +277,7 @@ def _service(folder: str, sources: _Sources) -> CalibrationService:
 
 @dataclass(frozen=True, slots=True)
 class _Sources:
-    """Where localizations and pictures come from, and what is known of target and lens."""
+    """The sources of localizations and pictures, and what is known of target and lens."""
 
     options: Options
     url: str | None
@@ -275,8 +288,8 @@ class _Sources:
 
     @property
     def described(self) -> dict[str, Any]:
-        """What is on the sheet, as it is described."""
-        from smartcam.calibration._targets import target_to_data
+        """Description of the sheet, as plain data."""
+        from smartcam.calibration import target_to_data
 
         return target_to_data(read_target(str(self.target)))
 
@@ -285,10 +298,12 @@ class _Sources:
 
         Raises ConfigurationError: a file of the options cannot be used.
         """
-        from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
-        from smartcam.calibration.wizards._plane import plane_wizard
-        from smartcam.calibration.wizards._sheet import sheet_wizard
-        from smartcam.calibration.wizards._verification import drift_wizard
+        from smartcam.calibration.wizards import (
+            drift_wizard,
+            hand_eye_wizard,
+            plane_wizard,
+            sheet_wizard,
+        )
 
         found: list[Wizard] = []
         connect: dict[str, Any] | None = None
@@ -345,8 +360,8 @@ class _Sources:
         return found
 
     def _taking(self) -> dict[str, Any]:
-        """Return what takes pictures, and which ones are waited for."""
-        from smartcam.calibration.wizards._pictures import PictureFolder
+        """Return the wizard's arguments that say where its pictures come from."""
+        from smartcam.calibration.wizards import PictureFolder
 
         if self.source is not None:
             return {"take_picture": self.source}
@@ -356,7 +371,7 @@ class _Sources:
         return {"take_picture": folder.take, "awaited": folder.awaited}
 
     async def take_picture(self) -> Any:
-        from smartcam.calibration.wizards._pictures import decode_picture
+        from smartcam.calibration._inside import decode_picture
         from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
         # the picture counts, not what the application says of it
@@ -376,10 +391,10 @@ class _Sources:
 
 
 def _read_lens(path: str) -> CameraModel:
-    from smartcam.calibration.formats._cameras import read_cameras
+    from smartcam.calibration._inside import read_lenses
 
     try:
         with naming(f"--lens {path}"):
-            return read_cameras(path, "camera_info").cameras[0]
+            return read_lenses(path).lenses[0].camera
     except CalibrationError as exc:
         raise ConfigurationError(f"--lens: {exc}") from exc

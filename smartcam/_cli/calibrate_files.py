@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,14 +12,15 @@ import click
 
 from smartcam._cli.options import OUTPUT, Options, naming, runs
 from smartcam._cli.texts import table_text
+from smartcam._cli.usage import ListedGroup, write_commands
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.calibration._lens.comparison import LensComparison
-    from smartcam.calibration._lens.uncertainty import MapFigures
-    from smartcam.calibration.formats._lenses import StoredLenses
+    from smartcam.calibration import LensComparison
+    from smartcam.calibration._inside import MapFigures, StoredLenses
+    from smartcam.calibration.formats import LengthUnit
 
 DIFFERENT = 7
 """Exit code after a comparison of calibrations that differ by more than their noise explains."""
@@ -27,26 +29,62 @@ COLUMNS = ("centre", "corners", "worst", "mean")
 """Names of a map's figures."""
 
 
+WIZARDS = ("plane", "sheet", "hand-eye")
+"""The values of --wizard."""
+
+MIN_LIKENESS = 0.75
+"""Likeness, up to 1, from which a word is taken for a command and not for a host."""
+
 OWN = "wizard"
-"""Name below ``calibrate`` of what it does itself, which nobody needs to say."""
+"""Name of the default command below ``calibrate``, which users need not type."""
 
 
 class OwnContext(click.Context):
-    """That of what a command does itself: it is called as the command."""
+    """The context of a command's own action, which bears the name of the command."""
 
     @property
     def command_path(self) -> str:
-        """What stands in its usage."""
+        """Command as its usage shows it."""
         return super().command_path.rstrip()
 
 
-class WithFiles(click.Group):
+class WithParts(click.Command):
+    """The command's own action, whose help lists the other commands, too."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, and the commands."""
+        super().format_options(ctx, formatter)
+        if ctx.parent is not None and isinstance(ctx.parent.command, click.Group):
+            write_commands(ctx.parent.command, ctx, formatter)
+
+
+class WithFiles(ListedGroup):
     """A command with others below it: what names none of them is its own affair."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""
         own = not args or args[0] not in self.commands
+        if own and args and re.fullmatch(r"[A-Za-z][\w-]*", args[0]):
+            self._check_host(ctx, *args[:2])
         return super().parse_args(ctx, [OWN, *args] if own else args)
+
+    def _check_host(self, ctx: click.Context, word: str, after: str = "-") -> None:
+        """Refuse a word that is more probably a command, or a wizard, than the name of a host."""
+        from smartcam._suggestions import closest, did_you_mean
+
+        if word in WIZARDS:
+            ctx.fail(f"{word!r} is no command but a wizard: smartcam calibrate URL --wizard {word}")
+        commands = [name for name in self.list_commands(ctx) if name != OWN]
+        if (
+            after.startswith("-")
+            and closest(word, [*commands, *WIZARDS], least=MIN_LIKENESS) is None
+        ):
+            return
+        end = did_you_mean(word, commands) or f"; commands are {', '.join(commands)}"
+        ctx.fail(
+            f"No such command {word!r}{end}; a wizard is named by --wizard, one of "
+            f"{', '.join(WIZARDS)}; a host of that name is bvs://{word}"
+        )
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -76,14 +114,19 @@ def distance_option(function: Any) -> Any:
     help="Compare two calibrations of one lens, or of one pair: by how much they differ in where "
     "they project, after the small motion of the camera that makes up for most, beside what the "
     "noise of both leads to. A and B are calibrations of smartcam (lens, pair, camera on a robot), "
-    "camera_info of ROS, camchains of Kalibr or files of OpenCV; what noise leads to is known of "
-    "calibrations of a lens alone. "
+    "camera_info of ROS, camchains of Kalibr, files of OpenCV or of others whose format is known; "
+    "what noise leads to is known of calibrations of a lens alone. "
     f"Exit code {DIFFERENT} if they differ by more than noise explains; 0 otherwise, also where "
     "there is no verdict."
 )
 @click.argument("a", type=click.Path(dir_okay=False))
 @click.argument("b", type=click.Path(dir_okay=False))
 @distance_option
+@click.option(
+    "--unit",
+    type=click.Choice(["m", "cm", "mm", "inch"]),
+    help="Of the lengths between cameras, for files that do not say it, such as OpenCV's.",
+)
 @click.option(
     "--svg",
     metavar="FILE",
@@ -94,12 +137,17 @@ def distance_option(function: Any) -> Any:
 )
 @runs(*OUTPUT)
 async def compare(
-    a: str, b: str, distance: float | None, svg: str | None, options: Options
+    a: str,
+    b: str,
+    distance: float | None,
+    unit: LengthUnit | None,
+    svg: str | None,
+    options: Options,
 ) -> None:
     """Compare two calibrations."""
-    from smartcam.calibration._lens.comparison import compare_lenses, rig_difference
+    from smartcam.calibration._inside import compare_lenses, rig_difference
 
-    first, second = _read(a), _read(b)
+    first, second = _read(a, unit), _read(b, unit)
     if len(first.lenses) != len(second.lenses):
         raise ConfigurationError(
             f"{a} and {b}: expected as many cameras in both, got {len(first.lenses)} and "
@@ -148,7 +196,7 @@ async def compare(
 @runs(*OUTPUT)
 async def draw(file: str, output: str, what: Any, distance: float | None, options: Options) -> None:
     """Draw a calibration."""
-    from smartcam.calibration._drawing.files import draw_file
+    from smartcam.calibration._inside import draw_file
 
     with naming(file):
         drawn = draw_file(file, what, distance)
@@ -156,11 +204,11 @@ async def draw(file: str, output: str, what: Any, distance: float | None, option
     options.show({"file": output}, output)
 
 
-def _read(path: str) -> StoredLenses:
-    from smartcam.calibration.formats._lenses import read_lenses
+def _read(path: str, unit: LengthUnit | None) -> StoredLenses:
+    from smartcam.calibration._inside import read_lenses
 
     with naming(path):
-        return read_lenses(path)
+        return read_lenses(path, unit=unit)
 
 
 def _data(name: str, one: LensComparison) -> dict[str, Any]:
@@ -171,8 +219,8 @@ def _data(name: str, one: LensComparison) -> dict[str, Any]:
         "ratio": one.ratio,
         "chance": one.chance,
         "distance_m": one.distance,
-        "difference_px": one.observed._asdict(),
-        "predicted_px": None if one.predicted is None else one.predicted._asdict(),
+        "difference_px": _numbers(one.observed),
+        "predicted_px": None if one.predicted is None else _numbers(one.predicted),
         "turn_deg": turn,
         "shift_mm": shift,
     }
@@ -194,8 +242,16 @@ def _text(name: str, one: LensComparison) -> str:
     )
 
 
+def _numbers(figures: MapFigures) -> dict[str, float | None]:
+    """Return the figures for JSON, which knows no NaN."""
+    return {name: one if math.isfinite(one) else None for name, one in figures._asdict().items()}
+
+
 def _row(name: str, figures: MapFigures) -> list[object]:
-    return [name, *(round(float(f"{one:.3g}"), 6) for one in figures)]
+    return [
+        name,
+        *(round(float(f"{one:.3g}"), 6) if math.isfinite(one) else "-" for one in figures),
+    ]
 
 
 def _motion(one: LensComparison) -> tuple[float, float]:
@@ -205,7 +261,7 @@ def _motion(one: LensComparison) -> tuple[float, float]:
 
 
 def _draw(path: str, names: Sequence[str], found: Sequence[LensComparison], title: str) -> None:
-    from smartcam.calibration._drawing.draw import draw_uncertainty
+    from smartcam.calibration import draw_uncertainty
 
     for name, one in zip(names, found, strict=True):
         file = Path(path)

@@ -18,18 +18,17 @@ from smartcam.exceptions import CalibrationError, ConfigurationError, FrameTimeo
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from smartcam.calibration._lens.intrinsics import IntrinsicCalibration
-    from smartcam.calibration._targets import Target
-    from smartcam.calibration._views import TargetView
+    from smartcam.calibration import IntrinsicCalibration, TargetView
+    from smartcam.calibration._inside import Target
     from smartcam.frames import FrameSource
 
-STILL: Final = 1.0
-"""Pixels by which points may move from a frame to the next one of a target that is held still."""
+MAX_STILL_MOTION_PX: Final = 1.0
+"""Pixels by which the points of a still target may move from one frame to the next."""
 
-MOVED: Final = 0.05
-"""Of the image's width: by how much points are elsewhere, on average, in a view that is another."""
+MIN_NEW_VIEW_SHARE: Final = 0.05
+"""Share of the image's width by which points must have moved, on average, for a new view."""
 
-MOST_VIEWS: Final = 200
+MAX_VIEWS: Final = 200
 
 MAX_DESCRIPTION: Final = 65_536
 """Bytes of a target's description."""
@@ -43,17 +42,17 @@ class Collecting:
     _last: TargetView | None = None
 
     def offer(self, view: TargetView) -> bool:
-        """Take a view if the target stands still, and where it was not seen before."""
+        """Take a view if the target stands still at a place where it was not seen before."""
         last, self._last = self._last, view
-        still = last is not None and _apart(last, view) <= STILL
-        far = MOVED * view.size[0]
+        still = last is not None and _apart(last, view) <= MAX_STILL_MOTION_PX
+        far = MIN_NEW_VIEW_SHARE * view.size[0]
         if not still or any(_apart(one, view) < far for one in self.views):
             return False
         self.views.append(view)
         return True
 
     def gone(self) -> None:
-        """The target was not seen."""
+        """Note that the target was not seen."""
         self._last = None
 
 
@@ -103,19 +102,33 @@ def _output(_context: object, _option: object, file: str) -> str:
     show_default=True,
     help="Of the distortion: for most lenses, for wide ones, for fisheyes.",
 )
+@click.option(
+    "--sheet",
+    type=click.Choice(["auto", "exact", "free"]),
+    default="auto",
+    show_default=True,
+    help="Whether the target's points are where they were meant to be, or are adjusted, too; auto: "
+    "as views that are left out are shown better.",
+)
 @option(
     "--count",
-    type=click.IntRange(3, MOST_VIEWS),
+    type=click.IntRange(3, MAX_VIEWS),
     help="How many views of a source.  [default: 15]",
 )
 @option("--seconds", help="Calibrate after so many seconds from the views of a source so far.")
 @option("--timeout", help="Bound of the wait for a frame.  [default: 5]")
 @runs(*OUTPUT)
 async def lens(
-    pictures: tuple[str, ...], target: str, output: str, force: bool, model: Any, options: Options
+    pictures: tuple[str, ...],
+    target: str,
+    output: str,
+    force: bool,
+    model: Any,
+    sheet: Any,
+    options: Options,
 ) -> None:
     """Calibrate a lens."""
-    from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
+    from smartcam.calibration import calibrate_intrinsics
 
     sources = [one for one in pictures if is_source(one)]
     if sources and len(pictures) > 1:
@@ -130,7 +143,9 @@ async def lens(
                 views = await _from_source(source, described, options)
         else:
             views = await _from_files(pictures, described, options)
-        found = await asyncio.to_thread(calibrate_intrinsics, views, distortion_model=model)
+        found = await asyncio.to_thread(
+            calibrate_intrinsics, views, distortion_model=model, sheet=sheet
+        )
         await asyncio.to_thread(_save, output, found)
     except CalibrationError as exc:
         raise ConfigurationError(str(exc)) from exc
@@ -139,7 +154,7 @@ async def lens(
 
 def read_target(path: str) -> Target:
     """Return the target that a file describes; ConfigurationError: it does not."""
-    from smartcam.calibration._targets import target_from_data
+    from smartcam.calibration import target_from_data
 
     try:
         with Path(path).open("rb") as stream:
@@ -147,7 +162,7 @@ def read_target(path: str) -> Target:
     except OSError as exc:
         raise ConfigurationError(f"--target {path}: {exc.strerror}") from exc
     except (ValueError, RecursionError) as exc:
-        raise ConfigurationError(f"--target {path}: no JSON: {exc}") from exc
+        raise ConfigurationError(f"--target {path}: not valid JSON: {exc}") from exc
     if not isinstance(data, dict):
         raise ConfigurationError(f"--target {path}: expected what smartcam sheet --describe writes")
     described: dict[str, Any] = data
@@ -181,24 +196,25 @@ async def _from_files(
 
 
 def _files(pictures: Sequence[str]) -> Iterator[Path]:
-    """Yield the files that are named, and those of folders, in the order of their names."""
-    from smartcam.calibration.wizards._pictures import SUFFIXES
+    """Yield the files that are named, and those of folders in the order of their numbers."""
+    from smartcam._natural import natural
+    from smartcam.calibration._inside import SUFFIXES
 
     for one in map(Path, pictures):
         if not one.is_dir():
             yield one
             continue
-        inside = sorted(file for file in one.iterdir() if file.suffix.lower() in SUFFIXES)
+        inside = [file for file in one.iterdir() if file.suffix.lower() in SUFFIXES]
         if not inside:
             raise ConfigurationError(
                 f"{one}: expected pictures ({', '.join(sorted(SUFFIXES))}), found none"
             )
-        yield from inside
+        yield from sorted(inside, key=lambda file: natural(file.name))
 
 
 def _view_of_file(path: Path, target: Target) -> TargetView:
-    from smartcam.calibration._detection.find import find_target
-    from smartcam.calibration.wizards._pictures import MAX_PICTURE, decode_picture
+    from smartcam.calibration import find_target
+    from smartcam.calibration._inside import MAX_PICTURE, decode_picture
 
     with naming(str(path)), path.open("rb") as stream:
         data = stream.read(MAX_PICTURE + 1)
@@ -207,8 +223,8 @@ def _view_of_file(path: Path, target: Target) -> TargetView:
 
 async def _from_source(source: FrameSource, target: Target, options: Options) -> list[TargetView]:
     """Return the views that are taken while somebody moves the target."""
-    from smartcam.calibration._detection.find import find_target
-    from smartcam.calibration.wizards._view_suggestions import LOOKS, suggestion
+    from smartcam.calibration import find_target
+    from smartcam.calibration._inside import LOOKS, suggestion
 
     wanted = options.count or 15
     taken, told = Collecting(), set[str]()
@@ -240,7 +256,7 @@ async def _from_source(source: FrameSource, target: Target, options: Options) ->
 
 def _tell_once(error: CalibrationError, told: set[str]) -> None:
     """Say why no view can be had of frames that show something; raise what no frame can mend."""
-    from smartcam.calibration._codes import Code
+    from smartcam.geometry import Code
 
     if error.code == Code.SHAPE:
         raise error
@@ -252,13 +268,12 @@ def _tell_once(error: CalibrationError, told: set[str]) -> None:
 def _show_view(name: str, view: TargetView | None, why: str, options: Options) -> None:
     points = 0 if view is None else len(view.ids)
     value = {"picture": name, "used": view is not None, "points": points, "reason": why}
-    options.show(
-        value, f"{name}: " + (f"{points} points" if view is not None else f"not used: {why}")
-    )
+    found = "; ".join([f"{points} points", *(one.text for one in view.warnings)]) if view else ""
+    options.show(value, f"{name}: {found or f'not used: {why}'}")
 
 
 def _save(output: str, found: IntrinsicCalibration) -> None:
-    from smartcam.calibration.formats._cameras import write_camera_info
+    from smartcam.calibration.formats import write_camera_info
 
     if Path(output).suffix.lower() == ".json":
         found.save(output)
@@ -267,7 +282,7 @@ def _save(output: str, found: IntrinsicCalibration) -> None:
 
 
 def _value(output: str, found: IntrinsicCalibration) -> dict[str, Any]:
-    """Return what came out, for JSON."""
+    """Return the calibration as values for JSON."""
     matrix = found.camera.matrix
     return {
         "file": output,

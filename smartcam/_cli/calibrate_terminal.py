@@ -11,6 +11,7 @@ import re
 import sys
 import textwrap
 import threading
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
@@ -19,34 +20,111 @@ from smartcam._cli.texts import table_text
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
+    from pathlib import Path
 
     from smartcam._cli.options import Options
-    from smartcam.calibration.wizards._sequence import WizardSession
-    from smartcam.calibration.wizards._steps import Input, Step
+    from smartcam.calibration._inside import Input
+    from smartcam.calibration.wizards import Step, WizardSession
 
 WIDTH: Final = 88
-"""Columns of a text."""
+"""Columns at which texts are wrapped."""
 
 COMMANDS: Final = ("undo", "repeat", "abort")
-"""What may stand where an answer is asked for."""
+"""Words that may be typed where an answer is asked for."""
 
 
-async def drive(session: WizardSession, options: Options) -> dict[str, Any]:
+async def drive(
+    session: WizardSession,
+    options: Options,
+    anew: Callable[[], WizardSession],
+    picture: Path,
+) -> dict[str, Any]:
     """Ask until the wizard's end; return the last view.
 
-    Raises ConfigurationError: a line of input is none, or there is no more.
+    ``anew``: begins the wizard anew. ``picture``: the file into which the picture of a step is
+    written. Raises ConfigurationError: a line of input is none, or there is no more.
     """
     lines = Lines()
-    view = session.current
+    if session.resumed and not options.as_json:
+        session = session if await _goes_on(session.resumed, lines) else anew()
+    view = {**session.current, "resumed": session.resumed}
     while view["type"] not in {"result", "abort"}:
-        options.show(view, _step_text)
+        options.show(view, lambda shown: _step_text(shown, _drawn(shown, picture)))
         if options.as_json:
-            view = await _from_json(session, await lines.next())
+            line = await lines.next()
+            if session.resumed and _asks_anew(line):
+                session = anew()
+                view = session.current
+            else:
+                view = await _from_json(session, line)
         elif session.step is not None:
             view = await _from_prompts(session, session.step, view, lines)
     options.show(view, _end_text)
     return view
+
+
+def _asks_anew(line: str) -> bool:
+    with contextlib.suppress(ValueError, RecursionError):
+        return bool(json.loads(line) == {"do": "anew"})
+    return False
+
+
+async def _goes_on(resumed: Mapping[str, Any], lines: Lines) -> bool:
+    """Show what was done before, and ask whether to go on with it."""
+    click.echo(_resumed_text(resumed))
+    while True:
+        click.echo("Go on, or begin anew? [go on]: ", nl=False)
+        text = (await lines.next()).lower()
+        if text in {"", "go on", "g", "begin anew", "anew", "b"}:
+            return text in {"", "go on", "g"}
+        click.echo(f"! {text!r}: expected 'go on' or 'begin anew'; {len(resumed['done'])} are done")
+
+
+def _resumed_text(resumed: Mapping[str, Any]) -> str:
+    text = (
+        f"Broken off: begun {_ago(resumed['since'])}, answered last {_ago(resumed['last'])}. What "
+        "was touched or seen then counts as it was: begin anew if camera, marks or sheet may have "
+        "been moved since."
+    )
+    rows = [f"  {number}. {_done_text(one)}" for number, one in enumerate(resumed["done"], 1)]
+    return "\n".join(["", *textwrap.wrap(text, WIDTH), *rows])
+
+
+def _done_text(done: Mapping[str, Any]) -> str:
+    answers = [
+        f"{name} {_default_text(value)}"
+        for name, value in done["answers"].items()
+        if value not in {None, ""}
+    ]
+    return textwrap.shorten(f"{done['step']}: {', '.join(answers) or 'done'}", WIDTH - 5)
+
+
+def _ago(at: str | None) -> str:
+    """Return a moment and how long ago it was."""
+    if at is None:
+        return "at an unknown time"
+    minutes = (datetime.now(UTC) - datetime.fromisoformat(at)).total_seconds() / 60
+    for size, unit in ((1440, "day"), (60, "hour"), (1, "minute")):
+        if minutes >= size:
+            count = int(minutes // size)
+            return f"{_minute(at)} UTC ({count} {unit}{'s' * (count > 1)} ago)"
+    return f"{_minute(at)} UTC (just now)"
+
+
+def _drawn(view: Mapping[str, Any], path: Path) -> Path | None:
+    """Write the picture of a step, if it has one; return its file."""
+    svg = (view.get("preview") or {}).get("svg")
+    if not svg:
+        return None
+    from smartcam._whole_files import replace_file
+
+    try:
+        replace_file(path, svg.encode())
+    except OSError as exc:
+        click.echo(f"! {path}: the picture cannot be written: {exc.strerror}")
+        return None
+    return path
 
 
 async def _do(session: WizardSession, command: str, token: str) -> dict[str, Any]:
@@ -71,7 +149,7 @@ async def _from_json(session: WizardSession, line: str) -> dict[str, Any]:
 
 
 class _Instead(NamedTuple):
-    """What was typed instead of an answer."""
+    """A word that was typed instead of an answer."""
 
     name: str
 
@@ -124,7 +202,7 @@ async def _answer(
 
 
 async def _typed(prompt: str, can: Collection[str], lines: Lines) -> str | _Instead:
-    """Return what is typed; a command that cannot be done now is refused, and it is asked again."""
+    """Return the line typed; ask again after a command that is not possible now."""
     while True:
         click.echo(f"{prompt}: ", nl=False)
         text = await lines.next()
@@ -168,10 +246,14 @@ def _value(schema: Mapping[str, Any], text: str) -> Any:
     return text
 
 
-def _step_text(view: Mapping[str, Any]) -> str:
+def _step_text(view: Mapping[str, Any], picture: Path | None = None) -> str:
     commands = ", ".join(f":{one}" for one in view["can"])
-    lines = ["", f"{view['number']}. {view['title']}  ({commands})", *_verdict_lines(view)]
+    about = f" of about {view['of']}" if view["of"] else ""
+    head = f"Step {view['number']}{about}: {view['title']}  ({commands})"
+    lines = ["", head, *_verdict_lines(view)]
     lines += textwrap.wrap(view["description"], WIDTH)
+    if picture is not None:
+        lines.append(f"  picture: {picture}")
     for note in view["notes"]:
         lines += _note_lines(note)
     errors = _errors_text(view)

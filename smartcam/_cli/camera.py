@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import shlex
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from smartcam._cli.options import (
     runs,
 )
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.texts import application_text, not_running, result_text
+from smartcam._cli.texts import application_text, not_running
 from smartcam.exceptions import NotRunningError, TriggerTimeoutError, UnsupportedError
 
 if TYPE_CHECKING:
@@ -45,9 +46,11 @@ async def trigger(url: str, input_hex: str | None, options: Options) -> None:
 
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
+    as_text = options.result_text()
     data = None if input_hex is None else from_hex(input_hex, "--input")
     timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
     loop = asyncio.get_running_loop()
+    url = await options.located(url)
     with options.camera(url) as unopened:
         options.remark(unopened)
         async with unopened as camera:
@@ -59,7 +62,7 @@ async def trigger(url: str, input_hex: str | None, options: Options) -> None:
                     result = await camera.trigger(input=data, timeout=timeout)
                 except NotRunningError as exc:
                     raise not_running(exc, camera, "trigger") from exc
-                options.show(result, result_text)
+                options.show(result, functools.partial(as_text, camera))
                 done += 1
 
 
@@ -84,7 +87,9 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
     from smartcam.settings import is_fleet
 
+    as_text = options.result_text()
     each = options.step(DEFAULT_TRIGGER_TIMEOUT) if options.count else None
+    url = await options.located(url)
     with options.camera(url) as unopened:
         # subscribed before the session is there, so the first result is seen too
         results = unopened.results()
@@ -107,12 +112,16 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
                                 f"status: {camera.status}"
                             ) from exc
                         line.clear()
-                        options.show(result, result_text)
+                        options.show(result, functools.partial(as_text, camera))
                         done += 1
             except TriggerTimeoutError:
                 raise
-            except TimeoutError:
-                pass  # --seconds are over
+            except TimeoutError:  # --seconds are over
+                if not done and not options.as_json:
+                    click.echo(
+                        f"note: no result came in {options.seconds:g} s; status: {camera.status}",
+                        err=True,
+                    )
 
 
 @click.command(
@@ -123,7 +132,14 @@ async def watch(url: str, web: PageOptions, options: Options) -> None:
 @click.argument("id_or_file", metavar="ID|FILE", type=application)
 @runs(*CAMERA)
 async def switch(url: str, id_or_file: int | str, options: Options) -> None:
-    await _then_show(url, options, lambda camera: camera.switch_application(id_or_file))
+    try:
+        await _then_show(url, options, lambda camera: camera.switch_application(id_or_file))
+    except UnsupportedError as exc:
+        if isinstance(id_or_file, int):
+            raise
+        raise UnsupportedError(
+            f"{id_or_file!r:.80} is no id, and so the name of a file: {exc}"
+        ) from exc
 
 
 @click.command(help=f"Enter run mode; returns when the camera is ready. {CONNECTS}")
@@ -146,6 +162,7 @@ async def _then_show(
     action: Callable[[smartcam.Camera], Awaitable[None]] | None = None,
 ) -> None:
     """Connect, do something, show how the camera is then."""
+    url = await options.located(url)
     with options.camera(url) as unopened:
         async with unopened as camera:
             if action is not None:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.options import DIALECTS, OUTPUT, Options, from_hex, option, runs
-from smartcam._cli.texts import table_text, value_text
+from smartcam._cli.texts import table_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
 
 if TYPE_CHECKING:
-    from smartcam.interpreters._base import Interpreter
+    from smartcam.interpreters import Interpreter
     from smartcam.models import ByteOrder
-    from smartcam.protocols._framed.dialect import FramedDialect
-    from smartcam.protocols._framed.framing import Frame
+    from smartcam.protocols import Frame, FramedDialect
+    from smartcam.protocols._inside import Framer
     from smartcam.protocols.messages import Sender
 
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 )
 @click.argument("data")
 @option("--interpret-as", help="How to read a result container's data.")
+@option("--units")
 @click.option("--big-endian", is_flag=True, help="The container is big endian.")
 @click.option(
     "--dialect",
@@ -40,8 +41,8 @@ async def decode(
     data: str, big_endian: bool, dialect_name: str | None, quirks: str, options: Options
 ) -> None:
     """Print what bytes mean; a frame with a magic number shows its dialect by itself."""
-    from smartcam.interpreters._base import resolve
-    from smartcam.protocols._bvs import BVS
+    from smartcam.interpreters import resolve
+    from smartcam.protocols import BVS
 
     payload = _load(data)
     if not payload:
@@ -62,7 +63,7 @@ async def decode(
             "--dialect must say whose frames they are, or --interpret-as what the container holds"
         )
     value = _interpret(payload, interpreter, byte_order)
-    options.show({"value": value}, value_text(value))
+    options.show({"value": value}, options.value_text(value))
 
 
 def _load(data: str) -> bytes:
@@ -85,7 +86,7 @@ def _load(data: str) -> bytes:
 
 
 def _dialect_of(payload: bytes) -> FramedDialect | None:
-    from smartcam.protocols._bvs import BVS
+    from smartcam.protocols import BVS
 
     for dialect in BVS.dialects.values():
         if dialect.header.magic and payload.startswith(dialect.header.magic):
@@ -100,12 +101,13 @@ def _decode_frames(
     byte_order: ByteOrder,
     options: Options,
 ) -> None:
-    from smartcam.protocols._framed.framing import Framer
+    from smartcam.protocols._inside import Framer
 
-    framer = Framer(dialect.header, dialect.header.max_payload)
+    # no frame is longer than all that is there: for one that says so no memory is taken
+    framer = Framer(dialect.header, min(len(payload), dialect.header.max_payload))
     framer.feed(payload)
     offset = 0
-    while (frame := framer.next_frame()) is not None:
+    while (frame := _next_frame(framer, dialect)) is not None:
         _show_frame(frame, offset, dialect, interpreter, byte_order, options)
         offset += dialect.header.size + len(frame.payload)
     if framer.buffered:
@@ -117,6 +119,16 @@ def _decode_frames(
         )
 
 
+def _next_frame(framer: Framer, dialect: FramedDialect) -> Frame | None:
+    """Return the next frame; None where there is none, or only a part of one."""
+    try:
+        return framer.next_frame()
+    except FrameError as exc:
+        if exc.offset == len(dialect.header.magic):  # of its length
+            return None
+        raise
+
+
 def _show_frame(
     frame: Frame,
     offset: int,
@@ -126,7 +138,7 @@ def _show_frame(
     options: Options,
 ) -> None:
     """Print one frame field by field, as each message that it can be."""
-    from smartcam.protocols._framed.constructs import view_fields
+    from smartcam.protocols._inside import view_fields
     from smartcam.protocols.messages import ResultContainer
 
     raw = dialect.encode_frame(frame)
@@ -149,7 +161,7 @@ def _show_frame(
         lines.append(table_text(("offset", "field", "bytes", "value"), rows))
         if name == ResultContainer.__name__ and interpreter is not None:
             shown["value"] = _interpret(fields[-1].raw, interpreter, byte_order)
-            lines.append(value_text(shown["value"]))
+            lines.append(options.value_text(shown["value"]))
         options.show(shown, "\n".join(lines))
 
 
@@ -167,7 +179,7 @@ def _senders(dialect: FramedDialect, frame: Frame) -> list[Sender]:
 
 
 def _interpret(payload: bytes, interpreter: Interpreter, byte_order: ByteOrder) -> Any:
-    from smartcam.interpreters._base import Context, Reader, run
+    from smartcam.interpreters import Context, Reader, run
 
     reader = Reader(payload, Context(byte_order=byte_order), interpreter.layout)
     return run(interpreter, reader)

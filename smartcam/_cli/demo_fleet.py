@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from smartcam.models import Result
 
 SHARED = "line1/cam1"
-CAMERAS = {"north": ("line1", 6), "south": ("line2", 4)}
-"""Of each agent: where they stand, and how many."""
+CAMERAS_OF_AGENT = {"north": ("line1", 6), "south": ("line2", 4)}
+"""For each agent, the line where its cameras stand and the number of these cameras."""
 
 BY_ROBOT, BY_HAND = 9, 3
 """Triggers of two programs, at the same time."""
@@ -41,7 +41,7 @@ async def demo(options: Options) -> None:
     """Start agents, share a camera, reserve it, trigger all, end agents."""
     from smartcam._zenoh import BusLink, with_ports
     from smartcam.fleet import open
-    from smartcam.fleet._zenoh import ZenohEnd
+    from smartcam.fleet._inside import ZenohEnd
 
     ZenohEnd(BusLink())  # without the engine it ends here
     say = Steps(options)
@@ -51,7 +51,7 @@ async def demo(options: Options) -> None:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         agents: dict[str, Process] = {}
         for name, place in (("north", "listen"), ("south", "connect")):
-            line, count = CAMERAS[name]
+            line, count = CAMERAS_OF_AGENT[name]
             cameras = {f"{line}/**": {"emulated": {"count": count}, "application": TANGRAM}}
             file = Path(folder) / f"{name}.yaml"
             # JSON is YAML, too
@@ -190,7 +190,7 @@ async def _kill(fleet: Fleet, agent: Process, robot: smartcam.Camera, say: Steps
     agent.kill()
     left: list[str] = []
     async with asyncio.timeout(PATIENCE):
-        while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS["south"][1]:
+        while "AgentLeft" not in left or left.count("CameraLeft") < CAMERAS_OF_AGENT["south"][1]:
             left.append(type(await anext(events)).__name__)
     gone = left.count("CameraLeft")
     say.detail(

@@ -15,32 +15,32 @@ import smartcam
 from smartcam._cli.demo import Steps
 from smartcam._cli.options import naming
 from smartcam._cli.texts import table_text
-from smartcam.emulator import EmulatedCamera
-from smartcam.emulator._scene import TABLE_SIZE, TablePose
+from smartcam.emulator import EmulatedCamera, TablePose
+from smartcam.emulator._inside import TABLE_SIZE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam._cli.options import Options
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._plane.calibration import PlaneCalibration
-    from smartcam.emulator._scene import TableScene
+    from smartcam.calibration import PlaneCalibration
+    from smartcam.emulator import TableScene
+    from smartcam.geometry import Transform
     from smartcam.models import Localization
 
 TANGRAM: Final = 7
 
 TOUCH_SIGMA: Final = 2e-4
-"""Metres; standard deviation of a touch along each of the robot's axes."""
+"""Standard deviation of a touch along each of the robot's axes, metres."""
 
 GRIP: Final = 2e-3
-"""Metres; how far beside a part the gripper still takes it."""
+"""Metres by which the gripper may miss a part and still take it."""
 
 EDGE: Final = 0.025
 """Metres from the table's edge to the outer marks."""
 
 
 class Pick(NamedTuple):
-    """How one part was picked."""
+    """The outcome of picking one part."""
 
     part: str
     x: float  # where the robot went, metres in the robot's frame
@@ -63,7 +63,7 @@ class SimulatedRobot:
     def __init__(self, scene: TableScene, seed: int) -> None:
         import numpy as np
 
-        from smartcam.calibration._geometry.frames import Transform
+        from smartcam.geometry import Transform
 
         self._scene = scene
         self._random = np.random.default_rng(seed)
@@ -90,7 +90,7 @@ class SimulatedRobot:
         ``part``: its pose, the tool's z into the table. ``predicted``: rms of the error that is
         expected there, metres.
         """
-        from smartcam.calibration._geometry.frames import Transform
+        from smartcam.geometry import Transform
 
         pose = part.pose
         gripper = Transform.from_quaternion("robot", "part", pose.position, pose.orientation)
@@ -113,7 +113,7 @@ async def pick(options: Options, picture: str, seed: int) -> None:
     MissingExtraError: the extra ``calibration`` is not installed; ConfigurationError: the picture
     cannot be written.
     """
-    from smartcam.calibration._optional_imports import load
+    from smartcam._extras import load
 
     load("scipy")  # first, since all that comes before the calibration would be in vain
     say = Steps(options)
@@ -158,7 +158,7 @@ def _lay(scene: TableScene, things: dict[str, TablePose]) -> None:
 def _calibrate(
     seen: list[Localization], marks: dict[str, TablePose], robot: SimulatedRobot, say: Steps
 ) -> PlaneCalibration:
-    from smartcam.calibration._plane.calibration import fit_plane
+    from smartcam.calibration import fit_plane
 
     camera_points = [tuple(mark.pose.position[:2]) for mark in seen]
     robot_points = [robot.touch(marks[mark.feature_id]).tolist() for mark in seen]
@@ -238,7 +238,7 @@ def _rms(values: list[float]) -> float:
 
 
 def _write(path: str, calibration: PlaneCalibration, parts: list[Localization], say: Steps) -> None:
-    from smartcam.calibration._plane.drawing import draw
+    from smartcam.calibration._inside import draw
 
     text = draw(calibration, parts, title="smartcam demo --pick")
     with naming(f"--picture {path}"):

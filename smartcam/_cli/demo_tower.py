@@ -16,7 +16,7 @@ import numpy as np
 from smartcam._cli.demo import Steps
 from smartcam._cli.texts import table_text
 from smartcam.depth import ColourRange, SpatialFilter, TemporalFilter, find_regions, region_depth
-from smartcam.depth._simulation import AXES, BLOCK, FOCAL, laid, to_robot
+from smartcam.depth._inside import AXES, BLOCK, FOCAL, laid, to_robot
 from smartcam.exceptions import FrameFormatError
 
 if TYPE_CHECKING:
@@ -24,59 +24,59 @@ if TYPE_CHECKING:
 
     from smartcam._cli.options import Options
     from smartcam.depth import ColourRegion
-    from smartcam.depth._simulation import TableSight, TowerTable, WoodenBlock
+    from smartcam.depth._inside import TableSight, TowerTable, WoodenBlock
 
 LAYERS: Final = 5
 """Blocks that the robot puts onto the tower."""
 
 PERSON: Final = {2: "add", 4: "remove"}
-"""What a person does to the tower after which of them."""
+"""The disturbances of the tower by a person, by the number of blocks put on before."""
 
 OVERVIEW: Final = (0.38, 0.0, 0.75)
-"""Metres: where the camera sees the whole table from."""
+"""Place from which the camera sees the whole table, metres."""
 
 NEAR: Final = 0.25
-"""Metres above the table, from where a block's pose is measured."""
+"""Metres above the table at which the camera measures a block's pose."""
 
 ABOVE: Final = 0.45
-"""Metres above the table, from where the tower is measured."""
+"""Metres above the table at which the camera measures the tower."""
 
 MAPS: Final = 5
-"""Depth maps that are averaged."""
+"""Number of depth maps that are averaged."""
 
 EDGE: Final = BLOCK[2] / 2
-"""Metres: a smaller step of the depth is noise, since no block is so thin."""
+"""Metres below which a step of the depth is noise, since no block is so thin."""
 
 REACH: Final = (0.15, 0.50)
-"""Metres from the robot's foot at which it can grip."""
+"""Least and greatest distance from the robot's foot at which it can grip, metres."""
 
 BLACK: Final = ColourRange(value=(0, 60))
 """The colour of the blocks that the robot is to take."""
 
 AREA: Final = (0.6, 1.7)
-"""Area of a block in the picture, beside that of its upper side: its other sides are seen, too."""
+"""Area of a block in the picture, in areas of its upper side: other sides may be seen, too."""
 
-RATIO: Final = (2.2, 3.8)
-"""Of a block's sides in the picture."""
+SIDE_RATIO: Final = (2.2, 3.8)
+"""Longer side of a block in the picture over the shorter one, from least to most."""
 
 FULLNESS: Final = 0.8
-"""Part of its rectangle that a block fills at least."""
+"""Share of its rectangle that a block fills at least."""
 
 RIM: Final = 2
 """Pixels at a region's rim whose depth is a mixture."""
 
 TOLERANCE: Final = (2e-3, math.radians(1.0), 1e-3)
-"""Metres beside, radians, and metres of height: how well all is to be found."""
+"""Largest errors of a block found: metres in the plane, radians, and metres of height."""
 
 MISSED: Final = 7
-"""Exit code where something was found less well."""
+"""Exit code after an error above the tolerance."""
 
 ARM: Final = "camera at the hand"
-"""Whose pictures errors are about."""
+"""Name of the camera whose pictures errors are about."""
 
 
 class BlockPose(NamedTuple):
-    """Where something lies, in the robot's frame: metres and radians."""
+    """The pose of a block in the robot's frame: metres and radians."""
 
     x: float
     y: float
@@ -96,7 +96,7 @@ class Compared(NamedTuple):
 
     @property
     def errors(self) -> tuple[float, float, float]:
-        """How large each is, in the order of :data:`TOLERANCE`."""
+        """Magnitude of each error, in the order of :data:`TOLERANCE`."""
         return self.beside, abs(self.turned), abs(self.higher)
 
 
@@ -143,7 +143,7 @@ async def tower(
 
 
 class Seen(NamedTuple):
-    """What the robot has found out before it moves a block."""
+    """The measurements that the robot makes before it moves a block."""
 
     blocks: list[BlockPose]  # that lie on the table
     reached: list[BlockPose]  # those of them that it can grip
@@ -251,7 +251,7 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
 
 
 def tower_place(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, float]:
-    """Return where something is higher than one block, x and y in metres.
+    """Return the place of whatever is higher than one block, x and y in metres.
 
     Raises:
         FrameFormatError: nothing is.
@@ -275,7 +275,7 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of what is seen
     upper = high.mask & (np.abs(depth - level) < EDGE)
     top = find_regions(upper)[0]
-    if not RATIO[0] <= top.ratio <= RATIO[1] or top.fullness < FULLNESS:
+    if not SIDE_RATIO[0] <= top.ratio <= SIDE_RATIO[1] or top.fullness < FULLNESS:
         raise FrameFormatError(
             f"{ARM}: expected a block on top of the tower, got {_shape(top)}", source=ARM
         )
@@ -284,9 +284,13 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
 
 
 def _regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
-    """Return what may be a block by its colour, area and sides."""
+    """Return the regions that may be blocks by their colour, area and sides."""
     return find_regions(
-        colours.mask(sight.rgb), area=_area(sight), ratio=RATIO, fullness=FULLNESS, whole=True
+        colours.mask(sight.rgb),
+        area=_area(sight),
+        ratio=SIDE_RATIO,
+        fullness=FULLNESS,
+        whole=True,
     )
 
 
@@ -332,7 +336,7 @@ def _nothing(sight: TableSight, colours: ColourRange) -> FrameFormatError:
     got = f"{len(found)} regions of it, the largest {_shape(found[0])}" if found else "none of it"
     return FrameFormatError(
         f"{ARM}: expected a block on the table of the colour {colours.as_json()}, {least:.0f} to "
-        f"{most:.0f} pixels with sides of {RATIO[0]:g}:1 to {RATIO[1]:g}:1, got {got}",
+        f"{most:.0f} pixels with sides of {SIDE_RATIO[0]:g}:1 to {SIDE_RATIO[1]:g}:1, got {got}",
         source=ARM,
     )
 
@@ -364,7 +368,7 @@ def _text(rows: list[Compared]) -> str:
 
 
 def _judge(compared: list[Compared], table: TowerTable, say: Steps) -> None:
-    """Tell whether all was found well enough; SystemExit: it was not."""
+    """Print the largest errors; raise SystemExit if one of them is above its tolerance."""
     beside, turned, higher = (
         max(row.errors[place] for row in compared) for place in range(len(TOLERANCE))
     )

@@ -11,21 +11,18 @@ import click
 
 from smartcam._cli.options import OUTPUT, Options, option, runs
 from smartcam._cli.page import PageOptions, page_options
-from smartcam._cli.usage import JsonErrors
+from smartcam._cli.usage import ListedGroup
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from smartcam.calibration.formats import LengthUnit
     from smartcam.depth import Cloud
-    from smartcam.web._clouds import Up
+    from smartcam.web._inside import Up
 
 UP = ("x", "y", "z", "-x", "-y", "-z")
-"""What may point upwards on the page."""
-
-
-class DepthCommands(JsonErrors, click.Group):
-    """Its commands tell a wrong use as JSON, too."""
+"""Axes that may point upwards on the page."""
 
 
 def _ranges(
@@ -47,7 +44,7 @@ def _ranges(
 
 
 @click.group(
-    cls=DepthCommands,
+    cls=ListedGroup,
     help="Clouds of points, as .ply and .pcd files: shown on a page, filtered, converted. Needs "
     'the extra "depth".',
 )
@@ -56,6 +53,13 @@ def depth() -> None:
 
 
 # ---------------------------------------------------------------------- show
+
+
+_UNIT = click.option(
+    "--unit",
+    type=click.Choice(["m", "cm", "mm", "inch"]),
+    help="Of the file's lengths; files that smartcam wrote say theirs.",
+)
 
 
 @depth.command(
@@ -71,14 +75,17 @@ def depth() -> None:
     show_default=True,
     help="The axis that points up; -y in the frame of a level camera.",
 )
+@_UNIT
 @page_options("", always=True)
 @option("--seconds")
 @runs(*OUTPUT)
-async def show(file: str, up: Up, web: PageOptions, options: Options) -> None:
+async def show(
+    file: str, up: Up, unit: LengthUnit | None, web: PageOptions, options: Options
+) -> None:
     from smartcam.depth import load_cloud
     from smartcam.web import CloudSite
 
-    cloud = await asyncio.to_thread(load_cloud, file)
+    cloud = await asyncio.to_thread(load_cloud, file, unit=unit)
     async with CloudSite(cloud, up=up, **web.place) as site:
         options.show(
             {"page": site.url, "file": file, "points": len(cloud)},
@@ -121,6 +128,7 @@ async def show(file: str, up: Up, web: PageOptions, options: Options) -> None:
     metavar="METRES",
     help="One point for each cube of this size.",
 )
+@_UNIT
 @click.option("--text", is_flag=True, help="Numbers as text in place of bytes.")
 @click.option("--force", is_flag=True, help="Take the place of a file that is there.")
 @runs(*OUTPUT)
@@ -130,6 +138,7 @@ async def convert(
     ranges: Sequence[tuple[str, float, float]],
     outliers: bool,
     voxel: float | None,
+    unit: LengthUnit | None,
     text: bool,
     force: bool,
     options: Options,
@@ -147,7 +156,7 @@ async def convert(
             raise ConfigurationError(
                 f"{target}: the file is there already; --force takes its place"
             )
-        cloud = load_cloud(source)
+        cloud = load_cloud(source, unit=unit)
         before = len(cloud)
         for axis, low, high in ranges:
             cloud = pass_through(cloud, axis, low, high)

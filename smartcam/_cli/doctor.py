@@ -42,7 +42,7 @@ MAX_BROKEN = 4
 async def doctor(url: str, trigger: bool, options: Options) -> None:
     """Print what an examination finds, as it finds it; end with the exit code of the worst."""
     from smartcam.doctor import examine
-    from smartcam.doctor._findings import summary
+    from smartcam.doctor._inside import summary
 
     findings: list[Finding] = []
     with options.tracing(url) as trace:

@@ -14,19 +14,26 @@ import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.texts import table_text
+from smartcam._extras import from_part
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 
     from smartcam.doctor import FoundPort
-    from smartcam.doctor._search import CameraSearch
+    from smartcam.doctor._inside import CameraSearch
 
-MAX_ADDRESSES, MOST_ADDRESSES = 65_536, 1 << 24
-MOST_AT_ONCE, MOST_RATE, MOST_SECONDS = 1_000, 10_000.0, 60.0
+DEFAULT_ADDRESSES, MAX_ADDRESSES = 65_536, 1 << 24
+MAX_OPEN_CONNECTIONS, MAX_OPENINGS_PER_SECOND, MAX_SECONDS = 1_000, 10_000.0, 60.0
 """Bounds of a search, as the library has them: they stand here, too, for ``--help``."""
 
 PERIOD = 1.0
 """Seconds between two looks of the line that tells how far the search is."""
+
+DISTURBED = (
+    "No document says that a camera of {} keeps its client when another one connects and says "
+    "nothing: --leave and --fleet keep away from those at work."
+)
+"""The warning about open ports of cameras that serve one client."""
 
 _EVIDENCE = {
     "greeted": "greets as {protocols}: {greeting}",
@@ -34,7 +41,7 @@ _EVIDENCE = {
     "said": "may be {protocols}: {greeting}",
     "ended": "hangs up at once: {protocols} with a client, or something else",
 }
-"""What was heard, in words."""
+"""Texts on what was heard, by kind."""
 
 
 @click.command(
@@ -68,25 +75,24 @@ _EVIDENCE = {
 @click.option(
     "--may-disturb",
     is_flag=True,
-    help="Allow ports of cameras that serve one client: it is not known of all that a second "
-    "connection leaves the first alone.",
+    help="Allow --ask to take cameras that serve one client from it.",
 )
 @click.option(
     "--ask",
     is_flag=True,
     help='Also speak to what was found, as "smartcam probe" does. That takes a camera from its '
-    "client.",
+    "client: it wants --may-disturb, or --protocol with names of others.",
 )
 @click.option(
     "--rate",
-    type=click.FloatRange(0, MOST_RATE, min_open=True),
+    type=click.FloatRange(0, MAX_OPENINGS_PER_SECOND, min_open=True),
     default=100.0,
     show_default=True,
     help="Openings a second at most.",
 )
 @click.option(
     "--at-once",
-    type=click.IntRange(1, MOST_AT_ONCE),
+    type=click.IntRange(1, MAX_OPEN_CONNECTIONS),
     default=64,
     show_default=True,
     help="Connections at a time at most.",
@@ -94,15 +100,15 @@ _EVIDENCE = {
 @click.option(
     "--timeout",
     "patience",
-    type=click.FloatRange(0, MOST_SECONDS, min_open=True),
+    type=click.FloatRange(0, MAX_SECONDS, min_open=True),
     default=1.0,
     show_default=True,
     help="Seconds until a port is open, and as many again to hear what comes by itself.",
 )
 @click.option(
     "--max-addresses",
-    type=click.IntRange(1, MOST_ADDRESSES),
-    default=MAX_ADDRESSES,
+    type=click.IntRange(1, MAX_ADDRESSES),
+    default=DEFAULT_ADDRESSES,
     show_default=True,
     help="Refuse more.",
 )
@@ -123,7 +129,7 @@ async def find(
 
     Raises ConfigurationError: something given cannot work, or consent is missing.
     """
-    from smartcam.doctor._search import CameraSearch
+    from smartcam.doctor._inside import CameraSearch
 
     if as_yaml and options.as_json:
         raise click.UsageError("--json and --yaml do not go together")
@@ -154,7 +160,8 @@ async def find(
 
 def _fleet_cameras(path: str) -> tuple[dict[str, dict[str, str]], set[str]]:
     """Return the hosts of a fleet file's cameras, with names and URLs of these; and all names."""
-    from smartcam.fleet import load_fleet
+    with from_part("fleet", "a fleet file needs"):
+        from smartcam.fleet import load_fleet
     from smartcam.settings import parse_address
 
     found: dict[str, dict[str, str]] = {}
@@ -197,7 +204,7 @@ def _ms(found: FoundPort) -> str:
 
 
 def evidence(found: FoundPort) -> str:
-    """Return what is known of a port that is open, as a line."""
+    """Return a line that says who answers at an open port, or may do so."""
     if found.answer is not None:
         return f"a camera answers: {found.answer.url}"
     if found.evidence == "other":
@@ -209,13 +216,16 @@ def evidence(found: FoundPort) -> str:
 
 
 def summary(search: CameraSearch) -> str:
-    """Return how the search went, for people."""
+    """Return a text of the outcome of the search, for people."""
     outcomes = ("open", "refused", "no answer", "unreachable", "failed")
     told = [f"{search.counts[name]} {name}" for name in outcomes if search.counts[name]]
     text = f"{search.opened} of {search.total} ports tried: {', '.join(told) or 'none'}"
     if search.why:
         text += f" (failed: {search.why})"
-    return f"{text}. Cameras that are set to UDP do not show."
+    text += ". Cameras that are set to UDP do not show."
+    if search.exclusive:
+        text += f" {DISTURBED.format(' or '.join(search.exclusive))}"
+    return text
 
 
 def fleet_lines(found: Iterable[FoundPort], taken: Iterable[str] = ()) -> list[str]:

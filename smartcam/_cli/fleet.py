@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,14 +14,16 @@ from smartcam._cli.options import OUTPUT, Options, from_hex, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.running import exit_code, first
 from smartcam._cli.terminal import tinted
-from smartcam._cli.texts import result_text, table_text
-from smartcam._cli.usage import JsonErrors, error_json
+from smartcam._cli.texts import table_text
+from smartcam._cli.usage import ListedGroup, error_json
+from smartcam._extras import from_part
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator
+    from collections.abc import AsyncGenerator, Callable
 
+    from smartcam.camera import Camera
     from smartcam.fleet import CameraSummary, Fleet, FleetEvent, FleetResults
     from smartcam.models import Result
     from smartcam.streams import Subscription
@@ -31,17 +34,13 @@ _EVENTS = {
     "CameraJoined": "{camera}: shared by agent {agent}",
     "CameraLeft": "{camera}: shared no more by agent {agent}",
 }
-"""What is said of an event, by the name of its class."""
+"""The text for an event, by the name of its class."""
 
-_READING = ("--interpret-as", "--y-down", "--calibration")
-
-
-class FleetCommands(JsonErrors, click.Group):
-    """Its commands tell a wrong use as JSON, too."""
+_READING = ("--interpret-as", "--y-down", "--calibration", "--units")
 
 
 @click.group(
-    cls=FleetCommands,
+    cls=ListedGroup,
     help="Show and use the cameras of a fleet together. URL is fleet://HOST[:PORT], or a fleet "
     "file: then agent and cameras are in this process, for this command only. PATTERN means "
     "cameras by their names: * is one part of a name, ** any number of them; default all. Needs "
@@ -95,7 +94,7 @@ async def list_(url: str, pattern: str, options: Options) -> None:
 
 
 def _camera(opened: Fleet, name: str, known: CameraSummary | None) -> dict[str, Any]:
-    """Return what is known of a camera, for JSON."""
+    """Return the state of a fleet's camera as values for JSON."""
     there = known is not None and known.connected
     return {
         "camera": name,
@@ -136,21 +135,21 @@ def _row(value: dict[str, Any]) -> tuple[str, ...]:
 async def watch(url: str, pattern: str, options: Options) -> None:
     async with _opened(url, options) as opened:
         results, events = opened.results(pattern), opened.events()
-        jobs = [_show_results(results, options), _show_events(events, pattern, options)]
+        jobs = [_show_results(opened, results, options), _show_events(events, pattern, options)]
         await first(jobs, options.seconds)
 
 
-async def _show_results(results: FleetResults[Any], options: Options) -> None:
-    done = 0
+async def _show_results(opened: Fleet, results: FleetResults[Any], options: Options) -> None:
+    done, as_text = 0, options.result_text()
     async for result in results:
-        options.show(result, _named_text)
+        options.show(result, functools.partial(_named_text, opened, as_text))
         done += 1
         if done == options.count:
             return
 
 
 async def _show_events(events: Subscription[FleetEvent], pattern: str, options: Options) -> None:
-    from smartcam.fleet._keys import meets
+    from smartcam.fleet._inside import meets
     from smartcam.models import jsonable
 
     async for event in events:
@@ -160,8 +159,8 @@ async def _show_events(events: Subscription[FleetEvent], pattern: str, options: 
             options.show({"event": kind, **fields}, _EVENTS[kind].format(**fields))
 
 
-def _named_text(result: Result) -> str:
-    return f"{result.camera}: {result_text(result)}"
+def _named_text(opened: Fleet, as_text: Callable[[Camera, Result], str], result: Result) -> str:
+    return f"{result.camera}: {as_text(opened[result.camera], result)}"
 
 
 # ---------------------------------------------------------------------- reload
@@ -191,6 +190,55 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
         raise SystemExit(codes[0])
 
 
+# ---------------------------------------------------------------------- outlets
+
+
+@fleet.command(
+    help="Show the accounts of the outlets in a fleet file, from their spools, whether an agent "
+    "runs or not: results = delivered + spooled + dropped."
+)
+@click.argument("file", metavar="FLEET.yaml")
+@runs(*OUTPUT)
+async def outlets(file: str, options: Options) -> None:
+    from pathlib import Path
+
+    from smartcam.fleet import load_fleet
+
+    with from_part("mqtt", '"fleet outlets" needs'):
+        from smartcam.outlets._inside import stored_accounts
+
+    section = load_fleet(file).outlets or {}
+    rows: list[tuple[str, ...]] = []
+    for name, account in stored_accounts(section, Path(file).parent).items():
+        fields = {} if account is None else account.fields()
+        if options.as_json:
+            options.show({"outlet": name, "account": fields or None}, "")
+            continue
+        dropped = ", ".join(f"{count} {why}" for why, count in fields.get("dropped", {}).items())
+        numbers = [str(fields.get(key, "")) for key in ("results", "delivered", "spooled")]
+        rows.append((name, *numbers, dropped or "0" if fields else "no spool yet"))
+    if not options.as_json:
+        head = ("outlet", "results", "delivered", "spooled", "dropped")
+        click.echo(table_text(head, rows) if rows else "the file has no outlets")
+
+
+# ---------------------------------------------------------------------- take-back
+
+
+@fleet.command(
+    name="take-back",
+    help="Have a camera's agent take it back from another client now. By itself it tries after "
+    "30 s, then ever more seldom.",
+)
+@click.argument("url")
+@click.argument("camera")
+@runs("--timeout", *OUTPUT)
+async def take_back(url: str, camera: str, options: Options) -> None:
+    async with _opened(url, options) as opened:
+        await opened[camera].take_back(timeout=options.step(10.0))
+    options.show({"camera": camera, "connected": True}, f"{camera}: its agent has a session")
+
+
 # ---------------------------------------------------------------------- page
 
 
@@ -208,13 +256,14 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
 async def page(url: str, control: bool, web: PageOptions, options: Options) -> None:
     from smartcam.web import FleetSite
 
+    units = options.unit_names
     with contextlib.suppress(TimeoutError):  # --seconds are over
         async with (
             asyncio.timeout(options.seconds),
             contextlib.AsyncExitStack() as stack,
         ):
             opened = await stack.enter_async_context(_awaited(url, options))
-            site = FleetSite(opened, control=control, **web.place)
+            site = FleetSite(opened, control=control, units=units, **web.place)
             await stack.enter_async_context(site)
             options.show({"page": site.url}, f"page: {site.url}")
             await asyncio.Event().wait()
@@ -255,18 +304,19 @@ async def _awaited(url: str, options: Options) -> AsyncGenerator[Fleet]:
 async def trigger(url: str, pattern: str, input_hex: str | None, options: Options) -> None:
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
 
+    as_text = options.result_text()
     data = None if input_hex is None else from_hex(input_hex, "--input")
     timeout = options.step(DEFAULT_TRIGGER_TIMEOUT)
     async with _opened(url, options) as opened:
         _require_cameras(opened)
         outcomes = await opened.trigger(pattern, timeout=timeout, input=data)
-    codes: list[int] = []
-    for name, outcome in sorted(outcomes.items()):
-        if isinstance(outcome, SmartCamError):
-            codes.append(exit_code(outcome))
-            _show_error(name, outcome, codes[-1], options)
-        else:
-            options.show(outcome, _named_text)
+        codes: list[int] = []
+        for name, outcome in sorted(outcomes.items()):
+            if isinstance(outcome, SmartCamError):
+                codes.append(exit_code(outcome))
+                _show_error(name, outcome, codes[-1], options)
+            else:
+                options.show(outcome, functools.partial(_named_text, opened, as_text))
     if codes:
         raise SystemExit(codes[0])
 

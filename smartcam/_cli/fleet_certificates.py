@@ -16,7 +16,7 @@ from smartcam._cli.usage import JsonErrors
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.fleet._authority import MadeCertificate
+    from smartcam.fleet._inside import MadeCertificate
 F = TypeVar("F", bound="Callable[..., Any]")
 
 
@@ -65,7 +65,7 @@ async def certificates(
     options: Options,
 ) -> None:
     """Make certificates."""
-    from smartcam.fleet._authority import make_certificates
+    from smartcam.fleet._inside import make_certificates
 
     wanted = {"agent": agents, "viewer": viewers, "operator": operators, "router": routers}
     made = await asyncio.to_thread(

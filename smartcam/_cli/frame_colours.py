@@ -11,6 +11,7 @@ import click
 from smartcam._cli.options import OUTPUT, Options, option, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.running import first
+from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
@@ -41,9 +42,10 @@ LINGER: Final = 3.0
 async def colours(url: str, begin: str | None, web: PageOptions, options: Options) -> None:
     """Serve the page."""
     from smartcam.frames import open as open_frames
-    from smartcam.frames._reader import FRAME_TIMEOUT
-    from smartcam.web import ColourSite
+    from smartcam.frames._inside import FRAME_TIMEOUT
 
+    with from_part("depth", "smartcam frames colours needs"):
+        from smartcam.web import ColourSite
     seconds = options.step(FRAME_TIMEOUT)
     source = open_frames(url, timeout=seconds, stall=seconds, linger=LINGER)
     site = ColourSite(source, colours=_range(begin), **web.place)
@@ -59,7 +61,8 @@ async def _serve(site: ColourSite, options: Options) -> None:
 
 def _range(text: str | None) -> ColourRange | None:
     """Return a range of its JSON; ConfigurationError: it is none."""
-    from smartcam.depth import ColourRange
+    with from_part("depth", "smartcam frames colours needs"):
+        from smartcam.depth import ColourRange
 
     if text is None:
         return None

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame
 
-DIGITS: Final = 4
-"""Of the number that a file of several gets; more where that is not enough."""
+MIN_NUMBER_DIGITS: Final = 4
+"""Digits of the number in the name of one file of several, at least."""
 
 
 @dataclass(frozen=True, slots=True)
 class Encoding:
-    """How frames become files.
+    """The way frames become files.
 
     Attributes:
         suffix: a key of :data:`SUFFIXES`.
@@ -51,14 +51,14 @@ def numbered(file: str, count: int) -> list[str]:
     """Return the names of so many files: ``x-0001.png``; of a single one its own."""
     if count == 1:
         return [file]
-    path, digits = Path(file), max(DIGITS, len(str(count)))
+    path, digits = Path(file), max(MIN_NUMBER_DIGITS, len(str(count)))
     return [str(path.with_stem(f"{path.stem}-{one:0{digits}}")) for one in range(1, count + 1)]
 
 
 def _levels(frame: Frame, how: Encoding) -> NDArray[Any]:
     import numpy as np
 
-    from smartcam.web._jpeg import picture
+    from smartcam.web._inside import picture
 
     seen = picture(frame, grey=how.grey)
     if how.eight and seen.dtype != np.uint8:
@@ -82,7 +82,7 @@ def _npy(frame: Frame, how: Encoding) -> bytes:
 def _jpeg(frame: Frame, how: Encoding) -> bytes:
     import numpy as np
 
-    from smartcam.web._jpeg import encoded, is_whole_jpeg
+    from smartcam.web._inside import encoded, is_whole_jpeg
 
     if not how.grey and is_whole_jpeg(frame):
         return bytes(frame.data)
@@ -107,7 +107,7 @@ def _jxl(frame: Frame, how: Encoding) -> bytes:
 def _lossless(frame: Frame, how: Encoding, format: str, encode: str, **options: Any) -> bytes:
     import numpy as np
 
-    from smartcam.frames._optional_imports import load
+    from smartcam._extras import load
 
     if frame.format.name == format and not (how.grey or how.eight):
         return bytes(frame.data)
@@ -124,4 +124,4 @@ SUFFIXES: Mapping[str, Callable[[Frame, Encoding], bytes]] = {
     ".png": _png,
     ".raw": _raw,
 }
-"""What makes a file, by its suffix in small letters."""
+"""The function that makes a file, by the suffix of its name in small letters."""

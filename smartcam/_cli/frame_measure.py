@@ -1,4 +1,4 @@
-"""What a source of frames is worth: rate, jitter, age, latency, losses, processor."""
+"""Measure a source of frames: rate, jitter, age, latency, losses, processor."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class _Stamps:
 
 
 def _stamp_of(frame: Frame) -> float | None:
-    from smartcam.frames._synthetic import read_stamp
+    from smartcam.frames._inside import read_stamp
 
     try:
         found = read_stamp(frame.grey()[:STAMP_ROWS])
@@ -100,7 +100,7 @@ def _stamp_of(frame: Frame) -> float | None:
 
 
 class _Taken:
-    """What was taken of a reader, the first frame among it."""
+    """The frames taken from a reader, the first one among them."""
 
     def __init__(self, first: Frame) -> None:
         self.stamps = _Stamps()
@@ -173,7 +173,7 @@ def _spread(seconds: Sequence[float]) -> dict[str, float | None] | None:
 
 
 def measured_text(value: dict[str, Any]) -> str:
-    """Return what was measured, for people."""
+    """Return the measured rates, ages and latencies as lines for people."""
     head = f"{value['source']}: {value['format']} {value['width']}x{value['height']}"
     rows = [
         f"{head}, {value['frames']} frames in {value['seconds']:.1f} s",

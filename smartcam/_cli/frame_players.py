@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from smartcam._cli.options import Options
     from smartcam.frames import FrameSource, RtpSender, RtspServer
 
-USER = "smartcam"
-"""Of RTSP, where that wants a password."""
+RTSP_USER = "smartcam"
+"""Name of the RTSP user where a password is set."""
 
 LONGEST_NAME = 60
 """Letters of a source's name in a URL, before its number."""
@@ -32,7 +32,7 @@ DESCRIBED = 5.0
 
 
 class Players(NamedTuple):
-    """What is served beside the page.
+    """The streams that are served beside the page.
 
     Attributes:
         rtsp: address to listen on for RTSP, None for none.
@@ -81,12 +81,13 @@ def rtsp_server(
     ``token``: of the page, which is the password, too. Where there is none, and others can reach
     the server, one is made.
     """
+    from smartcam._accepting import is_loopback
     from smartcam.frames import RtspServer
-    from smartcam.web._guard import is_loopback, new_token
+    from smartcam.web._inside import new_token
 
     host, port = place
     password = token or (None if is_loopback(host) else new_token())
-    user = None if password is None else USER
+    user = None if password is None else RTSP_USER
     named = names_of(sources)
     return RtspServer(named, host=host, port=port, user=user, password=password), password
 
@@ -95,7 +96,7 @@ def rtsp_urls(
     server: RtspServer, sources: Sequence[FrameSource], password: str | None
 ) -> dict[str, str]:
     """Return the URLs by name, as a player takes them."""
-    who = "" if password is None else f"{USER}:{password}@"
+    who = "" if password is None else f"{RTSP_USER}:{password}@"
     return {name: server.url(name).replace("//", f"//{who}", 1) for name in names_of(sources)}
 
 

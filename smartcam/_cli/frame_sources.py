@@ -14,7 +14,7 @@ TIMEOUT = (
 
 
 def is_source(text: str) -> bool:
-    """Tell whether a text is the URL of a source, and no file or folder."""
+    """Return True if a text is the URL of a source, not a file or folder."""
     return "://" in text
 
 
@@ -24,7 +24,7 @@ def opened(url: str, options: Options, *, linger: float = 0.0) -> FrameSource:
     Raises ConfigurationError: the URL is wrong.
     """
     from smartcam.frames import open as open_frames
-    from smartcam.frames._reader import FRAME_TIMEOUT
+    from smartcam.frames._inside import FRAME_TIMEOUT
 
     seconds = options.step(FRAME_TIMEOUT)
     return open_frames(url, timeout=seconds, stall=seconds, linger=linger)

@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.frame_colours import colours
+from smartcam._cli.frame_features import features_command, force_address_command
 from smartcam._cli.frame_files import SUFFIXES, Encoding, numbered
 from smartcam._cli.frame_measure import measure, measured_text
 from smartcam._cli.frame_sources import TIMEOUT, opened
+from smartcam._cli.frames_record import record
 from smartcam._cli.frames_serve import serve, show
 from smartcam._cli.options import OUTPUT, Options, option, runs
-from smartcam._cli.usage import JsonErrors
+from smartcam._cli.usage import ListedGroup
 from smartcam.exceptions import (
     ConfigurationError,
     FrameSourceError,
@@ -28,16 +30,12 @@ if TYPE_CHECKING:
 
     from smartcam.frames import FoundSource, Frame, FrameSource
 
-MOST_GRABBED = 100_000
-"""Files of one command."""
-
-
-class FrameCommands(JsonErrors, click.Group):
-    """Its commands tell a wrong use as JSON, too."""
+MAX_GRABBED = 100_000
+"""Files that one command writes at most."""
 
 
 @click.group(
-    cls=FrameCommands,
+    cls=ListedGroup,
     help="Pictures of any camera. URL is v4l2:///dev/video0, gige://HOST, rtsp://HOST/PATH, "
     "http://HOST/PATH, insight://HOST, synthetic:// (which needs no camera), or the path of a "
     "video; ?format=YUYV&size=640x480&fps=30 and the like say how it is to stream. A device "
@@ -47,8 +45,11 @@ def frames() -> None:
     """Have the commands of frames."""
 
 
+frames.add_command(record)
 frames.add_command(serve)
 frames.add_command(show)
+frames.add_command(features_command)
+frames.add_command(force_address_command)
 
 
 # ---------------------------------------------------------------------- list
@@ -63,7 +64,7 @@ frames.add_command(show)
 @option("--timeout", help="Bound of the search.  [default: 5]")
 @runs(*OUTPUT)
 async def list_(scheme: str | None, options: Options) -> None:
-    from smartcam.frames._reader import FRAME_TIMEOUT
+    from smartcam.frames._inside import FRAME_TIMEOUT
     from smartcam.registry import FRAMES
 
     known = [info.name for info in FRAMES.available()]
@@ -92,9 +93,9 @@ async def list_(scheme: str | None, options: Options) -> None:
 
 
 async def _look(scheme: str, seconds: float) -> list[FoundSource] | Exception | None:
-    """Return what is found by a scheme, None where its driver does not look for anything.
+    """Return the sources that a scheme's driver finds, None where the driver has no search.
 
-    A broken one costs only its own line.
+    The error of a broken driver is returned, and costs only the line of its scheme.
     """
     from smartcam.frames import discover
     from smartcam.registry import FRAMES
@@ -122,7 +123,7 @@ def _show_broken(scheme: str, error: Exception, options: Options) -> None:
 
 
 def _found(one: FoundSource) -> dict[str, Any]:
-    """Return what is known of a source, for JSON."""
+    """Return the name, formats and remark of a source found, as values for JSON."""
     return {
         "url": one.url,
         "name": one.name,
@@ -169,13 +170,19 @@ def _suffix(_context: object, _option: object, file: str) -> str:
 @option("--force")
 @option(
     "--count",
-    type=click.IntRange(1, MOST_GRABBED),
+    type=click.IntRange(1, MAX_GRABBED),
     help="Write so many, one after the other; with more than one the names get numbers.",
 )
 @click.option(
     "--after-now",
     is_flag=True,
     help="The first one whose exposure begins after it is asked for, not one that was on its way.",
+)
+@click.option(
+    "--trigger",
+    is_flag=True,
+    help="Trigger the device for each one: the picture that this trigger caused, by software. The "
+    "URL has to have it wait for triggers, as gige://HOST?trigger=Software does.",
 )
 @click.option("--grey", is_flag=True, help="The brightness alone.")
 @click.option("--8-bit", "eight", is_flag=True, help="Of more than 8 bits the upper 8.")
@@ -193,14 +200,17 @@ async def grab(
     output: str,
     force: bool,
     after_now: bool,
+    trigger: bool,
     grey: bool,
     eight: bool,
     quality: int,
     options: Options,
 ) -> None:
-    from smartcam.frames._reader import FRAME_TIMEOUT
+    from smartcam.frames._inside import FRAME_TIMEOUT
 
     suffix = Path(output).suffix.lower()
+    if trigger and after_now:
+        raise click.UsageError("--trigger is after now: no --after-now beside it")
     if suffix == ".raw" and (grey or eight):
         raise click.UsageError("a .raw file has the bytes as they came: no --grey or --8-bit")
     files = numbered(output, options.count or 1)
@@ -208,16 +218,20 @@ async def grab(
     encoding = Encoding(suffix, quality, grey, eight)
     async with opened(url, options) as source, source.reader() as reader:
         wait = options.step(FRAME_TIMEOUT)
-        coming = reader.after(time.monotonic(), timeout=wait) if after_now else anext(reader)
+        if trigger:
+            coming: Any = source.trigger(timeout=wait)
+        else:
+            coming = reader.after(time.monotonic(), timeout=wait) if after_now else anext(reader)
         frame = await _next(coming, source, 0, len(files))
         for done, file in enumerate(files, 1):
             data = await asyncio.to_thread(encoding.encode, frame)
             await asyncio.to_thread(_write, file, data)
             options.show(*_grabbed(file, len(data), frame))
             if done < len(files):
-                frame = await _next(anext(reader), source, done, len(files))
+                coming = source.trigger(timeout=wait) if trigger else anext(reader)
+                frame = await _next(coming, source, done, len(files))
         account = reader.statistics()
-    if len(files) > 1 and (account.skipped or account.lost):
+    if len(files) > 1 and not trigger and (account.skipped or account.lost):
         click.echo(f"note: {account.skipped} skipped, {account.lost} lost", err=True)
 
 
@@ -232,7 +246,7 @@ async def _next(coming: Any, source: FrameSource, done: int, wanted: int) -> Fra
 
 
 def _grabbed(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
-    """Return what was written, as JSON and as text."""
+    """Return the description of a frame written to a file, as values for JSON and as a text."""
     value = {
         "file": file,
         "size": size,
@@ -246,6 +260,8 @@ def _grabbed(file: str, size: int, frame: Frame) -> tuple[dict[str, Any], str]:
         "captured": datetime.fromtimestamp(frame.utc, UTC),
         "moment": frame.moment.value,
     }
+    if frame.trigger is not None:
+        value["evidence"] = [*frame.trigger.evidence]
     text = (
         f"{file}: {frame.format.name} {frame.width}x{frame.height}, number {frame.sequence}, "
         f"{size:,} bytes"

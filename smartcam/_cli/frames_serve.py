@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from smartcam._cli.frame_players import (
-    USER,
+    RTSP_USER,
     Players,
     address,
     names_of,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from smartcam.frames import RtspServer
     from smartcam.web import FramesSite
 
-MOST_SHOWN = 4
+MAX_SHOWN = 4
 """Sources side by side on a page."""
 
 FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
@@ -61,6 +61,11 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
             help="Of the JPEGs that the page gets; those of a camera that sends some stay as they "
             "are.",
         ),
+        click.option(
+            "--changes",
+            is_flag=True,
+            help="Whoever can open the page may set features of the devices and trigger them.",
+        ),
         page_options("", always=True),
         option("--seconds"),
         option("--timeout", help=TIMEOUT),
@@ -76,7 +81,7 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
 
 
 @click.command(
-    help=f"Serve pictures of one source, or of up to {MOST_SHOWN}, until Ctrl-C or SIGTERM: a page "
+    help=f"Serve pictures of one source, or of up to {MAX_SHOWN}, until Ctrl-C or SIGTERM: a page "
     "with all of them side by side, and for players and recorders RTSP or RTP. What is served "
     "goes to stdout, who looks, on a terminal, to stderr. A device streams while somebody looks; "
     'one that is not there is awaited, and the others go on. Needs the extras "web" and "frames", '
@@ -87,7 +92,8 @@ def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., Non
     metavar="HOST:PORT",
     callback=address,
     help="Serve them as H.264 by RTSP, too, as rtsp://HOST:PORT/NAME. Where the page has a token, "
-    f"that is the password, and {USER} the user; on an address that others can reach, one is made.",
+    f"that is the password, and {RTSP_USER} the user; on an address that others can reach, one is "
+    "made.",
 )
 @click.option(
     "--rtp",
@@ -108,6 +114,7 @@ async def serve(
     rtsp: tuple[str, int] | None,
     rtp: tuple[str, int] | None,
     sdp: str | None,
+    changes: bool,
     web: PageOptions,
     options: Options,
 ) -> None:
@@ -118,35 +125,43 @@ async def serve(
         raise click.UsageError("--rtp: expected the port of who receives it, got 0")
     if sdp is not None and rtp is None:
         raise click.UsageError("--sdp needs --rtp")
-    await serve_sources(urls, quality, Players(rtsp, rtp, sdp), web, options)
+    await serve_sources(urls, quality, Players(rtsp, rtp, sdp), web, options, changes=changes)
 
 
 @click.command(
-    help=f"Show one source, or up to {MOST_SHOWN} side by side, on a page until Ctrl-C: the newest "
+    help=f"Show one source, or up to {MAX_SHOWN} side by side, on a page until Ctrl-C: the newest "
     "frame of each, its age, rates, what was skipped and lost. It is serve, with nothing but the "
     "page: its address goes to stdout. A device streams while somebody looks; one that is not "
     'there is awaited, and the page says so. Needs the extras "web" and "frames".'
 )
 @_serves(terminated=143)
-async def show(urls: tuple[str, ...], quality: int, web: PageOptions, options: Options) -> None:
+async def show(
+    urls: tuple[str, ...], quality: int, changes: bool, web: PageOptions, options: Options
+) -> None:
     """Show some sources."""
-    await serve_sources(urls, quality, Players(), web, options)
+    await serve_sources(urls, quality, Players(), web, options, changes=changes)
 
 
 async def serve_sources(
-    urls: Sequence[str], quality: int, players: Players, web: PageOptions, options: Options
+    urls: Sequence[str],
+    quality: int,
+    players: Players,
+    web: PageOptions,
+    options: Options,
+    *,
+    changes: bool,
 ) -> None:
     """Serve sources until cancelled, or for ``--seconds``; one that fails harms no other.
 
     Raises ConfigurationError, FrameFormatError, UnsupportedError: so it is with all of them;
     ConfigurationError: it cannot listen.
     """
-    if len(urls) > MOST_SHOWN:
-        raise click.UsageError(f"expected {MOST_SHOWN} URLs at most, got {len(urls)}")
+    if len(urls) > MAX_SHOWN:
+        raise click.UsageError(f"expected {MAX_SHOWN} URLs at most, got {len(urls)}")
     from smartcam.web import FramesSite
 
     sources = [opened(url, options) for url in urls]
-    site = FramesSite(sources, quality=quality, **web.place)
+    site = FramesSite(sources, quality=quality, changes=changes, **web.place)
     tries = _Tries(len(sources))
     keeping = [site.pictures.keep_open(place, tries.of(place)) for place in range(len(sources))]
     await first([_serve(site, tries, players, options), *keeping], None)
@@ -175,7 +190,7 @@ async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Opt
 
 
 class _Tries:
-    """What became of the first try of each source; later ones that fail are told on stderr."""
+    """The outcomes of each source's first try; later ones that fail are told on stderr."""
 
     def __init__(self, count: int) -> None:
         self._done = asyncio.Event()  # each was tried
@@ -184,7 +199,7 @@ class _Tries:
         self._told: dict[int, str] = {}
 
     def of(self, place: int) -> Callable[[SmartCamError | None], None]:
-        """Return what hears of the tries of a source."""
+        """Return the function that is told the outcome of each try to open a source."""
 
         def tried(error: SmartCamError | None) -> None:
             self._first.setdefault(place, error)
@@ -231,7 +246,7 @@ async def _tell_viewers(site: FramesSite, server: RtspServer | None) -> None:
 
 
 def viewers_text(site: FramesSite, server: RtspServer | None = None) -> str:
-    """Return who looks at which source: addresses of those at the page, how many by RTSP."""
+    """Return each source's viewers as a text: addresses at the page, their number by RTSP."""
     played = {} if server is None else server.statistics()
     rows: list[str] = []
     for place, (name, source) in enumerate(names_of(site.sources).items()):

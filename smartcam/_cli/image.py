@@ -21,6 +21,7 @@ from smartcam.exceptions import ConfigurationError
 async def image(url: str, output: str, force: bool, options: Options) -> None:
     """Write a camera's last picture to a file."""
     _check_free(output, force)
+    url = await options.located(url)
     with options.camera(url) as unopened:
         async with unopened as camera:
             data = await camera.read_image(timeout=options.step(10.0))

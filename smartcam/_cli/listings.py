@@ -30,7 +30,7 @@ async def protocols(options: Options) -> None:
 
 def _protocol(info: PluginInfo) -> tuple[object, str]:
     """Describe a protocol, as JSON and as text."""
-    from smartcam.protocols._base import load_protocol
+    from smartcam.protocols._inside import load_protocol
 
     protocol = load_protocol(info.name)
     value = {

@@ -14,10 +14,9 @@ from smartcam.backoff import Backoff
 from smartcam.exceptions import LinkError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
     from smartcam.camera import Camera
-    from smartcam.web import LiveSite
 
 
 @click.command(
@@ -31,7 +30,8 @@ if TYPE_CHECKING:
 )
 @page_options("", always=True)
 @runs(
-    *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--seconds"),
+    *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--units"),
+    "--seconds",
     *CAMERA,
 )
 async def live(url: str, control: bool, web: PageOptions, options: Options) -> None:
@@ -45,26 +45,38 @@ async def serve_page(
     """Serve the page until the end; a camera that cannot be used at all ends it."""
     from smartcam.web import LiveSite
 
+    units = options.unit_names
+    url = await options.located(url)
     with options.cameras(url, reconnect=Backoff()) as make:
         camera = make()
         options.remark(camera)
         with contextlib.suppress(TimeoutError):  # --seconds are over
             async with asyncio.timeout(options.seconds):
-                async with LiveSite(camera, control=control, **web.place) as site:
+                async with LiveSite(camera, control=control, units=units, **web.place) as site:
                     options.show({"page": site.url}, f"page: {site.url}")
-                    await _have_open(camera, make, site)
+                    await have_open(camera, make, site.view.follow)
 
 
-async def _have_open(camera: Camera, make: Callable[[], Camera], site: LiveSite) -> None:
-    """Open the camera until it is there, and have it open until this is cancelled."""
+async def have_open(
+    camera: Camera,
+    make: Callable[[], Camera],
+    follow: Callable[[Camera, str], Awaitable[None]],
+    opened: Callable[[], None] = lambda: None,
+) -> None:
+    """Open the camera until it is there, and have it open until this is cancelled.
+
+    ``follow`` is told of each new camera that takes the place of one which could not be opened, and
+    why it could not. ``opened`` is called when it is open.
+    """
     policy = Backoff()
     for delay in policy.delays():
         try:
             async with camera:
+                opened()
                 await asyncio.Event().wait()
         except LinkError as exc:
             if not policy.transient(exc):
                 raise
             camera = make()
-            await site.view.follow(camera, str(exc))
+            await follow(camera, str(exc))
         await asyncio.sleep(delay)

@@ -20,17 +20,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
 
-MOST_WAITING = 10_000
-"""Lines that wait for being written."""
+MAX_WAITING = 10_000
+"""Lines that may wait to be written."""
 
-MOST_TEXT = 1 << 16
+MAX_TEXT = 1 << 16
 """Characters of a message, or of an exception's text; what is longer is cut."""
 
 FAREWELL = 1.0
 """Seconds that the last lines may take at the end."""
 
 FIELDS = ("time", "level", "logger", "message", "agent", "camera", "exception", "dropped")
-"""Of a line, in this order; the last two stand there where there is something to say."""
+"""The fields of a line, in this order; a line has the last two only where they have a value."""
 
 
 class JsonLines(logging.Formatter):
@@ -55,14 +55,14 @@ class JsonLines(logging.Formatter):
             "time": _time(record.created),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": message[:MOST_TEXT],
+            "message": message[:MAX_TEXT],
             "agent": self._agent() or None,
             "camera": self._camera(record),
         }
         if record.exc_info and record.exc_info[0] is not None:
-            fields["exception"] = self.formatException(record.exc_info)[-MOST_TEXT:]
+            fields["exception"] = self.formatException(record.exc_info)[-MAX_TEXT:]
         elif record.exc_text:
-            fields["exception"] = record.exc_text[-MOST_TEXT:]
+            fields["exception"] = record.exc_text[-MAX_TEXT:]
         return json.dumps(fields)
 
     def _camera(self, record: logging.LogRecord) -> str | None:
@@ -95,7 +95,7 @@ class LineHandler(logging.Handler):
         dropped: lines that found no room.
     """
 
-    def __init__(self, descriptor: int, most: int = MOST_WAITING) -> None:
+    def __init__(self, descriptor: int, most: int = MAX_WAITING) -> None:
         super().__init__()
         self.dropped: int = 0
         self._told = 0
@@ -161,9 +161,9 @@ def json_log(
     cameras: Callable[[], Container[str]],
     *,
     descriptor: int = 2,
-    most: int = MOST_WAITING,
+    most: int = MAX_WAITING,
 ) -> Iterator[LineHandler]:
-    """In here everything that is logged in this process is written as lines of JSON."""
+    """Write everything that this process logs, while in here, as lines of JSON."""
     root = logging.getLogger()
     handlers, before = root.handlers[:], root.level
     handler = LineHandler(descriptor, most)

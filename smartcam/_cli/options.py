@@ -10,18 +10,21 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from smartcam._cli.terminal import tinted
 from smartcam._cli.usage import INTERRUPTED, importing
+from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError, UnsupportedError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping
 
-    from smartcam.calibration._files.load import AnyCalibration
+    from smartcam.calibration._inside import AnyCalibration
     from smartcam.camera import Camera
+    from smartcam.models import Result
     from smartcam.observers import Observer, TraceEntry
 
 DIALECTS = ("handbook", "thesis", "b16", "bid")
-"""Those of ``bvs``, the default first."""
+"""The dialects of the protocol ``bvs``, the default first."""
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
@@ -65,6 +68,11 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
         "help": "The camera's name: in results, and as the frame of poses; default HOST:PORT, or "
         "that in the fleet.",
     },
+    "--units": {
+        "metavar": "UNITS",
+        "help": "Show values in these units instead of SI, such as mm,deg; with --json they are SI "
+        "as ever.",
+    },
     "--count": {"type": click.IntRange(min=1), "help": "End after so many results."},
     "--seconds": {"type": SECONDS, "help": "End after so many seconds."},
     "--timeout": {
@@ -89,17 +97,17 @@ _OPTIONS: Mapping[str, Mapping[str, Any]] = {
 """Options that several commands have."""
 
 OUTPUT = ("--json", "--debug")
-"""Of commands that print."""
+"""Options of the commands that print."""
 
 CAMERA = ("--timeout", "--trace", *OUTPUT)
-"""Of those that connect, too."""
+"""Options of the commands that connect to a camera, those that print among them."""
 
 RESULTS = (
-    *("--application", "--interpret-as", "--y-down", "--calibration", "--name"),
+    *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--units"),
     *("--count", "--seconds"),
     *CAMERA,
 )
-"""Of those that print results, too."""
+"""Options of the commands that print results, those that connect among them."""
 
 
 def option(name: str, **changes: Any) -> Callable[[F], F]:
@@ -157,7 +165,9 @@ def from_hex(text: str, where: str) -> bytes:
     try:
         return bytes.fromhex(text)
     except ValueError as exc:
-        raise ConfigurationError(f"{where}: {text[:64]!r} is no hex: {exc}") from exc
+        raise ConfigurationError(
+            f"{where}: {text[:64]!r} is no hex: expected two of 0-9 and a-f for each byte"
+        ) from exc
 
 
 def application(text: str) -> int | str:
@@ -189,6 +199,7 @@ class Options:
     name: str | None = None
     count: int | None = None
     seconds: float | None = None
+    units: str | None = None
 
     def step(self, default: float) -> float:
         """Return the bound of a step, seconds."""
@@ -204,6 +215,22 @@ class Options:
             raise ConfigurationError(
                 f"{what}: it was made {made} --y-down: {then} here, too, or poses are mirrored"
             )
+
+    async def located(self, url: str) -> str:
+        """Return a URL; of a bare HOST[:PORT] the one at which a camera answers there.
+
+        Raises ConnectFailedError: none answers in any registered protocol; errors of
+        :meth:`reading`, before anybody is asked.
+        """
+        from smartcam.settings import is_software
+
+        if "://" in url or is_software(url):
+            return url
+        if self.calibration is not None:
+            self._calibrated(f"--calibration {self.calibration}", check_y_down=True)
+        from smartcam.doctor._inside import locate
+
+        return await locate(url, timeout=self.step(10.0))
 
     @contextmanager
     def camera(self, url: str, **other: Any) -> Iterator[Camera]:
@@ -238,7 +265,7 @@ class Options:
     def _observers(trace: Callable[[TraceEntry], None] | None) -> list[Observer]:
         if trace is None:
             return []
-        from smartcam.doctor._context import FrameObserver
+        from smartcam.doctor._inside import FrameObserver
 
         return [FrameObserver(trace)]
 
@@ -253,14 +280,24 @@ class Options:
         if self.y_down or not fleet:
             options["y_down"] = self.y_down
         if self.calibration is not None:
-            from smartcam.calibration._files.load import load_calibration
-
             what = f"--calibration {self.calibration}"
-            with naming(what):
-                options["calibration"] = calibration = load_calibration(self.calibration)
-            if "y_down" in options:  # else the camera sees to it, which hears what the agent knows
-                self.check_y_down(calibration, what)
+            # without "y_down" the camera sees to it, which hears what the agent knows
+            calibration, doubt = self._calibrated(what, check_y_down="y_down" in options)
+            options["calibration"] = calibration
+            if doubt:
+                click.echo(f"{tinted('error', 'warning:')} {what}: {doubt}", err=True)
         return options
+
+    def _calibrated(self, what: str, *, check_y_down: bool) -> tuple[AnyCalibration, str]:
+        """Return the calibration, and the reason to doubt it; "" means none."""
+        with from_part("calibration", "--calibration needs"):
+            from smartcam.calibration import load_calibration
+            from smartcam.calibration._inside import doubt_of
+        with naming(what):
+            calibration = load_calibration(self.calibration or "")
+        if check_y_down:
+            self.check_y_down(calibration, what)
+        return calibration, doubt_of(calibration)
 
     @contextmanager
     def tracing(self, url: str) -> Iterator[Callable[[TraceEntry], None] | None]:
@@ -305,9 +342,53 @@ class Options:
         if failed:
             raise ConfigurationError(f"--trace {self.trace}: {failed[0].strerror}") from failed[0]
 
+    @property
+    def unit_names(self) -> list[str] | None:
+        """Names of the units in which values are shown; None: in SI.
+
+        Raises ConfigurationError: --units names what is no unit.
+        """
+        if self.units is None:
+            return None
+        from smartcam.layout._inside import ShownUnits
+
+        names = [name.strip() for name in self.units.split(",")]
+        ShownUnits(names)
+        return names
+
+    def result_text(self) -> Callable[[Camera, Result], str]:
+        """Return the function that makes a text of a camera's result for people, with units.
+
+        Raises ConfigurationError: --units names what is no unit.
+        """
+        from smartcam._cli.texts import result_text
+        from smartcam._client._inside import own_interpreter
+        from smartcam.layout._inside import ShownUnits
+
+        units = ShownUnits(self.unit_names or ())
+
+        def as_text(camera: Camera, result: Result) -> str:
+            interpreter = own_interpreter(camera, result.application)
+            layout = None if interpreter is None else interpreter.layout
+            return result_text(result, units, layout)
+
+        return as_text
+
+    def value_text(self, value: object) -> str:
+        """Return the text of a value that was read as --interpret-as says, with units.
+
+        Raises ConfigurationError: --units names what is no unit.
+        """
+        from smartcam._cli.texts import value_text
+        from smartcam.interpreters import resolve
+        from smartcam.layout._inside import ShownUnits
+
+        layout = None if self.interpret_as is None else resolve(self.interpret_as).layout
+        return value_text(value, ShownUnits(self.unit_names or ()), layout)
+
     def remark(self, camera: Camera) -> None:
         """Say on stderr what who asks this camera for results should know."""
-        from smartcam._client.handshake import remarks
+        from smartcam._client._inside import remarks
 
         for text in remarks(camera.settings.address):
             click.echo(f"note: {text}", err=True)

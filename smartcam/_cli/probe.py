@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from smartcam._cli.options import CAMERA, CONNECTS, Options, runs
-from smartcam.exceptions import ConnectFailedError
+from smartcam._cli.options import CONNECTS, OUTPUT, Options, option, runs
 
 if TYPE_CHECKING:
-    from smartcam.doctor._probing import CameraAnswer, Trial
+    from smartcam.doctor._inside import CameraAnswer, Trial
     from smartcam.observers import TraceEntry
 
 MAX_HEX = 128
@@ -19,39 +18,39 @@ MAX_HEX = 128
 
 
 @click.command(
-    help="Find out how a camera speaks; HOST or URL. Tries transports and dialects, the most "
-    f"probable first, until one is answered; --timeout bounds all of it. {CONNECTS}"
+    help="Find out how a camera speaks; HOST or URL. Tries what the URL says, then every protocol, "
+    f"transport and dialect, the most probable first, until one is answered. {CONNECTS}"
 )
 @click.argument("host_or_url")
 @click.option("--all", "go_on", is_flag=True, help="Try the rest too where one is answered.")
-@runs(*CAMERA)
+@option(
+    "--timeout",
+    help="Bound of all tries together (default 10); each has an equal share of what is left.",
+)
+@runs("--trace", *OUTPUT)
 async def probe(host_or_url: str, go_on: bool, options: Options) -> None:
-    """Try transports and dialects, one after the other on fresh links.
+    """Try protocols, transports and dialects, one after the other on fresh links.
 
     Raises ConnectFailedError: none answered; names each try.
     """
-    from smartcam.doctor._probing import trials
+    from smartcam.doctor._inside import no_session, trials
     from smartcam.settings import parse_address
 
     address = parse_address(host_or_url)
     answers: list[CameraAnswer] = []
-    failed: list[str] = []
+    failed: list[Trial] = []
     with options.tracing(host_or_url) as trace:
         timeout = options.step(10.0)
-        async with aclosing(trials(address, timeout=timeout, trace=trace, go_on=go_on)) as tries:
+        tries = trials(address, timeout=timeout, trace=trace, go_on=go_on, every_protocol=True)
+        async with aclosing(tries):
             async for trial in tries:
                 _show_trial(trial, options)
                 if trial.answer is not None:
                     answers.append(trial.answer)
                 else:
-                    failed.append(str(trial))
+                    failed.append(trial)
     if not answers:
-        raise ConnectFailedError(
-            f"no session with {address.host}:{address.port}: " + "; ".join(failed),
-            host=address.host,
-            port=address.port,
-            attempts=tuple(failed),
-        )
+        raise no_session(host_or_url, address, failed)
     _show_answers(answers, options)
 
 
@@ -68,9 +67,11 @@ def frame_text(entry: TraceEntry) -> str:
 
 def _show_trial(trial: Trial, options: Options) -> None:
     told = ("transport", "dialect", "step", "outcome", "frames", "omitted")
-    value = {name: getattr(trial, name) for name in told}
+    address = {"protocol": trial.address.protocol, "port": trial.address.port}
+    value = {**address, **{name: getattr(trial, name) for name in told}}
     outcome = f"{trial.step}: {trial.outcome}" if trial.answer is None else "a camera answers"
-    lines = [f"{trial.transport} {trial.dialect}: {outcome}"]
+    of = f"{trial.address.protocol} at port {trial.address.port}: " if trial.other else ""
+    lines = [f"{of}{trial.transport} {trial.dialect}: {outcome}"]
     lines += [f"  {frame_text(entry)}" for entry in trial.frames]
     if trial.omitted:
         lines.append(f"  ... and {trial.omitted} more")

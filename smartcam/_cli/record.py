@@ -6,18 +6,19 @@ import asyncio
 import contextlib
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 import click
 
 from smartcam._cli.options import CONNECTS, OUTPUT, SECONDS, Options, option, runs
 from smartcam._cli.running import first
-from smartcam._cli.serve import share
 from smartcam._cli.terminal import counting
 from smartcam._cli.texts import camera_value, not_running
+from smartcam._extras import from_part
 from smartcam.backoff import Backoff
 from smartcam.exceptions import (
     CameraFaultError,
+    CommandRejectedError,
     ConfigurationError,
     ConnectionClosedError,
     ConnectionLostError,
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
     from collections.abc import Coroutine
 
     from smartcam.camera import Camera
-    from smartcam.recording import BagCounts, FleetReplay, Recorder, Recording
+    from smartcam.fleet import FleetCamera
+    from smartcam.frames import FrameSource
+    from smartcam.recording import BagCounts, BagRecorder, FleetReplay, Recorder, Recording
 
 
 def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
@@ -68,6 +71,16 @@ _camera = click.option(
 @click.option(
     "--every", type=SECONDS, metavar="SECONDS", help="Send a trigger every so many seconds."
 )
+@click.option(
+    "--pictures",
+    metavar="SOURCE",
+    help="Record the pictures of a source of frames beside it, such as gige://HOST.",
+)
+@click.option(
+    "--read-images",
+    is_flag=True,
+    help="With --every: read the camera's picture after each result, and keep it with that.",
+)
 @option("--name", help="The camera's name in the file; default HOST:PORT.")
 @option("--application")
 @option("--interpret-as", help="How to read results; default raw: bytes, kept as hex.")
@@ -78,17 +91,42 @@ async def record(
     bag: str | None,
     force: bool,
     every: float | None,
+    pictures: str | None,
+    read_images: bool,
     options: Options,
 ) -> None:
     """Record a camera."""
+    if (pictures is not None or read_images) and output is None:
+        raise click.UsageError("pictures go into a recording (-o), not into a bag")
+    if read_images and every is None:
+        raise click.UsageError(
+            "--read-images needs --every: only of a trigger that is sent from "
+            "here the picture that is read is surely the result's"
+        )
     recorders = _recorders(output, bag, force=force)
-    with options.camera(url, observers=recorders, reconnect=Backoff()) as unopened:
-        await _record(unopened, recorders, every, options)
+    url = await options.located(url)
+    async with contextlib.AsyncExitStack() as stack:
+        source = None
+        if pictures is not None:
+            with from_part("frames", "pictures need"):
+                from smartcam._cli.frame_sources import opened
+
+            source = await stack.enter_async_context(opened(pictures, options))
+        camera = stack.enter_context(options.camera(url, observers=recorders, reconnect=Backoff()))
+        await _record(camera, recorders, _Plan(every, source, read_images), options)
+
+
+class _Plan(NamedTuple):
+    """The triggers and pictures of a recording."""
+
+    every: float | None  # seconds between triggers; None: none are sent
+    source: FrameSource | None  # whose pictures are recorded as well
+    read_images: bool  # after each trigger, the camera's picture
 
 
 def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Recorder]:
-    """Return what is to be written."""
-    from smartcam.recording import BagRecorder, Recorder
+    """Return the recorders of the file and of the bag that the options ask for."""
+    from smartcam.recording import Recorder
 
     recorders: list[Recorder] = []
     if output is not None:
@@ -96,6 +134,8 @@ def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Reco
     if bag is not None:
         if output is not None and Path(output).resolve().parent == Path(bag).resolve():
             raise ConfigurationError(f"--output {output}: it would be in the bag's own folder")
+        with from_part("ros2", "a bag needs"):
+            from smartcam.recording import BagRecorder
         recorders.append(BagRecorder(bag, overwrite=force))
     if not recorders:
         raise click.UsageError("Missing option '-o' / '--output', or '--bag'.")
@@ -103,11 +143,10 @@ def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Reco
 
 
 async def _record(
-    unopened: Camera, recorders: list[Recorder], every: float | None, options: Options
+    unopened: Camera, recorders: list[Recorder], plan: _Plan, options: Options
 ) -> None:
     from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
-    from smartcam.fleet import FleetCamera
-    from smartcam.ros2._camera_reading import in_pixels, own_interpreter
+    from smartcam.settings import is_fleet
 
     opened: list[Recorder] = []
     facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
@@ -120,16 +159,9 @@ async def _record(
         # subscribed, so that every container is interpreted
         results = unopened.results(max_queue=1)
         async with unopened as camera:
-            if isinstance(camera, FleetCamera):
-                # its frames, which would tell, are its agent's
-                dialect = camera.capabilities.dialect
-                _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
-                # what its agent knows of them, where it was not said here
-                read = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
-                if in_pixels(own_interpreter(camera, camera.active_application)):
-                    read["pixels"] = True
-                _describe(recorders, camera.name, **{name: on for name, on in read.items() if on})
-            elif every is None and not camera.capabilities.unasked_results:
+            if is_fleet(camera.url):
+                _describe_shared(recorders, cast("FleetCamera[Any]", camera))
+            elif plan.every is None and not camera.capabilities.unasked_results:
                 raise UnsupportedError(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "
                     "while it is recorded: --every SECONDS"
@@ -140,13 +172,35 @@ async def _record(
                 f"recording {camera.url} to {' and '.join(paths.values())}, Ctrl-C to end",
             )
             jobs: list[Coroutine[Any, Any, None]] = [*map(_watch_disk, recorders)]
-            jobs.append(_count(results, recorders[0], options.count))
-            if every is not None:
-                jobs.append(_trigger(camera, every, options.step(DEFAULT_TRIGGER_TIMEOUT)))
+            reads_last = plan.read_images  # then the last picture is read, too, before it ends
+            jobs.append(_count(results, recorders[0], None if reads_last else options.count))
+            images = recorders[0] if plan.read_images else None
+            if images is not None and not camera.capabilities.read_image:
+                raise UnsupportedError(
+                    f"{camera.name}: this camera cannot be asked for a picture; --pictures SOURCE "
+                    "records those of a source of frames"
+                )
+            if plan.every is not None:
+                step = options.step(DEFAULT_TRIGGER_TIMEOUT)
+                jobs.append(_trigger(camera, plan.every, step, images, options.count))
+            if plan.source is not None:
+                jobs.append(_record_pictures(plan.source, recorders[0], camera.name))
             async with counting(camera):
                 await first(jobs, options.seconds)
     finally:
         await _end_all(opened, unopened, options)
+
+
+def _describe_shared(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
+    """Note what the frames would tell, which a shared camera's agent keeps, and what it knows."""
+    from smartcam._client._inside import in_pixels, own_interpreter
+
+    dialect = camera.capabilities.dialect
+    _describe(recorders, camera.name, dialect=dialect, endian=camera.endian)
+    read = {name: getattr(camera.settings, name) for name in ("y_down", "lenient")}
+    if in_pixels(own_interpreter(camera, camera.active_application)):
+        read["pixels"] = True
+    _describe(recorders, camera.name, **{name: on for name, on in read.items() if on})
 
 
 def _describe(recorders: list[Recorder], camera: str, **facts: object) -> None:
@@ -155,9 +209,18 @@ def _describe(recorders: list[Recorder], camera: str, **facts: object) -> None:
 
 
 def _word(recorder: Recorder) -> str:
-    from smartcam.recording import BagRecorder
+    return "file" if _as_bag(recorder) is None else "bag"
 
-    return "bag" if isinstance(recorder, BagRecorder) else "file"
+
+def _as_bag(recorder: Recorder) -> BagRecorder | None:
+    """Return a recorder that writes a bag; None for one that writes a plain file."""
+    from smartcam.recording import Recorder as PlainRecorder
+
+    if type(recorder) is PlainRecorder:
+        return None
+    with from_part("ros2", "a bag needs"):
+        from smartcam.recording import BagRecorder
+    return recorder if isinstance(recorder, BagRecorder) else None
 
 
 async def _watch_disk(recorder: Recorder) -> None:
@@ -175,14 +238,42 @@ async def _count(results: Any, recorder: Recorder, count: int | None) -> None:
             return
 
 
-async def _trigger(camera: Camera, every: float, timeout: float) -> None:
-    """Send triggers; what goes wrong with one is recorded, as long as the first ones went well."""
+async def _record_pictures(source: FrameSource, recorder: Recorder, camera: str) -> None:
+    """Record a source's pictures, as the camera's; the end of a source ends the recording."""
+    await recorder.record(source, camera=camera)
+
+
+async def _read_image(camera: Camera, recorder: Recorder, result: Any, results: int) -> None:
+    """Keep the picture that a result was made of; of another trigger's it would be a wrong one."""
+    try:
+        image = await camera.read_image()
+    except CommandRejectedError:  # it has none, which the recorded frames say
+        return
+    if recorder.counts.results == results:
+        await asyncio.to_thread(recorder.add_image, camera.name, image, result=result)
+
+
+async def _trigger(
+    camera: Camera,
+    every: float,
+    timeout: float,
+    images: Recorder | None,
+    count: int | None,
+) -> None:
+    """Send triggers; what goes wrong with one is recorded, as long as the first ones went well.
+
+    ``images``: the recorder that also gets the picture of each result, of ``count`` of them.
+    """
     loop = asyncio.get_running_loop()
     when, worked = loop.time(), False
     while True:
         try:
-            await camera.trigger(timeout=timeout)
+            result = await camera.trigger(timeout=timeout)
             worked = True
+            if images is not None:
+                await _read_image(camera, images, result, images.counts.results)
+                if count is not None and images.counts.results >= count:
+                    return
         except NotRunningError as exc:
             if not worked:
                 raise not_running(exc, camera, "record") from exc
@@ -207,18 +298,22 @@ async def _end_all(recorders: list[Recorder], camera: Camera, options: Options) 
 
 async def _end(recorder: Recorder, camera: Camera, options: Options) -> None:
     """End the file, and tell what is in it; without a session there is no file."""
-    from smartcam.recording import BagRecorder
-
     path = recorder.path
     await asyncio.to_thread(recorder.close)
-    if isinstance(recorder, BagRecorder):
+    bag = _as_bag(recorder)
+    if bag is not None:
         if camera.statistics().sessions:
-            _show_bag(path, recorder.bag_counts, options)
+            _show_bag(path, bag.bag_counts, options)
         else:
-            recorder.remove()
+            bag.remove()
     elif camera.statistics().sessions:
         counts, size = recorder.counts._asdict(), path.stat().st_size
-        told = ", ".join(f"{kind} {number}" for kind, number in counts.items())
+        always = ("frames", "results", "events", "errors")
+        told = ", ".join(
+            f"{kind.replace('_', ' ')} {number}"
+            for kind, number in counts.items()
+            if number or kind in always
+        )
         options.show({"file": str(path), **counts, "bytes": size}, f"{path}: {told}; {size} bytes")
     elif path.is_file() and not path.is_symlink():
         path.unlink()
@@ -271,7 +366,6 @@ async def replay(
     options: Options,
 ) -> None:
     """Play a recording."""
-    from smartcam.recording import FleetReplay
     from smartcam.recording import replay as replay_camera
 
     loaded = _loaded(recording, since, until)
@@ -280,6 +374,8 @@ async def replay(
             raise click.UsageError("--transport is for a file: programs come to a folder's agent")
         cameras = None if camera is None else [camera]
         place = f"[{host}]" if ":" in host else host
+        with from_part("fleet", "a folder of a fleet's recordings needs"):
+            from smartcam.recording import FleetReplay
         played = FleetReplay(
             loaded,
             cameras=cameras,
@@ -310,6 +406,9 @@ async def replay(
 
 async def _play_fleet(played: FleetReplay, options: Options) -> None:
     """Play a folder, until it is cut off."""
+    with from_part("fleet", "a folder of a fleet's recordings needs"):
+        from smartcam._cli.serve import share
+
     for name, why in played.skipped.items():
         click.echo(f"smartcam: note: {name} is not played: {why}", err=True)
     async with played:
@@ -360,7 +459,8 @@ async def bag(
     recording: str, output: str, force: bool, camera: str | None, options: Options
 ) -> None:
     """Show a recording to ROS 2."""
-    from smartcam.recording._bag_recording import BagConversion
+    with from_part("ros2", "a bag needs"):
+        from smartcam.recording._inside import BagConversion
 
     loaded = _loaded(recording)
     reading = options.reading(fleet=True) if options.calibration or options.y_down else {}

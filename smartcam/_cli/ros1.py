@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from smartcam.ros1 import RosbridgeNode
-    from smartcam.ros1._fleet import RosbridgeFleet
+    from smartcam.ros1._inside import RosbridgeFleet
 
 
 @click.command(
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def ros1(place: str, bridge: str, namespace: str | None, options: Options) -> None:
     """Have cameras seen in ROS 1."""
-    from smartcam.ros1._link import checked_url
+    from smartcam.ros1._inside import checked_url
 
     checked_url(bridge)  # before cameras are taken
     begun: set[str] = set()
@@ -64,16 +64,16 @@ async def ros1(place: str, bridge: str, namespace: str | None, options: Options)
 async def _served(
     path: str, bridge: str, namespace: str | None, tell: Any
 ) -> AsyncIterator[RosbridgeFleet]:
-    from smartcam.fleet import load_fleet
-    from smartcam.fleet._ros_file import RosSection
-    from smartcam.fleet._server import FleetServer
-    from smartcam.ros1._fleet import bridged
+    from smartcam.fleet import FleetServer, load_fleet
+    from smartcam.fleet._inside import RosSection
+    from smartcam.ros1._inside import bridged
 
     file, folder = load_fleet(path), Path(path).parent
     said = {one.name: one.entry.ros2 for one in file.plan()}
     found = {name: one.load_calibration(folder) for name, one in said.items()}
+    places = {name: one.load_hand_eye(folder) for name, one in said.items()}
     section = file.ros2 or RosSection.model_validate({})
-    async with FleetServer(file, folder=folder) as server:
+    async with FleetServer(file, folder=folder, restore=section.autostart) as server:
         await server.wait_tried()
         async with bridged(
             bridge,
@@ -82,7 +82,9 @@ async def _served(
             _section(namespace or section.namespace, autostart=section.autostart),
             cameras=said,
             calibrations={name: one for name, one in found.items() if one is not None},
+            places={name: one for name, one in places.items() if one is not None},
             wanted=lambda agent, _camera: agent == file.agent_name,
+            desks=server.calibrations,
         ) as ros:
             yield ros
 
@@ -91,8 +93,8 @@ async def _served(
 async def _of_fleet(
     url: str, bridge: str, namespace: str | None, tell: Any
 ) -> AsyncIterator[RosbridgeFleet]:
-    from smartcam.fleet._address import FleetAddress
-    from smartcam.ros1._fleet import bridged
+    from smartcam.fleet._inside import FleetAddress
+    from smartcam.ros1._inside import bridged
 
     address = FleetAddress.parse(url)
     if address.camera:
@@ -104,8 +106,8 @@ async def _of_fleet(
 
 
 def _section(namespace: str, *, autostart: bool = True) -> Any:
-    from smartcam.fleet._ros_file import RosSection
-    from smartcam.ros2._names import check_namespace
+    from smartcam._ros_names import check_namespace
+    from smartcam.fleet._inside import RosSection
 
     given = {"namespace": check_namespace(namespace), "autostart": autostart}
     return RosSection.model_validate(given)

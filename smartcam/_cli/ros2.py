@@ -12,15 +12,36 @@ from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
-    from smartcam.fleet._ros_file import RosSection
+    from smartcam.fleet._inside import RosSection
+
+
+ROS_ARGS = "--ros-args"
+"""The option from which on all is for ROS, as of any program of ROS."""
+
+THROUGH = {"zenoh": "zenoh", "native": "rclpy"}
+"""Values of ``--rmw``, and their names in a fleet file."""
+
+
+class RosCommand(click.Command):
+    """A command that leaves what follows ``--ros-args`` to ROS."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Keep the arguments for ROS, and read the others."""
+        at = args.index(ROS_ARGS) if ROS_ARGS in args else len(args)
+        left = super().parse_args(ctx, args[:at])
+        ctx.params["ros_args"] = tuple(args[at:])
+        return left
 
 
 @click.command(
+    cls=RosCommand,
     help="Have cameras seen in ROS 2, as nodes of programs that use rmw_zenoh, until Ctrl-C or "
-    'SIGTERM. A fleet file is served as by "smartcam serve", and a fleet\'s URL, fleet://HOST, '
+    "SIGTERM; with --rmw native through the rclpy that is installed, over any middleware, and what "
+    "follows --ros-args is ROS' then. "
+    'A fleet file is served as by "smartcam serve", and a fleet\'s URL, fleet://HOST, '
     "means the cameras of a fleet that is served already. Prints one line per camera, its node. "
     'What "ros2" in a fleet file says counts where an option says nothing. Needs the extra "ros2", '
-    "and no ROS."
+    "and no ROS but for --rmw native.",
 )
 @click.argument("place", metavar="FLEET")
 @click.option(
@@ -32,7 +53,12 @@ if TYPE_CHECKING:
 @click.option(
     "--distribution",
     type=click.Choice(["humble", "jazzy", "kilted", "lyrical", "rolling"]),
-    help="Of ROS, whose type hashes are spoken; default jazzy.",
+    help="Of ROS, whose type hashes are spoken; default jazzy, or the installed one.",
+)
+@click.option(
+    "--rmw",
+    type=click.Choice(list(THROUGH)),
+    help="Who speaks: smartcam itself as rmw_zenoh does, or the installed ROS; default zenoh.",
 )
 @runs(*OUTPUT, interrupted=0, terminated=0)
 async def ros2(
@@ -40,11 +66,19 @@ async def ros2(
     domain: int | None,
     namespace: str | None,
     distribution: str | None,
+    rmw: str | None,
+    ros_args: tuple[str, ...],
     options: Options,
 ) -> None:
     """Have cameras seen in ROS 2."""
-    said = {"domain": domain, "namespace": namespace, "distribution": distribution}
-    given: dict[str, object] = {name: value for name, value in said.items() if value is not None}
+    said: dict[str, object] = {
+        "domain": domain,
+        "namespace": namespace,
+        "distribution": distribution,
+        "through": None if rmw is None else THROUGH[rmw],
+        "args": ros_args or None,
+    }
+    given = {name: value for name, value in said.items() if value is not None}
     from smartcam.settings import is_fleet
 
     if is_fleet(place):
@@ -55,8 +89,7 @@ async def ros2(
 
 async def _served(path: str, given: dict[str, object], options: Options) -> None:
     from smartcam._cli.serve import Serving
-    from smartcam.fleet import load_fleet
-    from smartcam.fleet._server import FleetServer
+    from smartcam.fleet import FleetServer, load_fleet
 
     file = load_fleet(path)
     already = {} if file.ros2 is None else file.ros2.model_dump(exclude_unset=True)
@@ -67,8 +100,7 @@ async def _served(path: str, given: dict[str, object], options: Options) -> None
 
 
 async def _of_fleet(url: str, given: dict[str, object], options: Options) -> None:
-    from smartcam.fleet._address import FleetAddress
-    from smartcam.fleet._ros import ros_of
+    from smartcam.fleet._inside import FleetAddress, ros_of
 
     address = FleetAddress.parse(url)
     if address.camera:
@@ -83,8 +115,10 @@ async def _of_fleet(url: str, given: dict[str, object], options: Options) -> Non
 def _section(given: dict[str, object]) -> RosSection:
     from pydantic import ValidationError
 
-    from smartcam.fleet._ros_file import RosSection
+    from smartcam.fleet._inside import RosSection
 
+    if given.get("args") and given.get("through") != THROUGH["native"]:
+        raise ConfigurationError(f"{ROS_ARGS}: expected --rmw native, which has them read by ROS")
     try:
         return RosSection.model_validate(given)
     except ValidationError as exc:

@@ -22,6 +22,7 @@ from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
     ConnectionLostError,
+    FrameFeatureError,
     FrameFormatError,
     FrameSourceError,
     InterpretationError,
@@ -45,6 +46,7 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (InterpretationError, 6),
     (TimeoutError, 4),
     (FrameFormatError, 5),
+    (FrameFeatureError, 5),
     (FrameSourceError, 3),
     (CommandRejectedError, 5),
     (UnsupportedError, 5),
@@ -54,16 +56,16 @@ EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 )
 """First match decides. 0 done; 1 a fault of ours; 2 wrong usage; 3 no session or a broken one, or a
 source of frames that is not there, in use or gone; 4 a wait in a session, or for a frame, ran out;
-5 the camera refused, is not running or has no such pixels; 6 a result is not interpretable; 7
-``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut off by Ctrl-C
-or SIGTERM."""
+5 the camera refused, is not running, or has no such pixels or feature; 6 a result is not
+interpretable; 7 ``calibrate --check``: stale, ``calibrate compare``: they differ; 130 and 143: cut
+off by Ctrl-C or SIGTERM."""
 
 
 TAKEN = (
     "Has another client taken it? Most cameras serve one, and the newcomer wins. smartcam doctor "
     "tells more."
 )
-"""Cure of a connection that the camera ended."""
+"""The advice after a connection that the camera ended."""
 
 
 def exit_code(error: BaseException) -> int:
@@ -87,7 +89,7 @@ def run(
 
     Args:
         main: what to run.
-        program: its name, for the error line.
+        program: name of the program in the error line.
         debug: log to stderr and show tracebacks.
         as_json: tell an error as a line of JSON.
         interrupted: exit code after Ctrl-C; 0 where that is the way to end.

@@ -18,7 +18,8 @@ from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._cli.running import exit_code
 from smartcam._cli.systemd import Notifier
 from smartcam._cli.terminal import tinted
-from smartcam.exceptions import SmartCamError
+from smartcam.backoff import Backoff
+from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.models import Connected, Disconnected, Reconnected
 
 if TYPE_CHECKING:
@@ -52,12 +53,14 @@ logger: logging.Logger = logging.getLogger("smartcam.serve")
 async def serve(file: str | None, schema: bool, log: str | None, options: Options) -> None:
     """Share cameras."""
     import smartcam.fleet
+    from smartcam.fleet._inside import raise_descriptor_limit
 
     if schema:
         click.echo(json.dumps(smartcam.fleet.fleet_schema(), indent=2))
         return
     if file is None:
         raise click.UsageError("a fleet file is missing: smartcam serve FLEET.yaml, or --schema")
+    raise_descriptor_limit()
     if log == "json":  # a file that is wrong is told so, too
         with _logged(None, options):
             server = smartcam.fleet.serve(file)
@@ -119,7 +122,11 @@ class Serving:
             if server.file.record is not None:
                 recorder = _recorder(server, self._options, self._as_lines)
                 await stack.enter_async_context(recorder)
-            await stack.enter_async_context(server)
+            if server.file.outlets is not None:
+                from smartcam.fleet._inside import FleetOutlets
+
+                await stack.enter_async_context(FleetOutlets(server, self._tell_outlet))
+            await self._enter(stack)
             stack.callback(notifier.stopping)
             server.reloads.tell = self._on_reload
             stack.enter_context(notifier.telling(self._status))
@@ -137,14 +144,39 @@ class Serving:
                 if self._options.as_json or not self._as_lines:
                     tell(server, event, self._options)
 
+    async def _enter(self, stack: contextlib.AsyncExitStack) -> None:
+        """Start the agent; one whose router is away is tried again, as a camera is."""
+        policy, told = Backoff(), False
+        for delay in policy.delays():
+            try:
+                await stack.enter_async_context(self._server)
+            except ConnectFailedError as exc:
+                if self._server.file.endpoints[0] or not policy.transient(exc):
+                    raise  # it cannot listen, or would never be let in
+                if not told:
+                    self._warn(f"{exc}; it is tried on")
+                told = True
+            else:
+                return
+            await asyncio.sleep(delay)
+
     def _warn(self, text: str) -> None:
         if self._as_lines:
             logger.warning("%s", text)
         else:
             click.echo(f"{tinted('error', 'warning:')} {text}", err=True)
 
+    def _tell_outlet(self, name: str, why: str) -> None:
+        if not self._as_lines:  # else it was logged
+            text = why or "delivers again"
+            click.echo(f"{datetime.now(UTC).astimezone():%H:%M:%S} outlet {name}: {text}", err=True)
+
     def _show_cameras(self) -> None:
         server = self._server
+        if not server.file.cameras:
+            url = server.address.url
+            router: dict[str, Any] = {"url": url, "router": True}
+            self._say("", router, f"{url}  a router, without cameras", connected=True)
         for name in [*server.hosts]:
             value = _camera(server, name)
             why = "" if value["connected"] else f"  not connected: {value['reason']}"
@@ -210,6 +242,8 @@ class Serving:
         server = self._server
         hosts = server.hosts.values()
         text = f"{sum(host.connected for host in hosts)} of {len(hosts)} cameras connected"
+        if server.agent is not None and not server.reached:
+            text = f"not on the bus; {text}"
         last = server.reloads.last
         return f"{text}; not reloaded: {last}" if isinstance(last, Exception) else text
 
@@ -244,7 +278,7 @@ async def _while_here(work: Any) -> AsyncIterator[None]:
 
 
 def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRecorder:
-    """Return what records the cameras, and says where it cannot."""
+    """Return the recorder of the cameras, which prints a line when it cannot record."""
     from smartcam.recording import FleetRecorder
 
     def say(trouble: RecordingError | None) -> None:
@@ -272,7 +306,7 @@ def _recorder(server: FleetServer, options: Options, as_lines: bool) -> FleetRec
 
 
 async def share(server: FleetServer, options: Options) -> None:
-    """Say where the cameras of a started agent are, and what comes and goes, until cut off."""
+    """Print the URLs of a started agent's cameras, and then each event, until cancelled."""
     await server.wait_tried()
     events = server.events()
     for name in server.hosts:
@@ -284,7 +318,7 @@ async def share(server: FleetServer, options: Options) -> None:
 
 
 def _camera(server: FleetServer, name: str) -> dict[str, Any]:
-    """Return what is known of a camera, for JSON."""
+    """Return the state of the agent's camera as values for JSON."""
     host = server.hosts[name]
     connected = host.connected
     failure = host.failure or "it is tried for the first time"

@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from smartcam._cli.options import OUTPUT, Options, naming, runs
+from smartcam._cli.usage import ListedGroup
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
 F = TypeVar("F", bound="Callable[..., Any]")
 
-DIGITS = 9
-"""Of a length in metres: nanometres."""
+LENGTH_DECIMALS = 9
+"""Decimals of a length in metres, which is rounded to nanometres."""
 
 
-@click.group()
+@click.group(cls=ListedGroup)
 def sheet() -> None:
     """Make a sheet to print: a target to scale, rays A and B from its origin, rulers.
 
@@ -29,7 +30,7 @@ def sheet() -> None:
 
 
 def _metres(_context: object, _option: object, millimetres: float | None) -> float | None:
-    return None if millimetres is None else round(millimetres / 1e3, DIGITS)
+    return None if millimetres is None else round(millimetres / 1e3, LENGTH_DECIMALS)
 
 
 def _length(name: str, about: str, **more: Any) -> Callable[[F], F]:
@@ -37,8 +38,8 @@ def _length(name: str, about: str, **more: Any) -> Callable[[F], F]:
     return click.option(name, type=kind, metavar="MM", callback=_metres, help=about, **more)
 
 
-def _count(name: str, about: str) -> Callable[[F], F]:
-    return click.option(name, type=click.IntRange(3, 1000), required=True, help=about)
+def _count(name: str, about: str, least: int = 3) -> Callable[[F], F]:
+    return click.option(name, type=click.IntRange(least, 1000), required=True, help=about)
 
 
 def _makes(
@@ -118,8 +119,36 @@ async def checkerboard(**given: Any) -> None:
 @_makes
 async def charuco(square: float, marker: float | None, **given: Any) -> None:
     """A checkerboard with a marker in each white square: some of it may be hidden."""
-    side = round(0.75 * square, DIGITS) if marker is None else marker
+    side = round(0.75 * square, LENGTH_DECIMALS) if marker is None else marker
     await _make("charuco", square=square, marker=side, **given)
+
+
+@sheet.command("marker_grid")
+@_count("--columns", "Markers along x.", least=1)
+@_count("--rows", "Markers along y.", least=1)
+@_length("--marker", "Side of a marker, its black border with it.", required=True)
+@_length("--gap", "Between two markers.", required=True)
+@click.option(
+    "--dictionary",
+    metavar="NAME",
+    default="DICT_4X4_50",
+    show_default=True,
+    help="OpenCV's name of the markers' dictionary.",
+)
+@click.option(
+    "--kalibr",
+    is_flag=True,
+    help="An AprilGrid as Kalibr has it: tags of 36h11 with a border of two modules, numbered from "
+    "the lower left, with squares between their corners.",
+)
+@_makes
+async def marker_grid(dictionary: str, kalibr: bool, **given: Any) -> None:
+    """Markers in rows and columns: some of them may be hidden."""
+    if kalibr:
+        given |= {"dictionary": "DICT_APRILTAG_36h11", "border": 2, "kalibr": True}
+    else:
+        given["dictionary"] = dictionary
+    await _make("marker_grid", **given)
 
 
 @sheet.command()
@@ -133,7 +162,7 @@ async def charuco(square: float, marker: float | None, **given: Any) -> None:
 async def circles(spacing: float, diameter: float | None, asymmetric: bool, **given: Any) -> None:
     """Dots in rows and columns."""
     part = 0.4 if asymmetric else 0.5
-    dot = round(part * spacing, DIGITS) if diameter is None else diameter
+    dot = round(part * spacing, LENGTH_DECIMALS) if diameter is None else diameter
     await _make("circles", spacing=spacing, diameter=dot, asymmetric=asymmetric, **given)
 
 
@@ -163,7 +192,8 @@ async def _make(
     for path in outputs:
         if _suffix(path) not in {".svg", ".pdf"}:
             raise click.UsageError(f"-o {path}: expected a name that ends with .svg or .pdf")
-    from smartcam.calibration._printing.sheets import make_sheet, on_paper, scaled
+    from smartcam.calibration import make_sheet, scaled
+    from smartcam.calibration._inside import on_paper
 
     made = make_sheet(on_paper({"kind": kind, **described}), page=page)
     real = made.target if measured is None else scaled(made.target, measured)

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import click
 
 import smartcam
-from smartcam._cli.usage import JsonErrors, importing
+from smartcam._cli.usage import ListedGroup, importing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+    from types import ModuleType
 
     from click.shell_completion import CompletionItem
 
@@ -35,10 +36,12 @@ class Listed(NamedTuple):
     Attributes:
         module: of this package; the command has its name there.
         summary: the first sentence of its help.
+        extra: the extra that brings the module, where smartcam alone does not.
     """
 
     module: str
     summary: str
+    extra: str = ""
 
 
 TOPICS: Mapping[str, Mapping[str, Listed]] = {
@@ -60,6 +63,16 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         "status": Listed("camera", "Show a camera's status; changes nothing on it."),
         "start": Listed("camera", "Enter run mode; returns when the camera is ready."),
         "stop": Listed("camera", "Leave run mode; returns when the camera has stopped."),
+        "outlet": Listed(
+            "outlet",
+            "Bring a camera's results to brokers and databases, as a YAML file says, until Ctrl-C.",
+            extra="mqtt",
+        ),
+        "results": Listed(
+            "results",
+            "Show the results in a store: those of a shift, those that failed.",
+            extra="mqtt",
+        ),
         "switch": Listed(
             "camera",
             "Load another application by its id, or by the name of its file where the camera can "
@@ -71,24 +84,40 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
             "serve",
             "Have the sessions with the cameras of a fleet file, and share them with any number "
             "of programs, until Ctrl-C or SIGTERM.",
+            extra="fleet",
         ),
-        "fleet": Listed("fleet", "Show and use the cameras of a fleet together."),
+        "fleet": Listed("fleet", "Show and use the cameras of a fleet together.", extra="fleet"),
         "ros2": Listed(
             "ros2",
             "Have cameras seen in ROS 2, as nodes of programs that use rmw_zenoh, until Ctrl-C "
-            "or SIGTERM.",
+            "or SIGTERM; with --rmw native through the rclpy that is installed, over any "
+            "middleware, and what follows --ros-args is ROS' then.",
+            extra="ros2",
         ),
         "ros1": Listed(
             "ros1",
             "Have cameras seen in ROS 1, over a rosbridge, until Ctrl-C or SIGTERM: the topics "
             'and services that "smartcam ros2" has, without what ROS 1 has not.',
+            extra="ros2",
         ),
     },
     "Pictures": {
-        "frames": Listed("frames", "Pictures of any camera."),
+        "frames": Listed("frames", "Pictures of any camera.", extra="frames"),
+        "teach": Listed(
+            "teach",
+            "Teach an application of a software camera, on a page or by options: draw regions, "
+            "choose tools, see what they find, set tolerances, save.",
+            extra="inspection",
+        ),
+        "inspect": Listed(
+            "inspect",
+            "Try an application of a software camera on pictures in files, and draw what it saw.",
+            extra="inspection",
+        ),
         "depth": Listed(
             "depth",
             "Clouds of points, as .ply and .pcd files: shown on a page, filtered, converted.",
+            extra="depth",
         ),
     },
     "Finding out": {
@@ -114,10 +143,17 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         "calibrate": Listed(
             "calibrate",
             "Calibrate a camera against a robot: where its localizations lie in the robot's space.",
+            extra="calibration",
+        ),
+        "gateway": Listed(
+            "gateway",
+            "Answer robots and PLCs that ask for parts, line by line over TCP, until Ctrl-C.",
+            extra="calibration",
         ),
         "sheet": Listed(
             "sheet",
             "Make a sheet to print: a target to scale, rays A and B from its origin, rulers.",
+            extra="calibration",
         ),
     },
     "Recordings": {
@@ -148,16 +184,23 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         ),
     },
     "Without a camera": {
+        "emulator": Listed(
+            "smartcam_emulator",
+            "Emulate smart cameras, over real TCP or UDP, until Ctrl-C or SIGTERM.",
+        ),
         "demo": Listed(
             "demos",
             "Watch smartcam do its main job against an emulated camera over real TCP.",
         ),
     },
 }
-"""What ``--help`` lists where."""
+"""Commands by topic, in the order of ``--help``."""
 
 LISTED = {name: listed for commands in TOPICS.values() for name, listed in commands.items()}
 """All of them."""
+
+ALIASES = {"emulate": "emulator"}
+"""Other names of commands, which no list shows."""
 
 
 class CommandTable(MutableMapping[str, click.Command]):
@@ -174,7 +217,7 @@ class CommandTable(MutableMapping[str, click.Command]):
         found = self._commands[name]
         if isinstance(found, Listed):
             with importing():
-                module = importlib.import_module(f"smartcam._cli.{found.module}")
+                module = _module(name, found)
             found = self._commands[name] = cast("click.Command", getattr(module, name))
         return found
 
@@ -191,11 +234,27 @@ class CommandTable(MutableMapping[str, click.Command]):
         return len(self._commands)
 
 
-class CommandsByTopic(JsonErrors, click.Group):
+def _module(name: str, listed: Listed) -> ModuleType:
+    """Return the module of a command; a usage error where the extra that brings it is missing."""
+    from smartcam._extras import from_part
+    from smartcam.exceptions import MissingExtraError
+
+    try:
+        with from_part(listed.extra, f"smartcam {name} needs"):
+            return importlib.import_module(f"smartcam._cli.{listed.module}")
+    except MissingExtraError as exc:
+        raise click.UsageError(str(exc)) from exc
+
+
+class CommandsByTopic(ListedGroup):
     """The commands, listed by topic with whole summaries."""
 
     def __init__(self, name: str | None = None, **given: Any) -> None:
         super().__init__(name, commands=CommandTable(LISTED), **given)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command by its name, or by another one that it has."""
+        return super().get_command(ctx, ALIASES.get(cmd_name, cmd_name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list."""
@@ -218,15 +277,36 @@ class CommandsByTopic(JsonErrors, click.Group):
         return [*found, *click.Command.shell_complete(self, ctx, incomplete)]
 
 
+def _install_completion(ctx: click.Context, _option: click.Parameter, shell: str | None) -> None:
+    if shell is None or ctx.resilient_parsing:
+        return
+    from smartcam._cli.completion import install
+
+    click.echo(install(shell))
+    ctx.exit()
+
+
 @click.group(
     cls=CommandsByTopic, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]}
 )
 @click.version_option(smartcam.__version__)
+@click.option(
+    "--install-completion",
+    metavar="[bash|zsh|fish]",
+    is_flag=False,
+    flag_value="",
+    expose_value=False,
+    is_eager=True,
+    callback=_install_completion,
+    help="Have the shell complete smartcam and smartcam-emulator, and end; default: the shell that "
+    "SHELL names.",
+)
 def command() -> None:
     """Talk to industrial smart cameras.
 
     A camera is named by its URL: bvs://HOST[:PORT] over TCP, bvs+udp://HOST[:PORT] over UDP,
     insight://[USER[:PASSWORD]@]HOST[:PORT]; ?dialect=NAME pins what is otherwise found out (see
     "smartcam protocols"). fleet://HOST[:PORT]/NAME is a camera that "smartcam serve" shares with
-    any number of programs.
+    any number of programs. "smartcam emulator" (or smartcam-emulator) is a camera to try all of
+    it with.
     """

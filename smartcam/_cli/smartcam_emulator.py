@@ -12,16 +12,18 @@ from smartcam._cli.options import DIALECTS, OUTPUT, Options, runs
 from smartcam._cli.page import PageOptions, page_options
 from smartcam._cli.texts import camera_value
 from smartcam._cli.usage import JsonErrors
+from smartcam._extras import from_part
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
     from contextlib import AsyncExitStack
 
     from smartcam.emulator import Scenario, WireCamera
+    from smartcam.inspection import SoftwareDevice
 
 PROTOCOL = "bvs"
-"""Whose cameras they are where nothing else is said."""
+"""The protocol of the emulated cameras, by default."""
 
 SHOWN = 7
 """The application that runs where a page shows a camera of no scenario."""
@@ -33,10 +35,10 @@ _SAID = {
     "seed": "--seed",
     "web": "--web",
 }
-"""What not every emulated camera takes, as it is said."""
+"""Names, in errors, of the options that not every emulated camera takes."""
 
 
-@click.command(cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
+@click.command("emulator", cls=JsonErrors, context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("scenario", required=False, metavar="[SCENARIO.yaml]")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
 @click.option(
@@ -77,6 +79,12 @@ _SAID = {
     type=int,
     help="Of all that is left to chance; default what the scenario says, else 0.",
 )
+@click.option(
+    "--program",
+    type=click.Path(dir_okay=False),
+    metavar="CELL.yaml",
+    help="Serve the software cameras of a cell file instead: programs that inspect real pictures.",
+)
 @click.option("--schema", is_flag=True, help="Print the JSON Schema of scenario files, and end.")
 @click.option(
     "--generators", is_flag=True, help="List what can make an application's values, and end."
@@ -97,6 +105,7 @@ async def command(
     cameras: int,
     quirks: tuple[str, ...],
     seed: int | None,
+    program: str | None,
     schema: bool,
     generators: bool,
     web: PageOptions,
@@ -122,36 +131,54 @@ async def command(
     import asyncio
     from contextlib import AsyncExitStack
 
-    from smartcam.emulator._makes import emulated_class
+    from smartcam.emulator import WireCamera
+    from smartcam.emulator._inside import emulated_class
 
-    plans = _scenarios(scenario, protocol, dialect, cameras, shown=web.wanted)
-    for plan in plans:
-        _refuse_what_does_not_fit(context, plan)
     chosen = dict(map(_quirk, quirks)) or None
-    emulators = [
-        emulated_class(plan.protocol).from_scenario(
-            plan,
-            host=host,
-            port=port + index if port else port,
-            dialect=dialect,
-            transport=transport,
-            quirks=chosen,
-            seed=None if seed is None else seed + index,
-        )
-        for index, plan in enumerate(plans)
-    ]
+    place: dict[str, Any] = {
+        "host": host,
+        "dialect": dialect,
+        "transport": transport,
+        "quirks": chosen,
+    }
+    servers: list[WireCamera | SoftwareDevice]
+    if program is not None:
+        if scenario is not None or cameras > 1:
+            raise click.UsageError(
+                "--program has the cameras of its file: no scenario, no --cameras"
+            )
+        servers = [*_software(program, protocol or PROTOCOL, port, seed, place)]
+    else:
+        plans = _scenarios(scenario, protocol, dialect, cameras, shown=web.wanted)
+        for plan in plans:
+            _refuse_what_does_not_fit(context, plan)
+        servers = [
+            emulated_class(plan.protocol).from_scenario(
+                plan,
+                port=port + index if port else port,
+                seed=None if seed is None else seed + index,
+                **place,
+            )
+            for index, plan in enumerate(plans)
+        ]
     async with AsyncExitStack() as stack:
-        for emulator in emulators:
-            await stack.enter_async_context(emulator)
+        for server in servers:
+            await stack.enter_async_context(server)
+        emulators = [one if isinstance(one, WireCamera) else one.emulator for one in servers]
         address = await _open_page(web, stack, emulators)
+        named = scenario is not None or program is not None
         for emulator in emulators:
-            _announce(emulator, options, named=scenario is not None, page=address)
+            _announce(emulator, options, named=named, page=address)
         await asyncio.Event().wait()
+
+
+emulator = command
+"""The command as ``smartcam emulator``."""
 
 
 def _list_generators(options: Options) -> None:
     """Print a line for each generator; a broken plug-in costs only its own."""
-    from smartcam.emulator._generators import find_generator
+    from smartcam.emulator._inside import find_generator
     from smartcam.registry import GENERATORS
 
     for info in GENERATORS.available():
@@ -175,6 +202,25 @@ async def _open_page(
     await stack.enter_async_context(site)
     click.echo(f"page: {site.url}", err=True)
     return site.url
+
+
+def _software(
+    path: str, protocol: str, port: int | None, seed: int | None, place: dict[str, Any]
+) -> Iterator[SoftwareDevice]:
+    """Yield the software cameras of a cell file.
+
+    Raises ConfigurationError: the file is wrong, or a camera cannot be so.
+    """
+    with from_part("inspection", "--program needs"):
+        from smartcam.inspection import SoftwareDevice, load_cell
+    for index, camera in enumerate(load_cell(path).values()):
+        yield SoftwareDevice(
+            camera,
+            protocol=protocol,
+            port=port + index if port else 0,
+            seed=None if seed is None else seed + index,
+            **place,
+        )
 
 
 def _scenarios(
@@ -210,7 +256,7 @@ def _scenarios(
 def _plain(protocol: str, *, shown: bool) -> Scenario:
     """Return a camera without a scenario; one with a page has something to show."""
     from smartcam.emulator import Scenario
-    from smartcam.emulator._makes import emulated_class
+    from smartcam.emulator._inside import emulated_class
 
     if not (shown and emulated_class(protocol).state_options(SHOWN, running=True)):
         return Scenario(protocol=protocol)
@@ -221,7 +267,7 @@ def _quirk(text: str) -> tuple[str, Any]:
     name, equals, value = text.partition("=")
     if not equals:
         return name, True
-    from smartcam.layout._yamls import BadYamlError, load
+    from smartcam.layout._inside import BadYamlError, load
 
     try:
         return name, load(value, what="--quirk NAME=VALUE")
@@ -231,7 +277,7 @@ def _quirk(text: str) -> tuple[str, Any]:
 
 def _refuse_what_does_not_fit(context: click.Context, plan: Scenario) -> None:
     """Refuse what a camera of this protocol does not take; click.UsageError names what it does."""
-    from smartcam.emulator._makes import emulated_class
+    from smartcam.emulator._inside import emulated_class
 
     takes = emulated_class(plan.protocol).takes
     for name, text in _SAID.items():

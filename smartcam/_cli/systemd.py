@@ -1,4 +1,4 @@
-"""What systemd is told: one datagram each to the socket that NOTIFY_SOCKET names; see sd_notify(3).
+"""Notify systemd: one datagram each to the socket that NOTIFY_SOCKET names; see sd_notify(3).
 
 Where there is no such variable, nothing is done. Nothing here blocks or raises: who is told of a
 program must not be able to stop it.
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.systemd")
 
-MOST_STATUS = 500
+MAX_STATUS = 500
 """Characters of a status: one line in ``systemctl status``."""
 
-MOST_UNSENT = 32
+MAX_UNSENT = 32
 STATUS_PERIOD = 5.0
 """Seconds between two looks at the status, where no watchdog asks for more."""
 
@@ -49,27 +49,27 @@ class Notifier:
         self._status = ""
 
     def ready(self, status: str) -> None:
-        """The program is ready, or ready again after a reload."""
+        """Say that the program is ready, or ready again after a reload."""
         self._send("READY=1", self._status_line(status), keep=True)
 
     def reloading(self, status: str) -> None:
-        """A reload has begun; :meth:`ready` says that it is over."""
+        """Say that a reload has begun; :meth:`ready` says that it is over."""
         now = time.monotonic_ns() // 1000
         self._send("RELOADING=1", f"MONOTONIC_USEC={now}", self._status_line(status), keep=True)
 
     def stopping(self) -> None:
-        """The program ends."""
+        """Say that the program ends."""
         self._send("STOPPING=1", self._status_line("stopping"), keep=True)
 
     def status(self, status: str) -> None:
-        """Say in words how it is, where that has changed."""
+        """Report the state in words to systemd, where it has changed."""
         before = self._status
         line = self._status_line(status)
         if self._status != before:
             self._send(line)
 
     def alive(self) -> None:
-        """The event loop runs."""
+        """Say that the event loop runs."""
         self._send("WATCHDOG=1")
 
     def close(self) -> None:
@@ -79,7 +79,7 @@ class Notifier:
             self._socket = None
 
     def _status_line(self, status: str) -> str:
-        self._status = " ".join(status.split())[:MOST_STATUS]
+        self._status = " ".join(status.split())[:MAX_STATUS]
         return f"STATUS={self._status}"
 
     def _send(self, *lines: str, keep: bool = False) -> None:
@@ -99,14 +99,14 @@ class Notifier:
             if not keep:
                 del self._unsent[-1]
                 self._status = ""  # to be said again
-            del self._unsent[:-MOST_UNSENT]
+            del self._unsent[:-MAX_UNSENT]
             if not self._failed:
                 logger.warning("systemd cannot be told by NOTIFY_SOCKET: %s", exc)
             self._failed = True
 
     @contextlib.contextmanager
     def telling(self, status: Callable[[], str]) -> Iterator[None]:
-        """In here the running event loop says again and again that it runs, and how it is.
+        """Have the event loop say again and again, while in here, that it runs, and how it is.
 
         It says so at half of the watchdog's time. A loop that hangs says nothing, and is killed.
         """

@@ -1,4 +1,4 @@
-"""What only a terminal gets: colour, and a line that tells how a wait goes."""
+"""Colour, and a line that shows how a wait goes, for terminals only."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
 
-COLOURS = {"ok": "green", "hint": "cyan", "warning": "yellow", "error": "red"}
-"""Of words that judge; the word says the same without it."""
+VERDICT_COLOURS = {"ok": "green", "hint": "cyan", "warning": "yellow", "error": "red"}
+"""The colour of each word that judges; the word says the same without its colour."""
 
 PERIOD = 1.0
 """Seconds between two looks of a line that counts."""
@@ -29,7 +29,7 @@ def tinted(word: str, text: str | None = None) -> str:
     text = word if text is None else text
     if os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
-    return click.style(text, fg=COLOURS[word], bold=word == "error" or None)
+    return click.style(text, fg=VERDICT_COLOURS[word], bold=word == "error" or None)
 
 
 class CountingLine:

@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 from smartcam.exceptions import NotRunningError, hex_excerpt
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from smartcam.camera import Camera
     from smartcam.emulator import WireCamera
+    from smartcam.layout import Layout
+    from smartcam.layout._inside import ShownUnits
     from smartcam.models import Localization, Result
 
 
-DIGITS = 6
-"""Of a number that people read."""
+SIGNIFICANT_DIGITS = 6
+"""Significant digits of the largest number in a column that people read."""
 
 SMALLEST, LARGEST = 1e-3, 1e6
 """Columns whose largest number lies between them have all their points below each other."""
@@ -44,7 +46,7 @@ def _column(values: Sequence[object]) -> list[str]:
     largest = max(map(abs, floats), default=0.0)
     if len(floats) < len(values) or not SMALLEST <= largest < LARGEST:
         return [_cell(value) for value in values]
-    decimals = max(0, DIGITS - 1 - math.floor(math.log10(largest)))
+    decimals = max(0, SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest)))
     if any(0 < abs(value) < 10**-decimals for value in floats):
         return [_cell(value) for value in values]  # one of them would be shown as nothing
     texts = [f"{value:.{decimals}f}" for value in floats]
@@ -81,46 +83,84 @@ def not_running(error: NotRunningError, camera: Camera, verb: str) -> NotRunning
     )
 
 
-def result_text(result: Result) -> str:
-    """Return a result: a line about it, then its value."""
+def result_text(result: Result, units: ShownUnits, layout: Layout | None) -> str:
+    """Return a result: a line about it, then its value.
+
+    ``units``: those in which values are shown. ``layout``: that of a table, which knows no units.
+    """
     latency = f", {1e3 * result.latency:.1f} ms after its trigger" if result.latency else ""
     sequence = f", sequence {result.sequence}" if result.sequence is not None else ""
     return (
         f"result {result.number} of {application_text(result.application)}{sequence}{latency}\n"
-        f"{value_text(result.value)}"
+        f"{value_text(result.value, units, layout)}"
     )
 
 
-def value_text(value: Any) -> str:
-    """Return an interpreter's value as text."""
+def value_text(value: Any, units: ShownUnits, layout: Layout | None) -> str:
+    """Return an interpreter's value as text; arguments as :func:`result_text` has them."""
+    from smartcam.layout._inside import units_of
     from smartcam.models import Localization, jsonable
 
     if isinstance(value, bytes):
         return f"  {hex_excerpt(value)}"
     if isinstance(value, list) and value and all(isinstance(v, Localization) for v in value):
-        return _localizations_text(value)
-    plain = jsonable(value)
+        return _localizations_text(value, units)
+    plain, symbols = jsonable(value), units_of(value, layout)
     if isinstance(plain, dict):
-        return "\n".join(f"  {name} = {_cell(item)}" for name, item in plain.items())
-    if isinstance(plain, list) and plain and all(isinstance(item, dict) for item in plain):
-        return table_text(list(plain[0]), [list(item.values()) for item in plain])
+        lists = {name: units_of(getattr(value, name, None)) for name in plain}
+        texts = (_field_text(name, one, symbols, units, lists) for name, one in plain.items())
+        return "\n".join(texts)
+    if _is_table(plain):
+        return _records_text(plain, symbols, units)
     if isinstance(plain, list):
         return "\n".join(f"  {_cell(item)}" for item in plain) or "  (nothing)"
     return f"  {_cell(plain)}"
 
 
-def _localizations_text(parts: list[Localization]) -> str:
+def _is_table(plain: Any) -> bool:
+    return isinstance(plain, list) and bool(plain) and all(isinstance(one, dict) for one in plain)
+
+
+def _field_text(
+    name: str,
+    value: Any,
+    symbols: Mapping[str, str],
+    units: ShownUnits,
+    lists: Mapping[str, Mapping[str, str]],
+) -> str:
+    """Return a field's line; of a list of records a table. ``lists``: the units of their fields."""
+    if _is_table(value):
+        return f"  {name}:\n{_records_text(value, lists[name], units)}"
+    symbol = symbols.get(name, "")
+    text = f"  {name} = {_cell(units.shown(value, symbol))}"
+    return f"{text} {units.of(symbol).name}" if symbol else text
+
+
+def _records_text(rows: list[dict[str, Any]], symbols: Mapping[str, str], units: ShownUnits) -> str:
+    """Return a row for each record, with the units in the head."""
+    heads = [_head(name, symbols.get(name, ""), units) for name in rows[0]]
+    shown = [[units.shown(one, symbols.get(name, "")) for name, one in row.items()] for row in rows]
+    return table_text(heads, shown)
+
+
+def _head(name: str, symbol: str, units: ShownUnits) -> str:
+    return f"{name} [{units.of(symbol).name}]" if symbol else name
+
+
+def _localizations_text(parts: list[Localization], units: ShownUnits) -> str:
     """Return a row for each: in the plane where all of them lie there, else in space."""
     head: tuple[str, ...]
     rows: list[tuple[object, ...]]
     if any(pose.position.z or any(pose.orientation[:2]) for *_, pose in parts):
-        head = ("x [m]", "y [m]", "z [m]", "qx", "qy", "qz", "qw")
+        head = ("x", "y", "z", "qx", "qy", "qz", "qw")
         rows = [(*part.pose.position, *part.pose.orientation) for part in parts]
     else:
-        head = ("x [m]", "y [m]", "theta [rad]")
+        head = ("x", "y", "theta")
         rows = [(*part.pose.position[:2], part.pose.orientation.theta) for part in parts]
+    names = ("feature_id", "quality", *head)
     named = [(*part[:2], *row) for part, row in zip(parts, rows, strict=True)]
-    return table_text(("feature_id", "quality", *head), named)
+    symbols = {"x": "m", "y": "m", "z": "m", "theta": "rad"}
+    return _records_text([dict(zip(names, row, strict=True)) for row in named], symbols, units)
 
 
 def _cell(value: object) -> str:

@@ -60,12 +60,102 @@ class JsonErrors(click.Command):
             return super().invoke(ctx)
 
 
+class ListedGroup(JsonErrors, click.Group):
+    """A command with others below it, which are listed with their whole summaries."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list."""
+        write_commands(self, ctx, formatter)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that is meant; a usage error says which one might have been."""
+        if args and not args[0].startswith("-") and self.get_command(ctx, args[0]) is None:
+            from smartcam._suggestions import did_you_mean
+
+            end = did_you_mean(args[0], self.list_commands(ctx)) or "."
+            ctx.fail(f"No such command {args[0]!r}{end}")
+        return super().resolve_command(ctx, args)
+
+
+MAX_SUMMARY_CHARACTERS = 400
+"""Characters of a command's first sentence that a list shows."""
+
+
+def write_commands(group: click.Group, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    """Write the commands of a group with their whole summaries, but hidden ones."""
+    found = [(name, group.commands[name]) for name in group.list_commands(ctx)]
+    rows = [
+        (name, command.get_short_help_str(MAX_SUMMARY_CHARACTERS))
+        for name, command in found
+        if not command.hidden
+    ]
+    with formatter.section("Commands"):
+        formatter.write_dl(rows)
+
+
 @contextlib.contextmanager
 def _told_as_json(wanted: bool) -> Iterator[None]:
     try:
-        yield
+        with _options_suggested(), _numbers_explained():
+            yield
     except click.ClickException as exc:
         if not wanted:
             raise
         sys.stderr.write(error_json(exc, exc.format_message(), exc.exit_code) + "\n")
         raise click.exceptions.Exit(exc.exit_code) from exc
+
+
+_KINDS = {
+    "integer": "a whole number",
+    "integer range": "a whole number",
+    "float": "a number",
+    "float range": "a number",
+}
+"""Words for what an option takes, by click's names."""
+
+
+@contextlib.contextmanager
+def _numbers_explained() -> Iterator[None]:
+    """Make the error for what is no number say so in words."""
+    try:
+        yield
+    except click.BadParameter as exc:
+        given, told, kind = exc.message.partition(" is not a valid ")
+        words = _KINDS.get(kind.rstrip(".")) if told else None
+        if words is not None:
+            point = given.strip("'").replace(",", ".")
+            end = f"; did you mean {point}?" if _is_number(point) else "."
+            text = f"{given} is not {words}{end}"
+            raise click.BadParameter(
+                text, ctx=exc.ctx, param=exc.param, param_hint=exc.param_hint
+            ) from exc
+        raise
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _options_suggested() -> Iterator[None]:
+    """Make the error for an unknown option say which one may have been meant."""
+    try:
+        yield
+    except click.NoSuchOption as exc:
+        if exc.ctx is None:
+            raise
+        from smartcam._suggestions import did_you_mean
+
+        known = [
+            name for one in exc.ctx.command.params for name in (*one.opts, *one.secondary_opts)
+        ]
+        names = [name for name in known if name.startswith("--")]
+        end = did_you_mean(exc.option_name, names) or "."
+        text = f"No such option {exc.option_name!r}{end}"
+        raise click.NoSuchOption(exc.option_name, text, ctx=exc.ctx) from exc

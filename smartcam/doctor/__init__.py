@@ -1,4 +1,4 @@
-"""What is wrong with a camera, or with the way to it, in plain words and with the cure.
+"""Find out what is wrong with a camera, or with the way to it, and name the cure in plain words.
 
 :func:`examine` runs one check after the other, from the ground up: the name, the session, status,
 application, round trip, run state, triggers, layout, clock. It changes nothing on the camera and
@@ -8,9 +8,18 @@ triggers nothing unless that is allowed. :func:`find` says where in a network ca
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam.doctor import _fleet_checks as fleet_checks
+from smartcam._arguments import (
+    check_application,
+    check_callable,
+    check_flag,
+    check_integer,
+    check_number,
+    check_seconds_or_none,
+)
+from smartcam._extras import from_part
 from smartcam.doctor import _result_checks as result_checks
 from smartcam.doctor import _session_checks as session_checks
 from smartcam.doctor import _state_checks as state_checks
@@ -28,14 +37,15 @@ from smartcam.exceptions import (
     SmartCamError,
     UnsupportedError,
 )
-from smartcam.interpreters._base import resolve
+from smartcam.interpreters import resolve
 from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Awaitable, Callable
 
-    from smartcam.interpreters._base import Spec
+    from smartcam.interpreters import Spec
     from smartcam.observers import TraceEntry
+    from smartcam.settings import Address
 
 __all__ = [
     "Finding",
@@ -62,7 +72,7 @@ MAX_SECONDS = 86_400
 """Seconds that a camera is watched at most: a day."""
 
 MAX_TRIGGERS = 10_000
-"""Triggers at most: their times are kept."""
+"""Triggers of an examination at most, since their times are kept."""
 
 
 class _DoctorCheck(NamedTuple):
@@ -101,15 +111,23 @@ _AT_THE_WIRE = (
     ),
 )
 
-_IN_A_FLEET = (
-    _NAME,
-    _DoctorCheck("bus", fleet_checks.reach, _switch, in_session=False),
-    _DoctorCheck(
-        "agent", fleet_checks.find, lambda options: 5 * fleet_checks.LOOKS_WITHIN, in_session=False
-    ),
-    _DoctorCheck("session", fleet_checks.connect, _switch, in_session=False),
-    _DoctorCheck("reservation", fleet_checks.reserve, _once),
-)
+
+def _way_to(url: str) -> tuple[tuple[_DoctorCheck, ...], Address]:
+    """Return the checks on the way to a camera of a fleet, and the camera's address."""
+    with from_part("fleet", "an examination of a camera of a fleet needs"):
+        from smartcam.doctor import _fleet_checks as checks
+
+    found = (
+        _NAME,
+        _DoctorCheck("bus", checks.reach, _switch, in_session=False),
+        _DoctorCheck(
+            "agent", checks.find, lambda options: 5 * checks.LOOKS_WITHIN, in_session=False
+        ),
+        _DoctorCheck("session", checks.connect, _switch, in_session=False),
+        _DoctorCheck("reservation", checks.reserve, _once),
+    )
+    return found, checks.address_of(url)
+
 
 _CHECKS = (
     _DoctorCheck("status", state_checks.look_at_status, _requests),
@@ -150,15 +168,16 @@ async def examine(
     is started, stopped, switched or set, and nothing is triggered, unless ``trigger`` says so.
 
     Args:
-        url: the camera's address.
+        url: the camera's address; ``gige://HOST`` is a source of frames, of which the way, the
+            control, the packets and the pictures are examined.
         application: id that is expected to be active. With ``trigger`` it is loaded and started
             for the triggers, and what was before is back afterwards.
-        interpret_as: how results are to be read; None does not compare them with anything.
-        y_down: the camera's y axis points down.
-        trigger: send triggers.
+        interpret_as: interpretation of the results; None does not compare them with anything.
+        y_down: whether the camera's y axis points down.
+        trigger: whether to send triggers.
         timeout: seconds for each step: connect (default 10), request (5), switch (10), trigger (5).
-        seconds: how long a camera is watched that sends results by itself.
-        count: how many triggers.
+        seconds: time for which a camera is watched that sends results by itself.
+        count: number of triggers.
         trace: called with everything that goes over the wire.
 
     Raises:
@@ -167,11 +186,31 @@ async def examine(
     Cancellation: the session is ended in order, an application that was loaded goes back. So is it
     when the generator is closed: use :func:`contextlib.aclosing`.
     """
-    if not 0 < seconds <= MAX_SECONDS or not 0 < count <= MAX_TRIGGERS:
+    if application is not None:
+        application = check_application(application, who="doctor")
+    gige = _is_gige(url)
+    if gige and (trigger or application is not None or interpret_as is not None):
         raise ConfigurationError(
-            f"doctor: seconds={seconds!r} and count={count!r}: expected more than 0, and at most "
-            f"{MAX_SECONDS} seconds and {MAX_TRIGGERS} triggers"
+            "doctor: a GigE camera has no applications and no results: trigger, application and "
+            "interpret_as are for smart cameras"
         )
+    seconds = check_number(seconds, "seconds", 0, MAX_SECONDS, "doctor", above=True)
+    count = check_integer(count, "count", 1, MAX_TRIGGERS, "doctor")
+    timeout = check_seconds_or_none(timeout, "timeout", "doctor", above=True)
+    y_down = check_flag(y_down, "y_down", "doctor")
+    trigger = check_flag(trigger, "trigger", "doctor")
+    if trace is not None:
+        check_callable(trace, "trace", "doctor")
+    if gige:
+        with from_part("frames", "an examination of a GigE camera needs"):
+            from smartcam.doctor._gige_checks import examine_gige
+
+        async with contextlib.aclosing(
+            examine_gige(url, seconds=seconds, timeout=timeout)
+        ) as findings:
+            async for finding in findings:
+                yield finding
+        return
     interpreter = None if interpret_as is None else resolve(interpret_as)
     options = DoctorOptions(
         application=application,
@@ -183,17 +222,21 @@ async def examine(
         count=count,
     )
     fleet = is_fleet(url)
-    address = fleet_checks.address_of(url) if fleet else parse_address(url)
+    way, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
     exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
     exam.make_camera()  # which sees to it that the options can work
     yield SHARED if fleet else NOTICE
     async with exam.stack, exam.borrowed:
-        for check in (*(_IN_A_FLEET if fleet else _AT_THE_WIRE), *_CHECKS):
+        for check in (*way, *_CHECKS):
             goes_on = await _run(check, exam)
             for finding in exam.take():
                 yield finding
             if not goes_on:
                 return
+
+
+def _is_gige(url: object) -> bool:
+    return isinstance(url, str) and url.strip().lower().startswith("gige://")
 
 
 async def _run(check: _DoctorCheck, exam: Examination) -> bool:
@@ -234,6 +277,8 @@ async def _run(check: _DoctorCheck, exam: Examination) -> bool:
 
 async def _explain_loss(exam: Examination, error: SmartCamError) -> None:
     if exam.in_fleet:
-        fleet_checks.explain_loss(exam, error)
+        with from_part("fleet", "an examination of a camera of a fleet needs"):
+            from smartcam.doctor import _fleet_checks as checks
+        checks.explain_loss(exam, error)
     else:
         await session_checks.explain_loss(exam, error)

@@ -12,7 +12,7 @@ from smartcam.client import SmartCamera
 from smartcam.connecting import connect
 from smartcam.doctor._findings import Exit, Finding, Severity
 from smartcam.exceptions import InterpretationError
-from smartcam.interpreters._base import Interpreter, Reader, run
+from smartcam.interpreters import Interpreter, Reader, run
 from smartcam.layout import Layout
 from smartcam.models import CameraEvent, Result, Status, StatusChanged
 from smartcam.observers import Observer
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
     from smartcam.exceptions import SmartCamError
-    from smartcam.fleet._bus import Bus
+    from smartcam.fleet._inside import Bus
     from smartcam.models import ByteOrder
     from smartcam.observers import TraceEntry
     from smartcam.settings import Address, CameraOptions
@@ -49,16 +49,16 @@ def called(application: int | None) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DoctorOptions:
-    """What was asked for.
+    """The options of an examination.
 
     Attributes:
         application: id that is expected to be active, None for any.
-        interpreter: how results are to be read, None where nothing was said.
-        y_down: the camera's y axis points down.
-        trigger: triggers may be sent, and ``application`` may be loaded for them.
+        interpreter: interpretation of the results; None where nothing was said.
+        y_down: whether the camera's y axis points down.
+        trigger: whether triggers may be sent, and ``application`` loaded for them.
         timeout: seconds for each step, None for the defaults.
-        seconds: how long the camera is watched.
-        count: triggers.
+        seconds: time for which the camera is watched.
+        count: number of triggers.
     """
 
     application: int | None = None
@@ -78,9 +78,9 @@ class Witness(Observer):
     """Sees what the camera sends and keeps the last of it.
 
     Attributes:
-        statuses: those that differ from the one before.
-        results: how many came.
-        arrivals: loop times of the last ones.
+        statuses: the last statuses, each different from the status before.
+        results: number of results since the arrivals were last forgotten.
+        arrivals: loop times at which the last results arrived, in seconds.
         containers: the last results; each value is a :class:`Reading` where an interpreter was
             given.
         unreadable: why the first result could not be given to an interpreter: an endian field
@@ -240,13 +240,15 @@ class Examination:
 
     @property
     def host_and_port(self) -> str:
-        """Where the camera is, for texts."""
+        """Address of the camera, for texts."""
         host = f"[{self.address.host}]" if ":" in self.address.host else self.address.host
         return f"{host}:{self.address.port}"
 
     def pin(self, url: str) -> None:
-        """Take over transport and dialect of a URL; a login, which no URL shows, stays."""
+        """Take over protocol, transport and dialect of a URL; a login, which none shows, stays."""
         found = parse_address(url)
+        if found.protocol != self.address.protocol:
+            self.address = found
         self.address = self.address._replace(
             scheme=found.scheme, dialect=found.dialect, quirks=found.quirks
         )
@@ -281,5 +283,5 @@ class Examination:
 
     @property
     def in_fleet(self) -> bool:
-        """Whether an agent has the session with the camera."""
+        """True if an agent has the session with the camera."""
         return is_fleet(self.address.url)

@@ -1,4 +1,4 @@
-"""What an examination says: findings, their severities, and the exit code of the worst."""
+"""The findings of an examination, their severities, and the exit code of the worst."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 Severity = Literal["ok", "hint", "warning", "error"]
 
 SEVERITIES: tuple[Severity, ...] = ("ok", "hint", "warning", "error")
-"""From the best to the worst."""
+"""Severities from the best to the worst."""
 
 
 class Exit(enum.IntEnum):
@@ -35,12 +35,12 @@ class Finding:
     """One thing that was found out.
 
     Attributes:
-        check: which check found it.
+        check: name of the check that made the finding.
         severity: ``ok``: as it should be, or only said; ``hint``: something to know or to try;
             ``warning``: it works, and something is wrong; ``error``: it does not work.
         text: what was found, in plain words.
         cure: what to do, empty where nothing is to be done.
-        details: the same for programs; times in seconds.
+        details: the finding as values for programs; times in seconds.
         exit_code: what a command that ends with it returns; 0 for all but errors.
     """
 

@@ -16,10 +16,15 @@ from smartcam.exceptions import (
     NotAllowedError,
     ResponseTimeoutError,
 )
-from smartcam.fleet._address import FleetAddress
-from smartcam.fleet._certificates import ends_soon, may_command, read_identity, shake_hands
-from smartcam.fleet._keys import Keys
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet._inside import (
+    FleetAddress,
+    Keys,
+    ZenohEnd,
+    ends_soon,
+    may_command,
+    read_identity,
+    shake_hands,
+)
 
 if TYPE_CHECKING:
     from smartcam.doctor._context import Examination
@@ -32,7 +37,7 @@ LOOKS_WITHIN = 1.0
 
 LOOK_AGAIN = 0.1
 
-MOST_LISTED = 20
+MAX_CAMERAS_LISTED = 20
 """Cameras that a finding names."""
 
 SERVE = "Is smartcam serve running on {host}? What does the listen: of its fleet file say? "
@@ -162,7 +167,9 @@ async def find(exam: Examination) -> None:
     details: dict[str, Any] = {"agents": agents, "cameras": len({one[2] for one in cameras})}
     if not sharing:
         names = sorted({name for _, _, name in cameras})
-        listed = ", ".join(names[:MOST_LISTED]) + (" ..." if len(names) > MOST_LISTED else "")
+        listed = ", ".join(names[:MAX_CAMERAS_LISTED]) + (
+            " ..." if len(names) > MAX_CAMERAS_LISTED else ""
+        )
         exam.fail(
             f"no agent{of} has a camera {address.camera}{did_you_mean(address.camera, names)}",
             f"Agents there: {', '.join(agents)}. Their cameras: {listed}.",

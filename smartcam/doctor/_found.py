@@ -1,13 +1,14 @@
-"""What a search finds: which protocols are spoken where, and what an open port may be."""
+"""The findings of a search: the protocols that are spoken, and the likely owners of open ports."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+from smartcam._arguments import check_all, check_integer, check_text
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, PluginError
-from smartcam.protocols._base import Protocol, Transport
+from smartcam.protocols import Protocol, Transport
 from smartcam.registry import PROTOCOLS
 
 if TYPE_CHECKING:
@@ -18,8 +19,8 @@ if TYPE_CHECKING:
 
 Evidence = Literal["greeted", "silent", "said", "ended", "other"]
 
-MOST_PORTS = 32
-"""Ports of one address at most."""
+MAX_PORTS = 32
+"""Ports of one address that a search opens at most."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,8 +28,8 @@ class FoundPort:
     """A port that took a connection.
 
     Attributes:
-        host: its address.
-        port: the port.
+        host: address of the host.
+        port: number of the port.
         protocols: names of the protocols that it may speak, the most probable first; empty where
             what was heard is none of them.
         evidence: ``greeted``: it said by itself what cameras of the protocol say; ``silent``: it
@@ -36,9 +37,9 @@ class FoundPort:
             what they say is not known; ``ended``: it hung up at once, as a camera may that has a
             client; ``other``: it is none of them.
         said: what came by itself, up to 512 bytes.
-        seconds: until the connection was there.
+        seconds: time until the connection was open.
         answer: what the camera said of itself, where it was asked and has answered.
-        refusal: why it has not, where it was asked.
+        refusal: why the camera has not answered, where it was asked.
     """
 
     host: str
@@ -97,7 +98,10 @@ def ports_of(
         ConfigurationError: a name is no protocol's of TCP, a number is no port.
     """
     known = tcp_protocols()
-    chosen = [*known] if names is None else [*dict.fromkeys(names)]
+    chosen = [*known]
+    if names is not None:
+        given = check_all(names, "protocols", "names of protocols", "find")
+        chosen = [*dict.fromkeys(check_text(one, "protocol", "find") for one in given)]
     for name in chosen:
         if name not in known:
             raise ConfigurationError(
@@ -110,18 +114,17 @@ def ports_of(
     for name in chosen:
         port = known[name].default_port
         found[port] = (*found.get(port, ()), known[name])
-    for port in further:
-        if not 0 < port <= 0xFFFF:
-            raise ConfigurationError(f"find: port {port!r}: expected 1 to 65535")
+    for one in check_all(further, "ports", "numbers of ports", "find"):
+        port = check_integer(one, "port", 1, 0xFFFF, "find")
         own = found.get(port, ())
         found[port] = (*own, *(known[name] for name in chosen if known[name] not in own))
-    if len(found) > MOST_PORTS:
-        raise ConfigurationError(f"find: {len(found)} ports: expected {MOST_PORTS} at most")
+    if len(found) > MAX_PORTS:
+        raise ConfigurationError(f"find: {len(found)} ports: expected {MAX_PORTS} at most")
     return found
 
 
 def serves_one(protocol: Protocol) -> bool:
-    """Return whether its cameras serve one client."""
+    """Return True if cameras of a protocol may serve only one client."""
     return any(dialect.exclusive for dialect in protocol.dialects.values())
 
 
@@ -130,14 +133,14 @@ def _scheme(protocol: Protocol) -> str:
 
 
 def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
+    """Raise ConfigurationError where asking at these ports may take a camera from its client."""
     names = sorted({one.name for several in ports.values() for one in several if serves_one(one)})
     if names:
         raise ConfigurationError(
-            f"find: cameras of {', '.join(names)} serve one client, and no document says that a "
-            "second TCP connection which sends nothing leaves that client alone; so none is opened "
-            "without consent. Say may_disturb=True (--may-disturb) when a lost session does no "
-            f"harm, or look for other protocols only (protocols, --protocol); what is in leave "
-            "(--leave, --fleet) is not touched"
+            f"find: cameras of {', '.join(names)} serve one client, and asking takes them from it; "
+            "so none is asked without consent. Say may_disturb=True (--may-disturb) when a lost "
+            "session does no harm, ask other protocols only (protocols, --protocol), or ask none; "
+            "what is in leave (--leave, --fleet) is not touched"
         )
 
 
@@ -145,7 +148,7 @@ def check_consent(ports: Mapping[int, tuple[Protocol, ...]]) -> None:
 
 
 def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]) -> FoundPort:
-    """Return what an open port is, by what was heard."""
+    """Return an open port with the protocols that fit what was heard there."""
     said = opened.said.lstrip()
     greeted = [one for one in protocols if one.greeting and said.startswith(one.greeting)]
     possible = greeted or [one for one in protocols if _may_be(one, opened)]
@@ -169,7 +172,7 @@ def judged(host: str, port: int, opened: Opened, protocols: tuple[Protocol, ...]
 
 
 def _may_be(protocol: Protocol, opened: Opened) -> bool:
-    """Return whether a camera may have been heard so, though it has not greeted."""
+    """Return True if a camera of the protocol may behave like this without a greeting."""
     if opened.said:
         return protocol.greeting is None
     # who hangs up without a word may have as many clients as it takes
@@ -177,7 +180,7 @@ def _may_be(protocol: Protocol, opened: Opened) -> bool:
 
 
 def decided(said: bytes, protocols: tuple[Protocol, ...]) -> bool:
-    """Return whether more cannot change what an open port is."""
+    """Return True if further bytes cannot change how an open port is judged."""
     heard = said.lstrip()
     if not heard:
         return False

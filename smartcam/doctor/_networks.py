@@ -1,4 +1,4 @@
-"""Which addresses a text means: a network, a range, one address, a host's name."""
+"""Read a text as addresses: a network, a range, one address, a host's name."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class HostAddress(NamedTuple):
     scope: str = ""  # interface of an IPv6 address that is the link's own
 
     def __str__(self) -> str:
-        """Return it as people write it."""
+        """Return the address as people write it."""
         kind = ipaddress.IPv4Address if self.version == 4 else ipaddress.IPv6Address
         return str(kind(self.number)) + (f"%{self.scope}" if self.scope else "")
 
@@ -59,7 +59,7 @@ class Span(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many."""
+        """The number of addresses."""
         return self.last.number - self.first.number + 1
 
 
@@ -82,11 +82,11 @@ class AddressSet:
         self._firsts = [_place(one.first) for one in self._spans]
 
     def __len__(self) -> int:
-        """How many."""
+        """Return the number of addresses."""
         return sum(one.size for one in self._spans)
 
     def __contains__(self, address: HostAddress) -> bool:
-        """Return whether an address is one of them."""
+        """Return True if an address is in the set."""
         nth = bisect.bisect_right(self._firsts, _place(address)) - 1
         if nth < 0:
             return False
@@ -133,7 +133,9 @@ def read_span(text: str, *, whole: bool = False) -> Span | None:
     if span is None:
         if _NAME.fullmatch(text):
             return None
-        raise ConfigurationError(f"{text!r:.80} is no address: {EXPECTED}")
+        host, _, port = text.rpartition(":")
+        why = "a port has no place here" if host and port.isdecimal() else "it is no address"
+        raise ConfigurationError(f"{text!r:.80}: {why}: {EXPECTED}")
     span = _mapped(span)
     for network in _NO_HOST:
         begin, end = int(network.network_address), int(network.broadcast_address)
@@ -150,7 +152,7 @@ def read_span(text: str, *, whole: bool = False) -> Span | None:
 
 
 def _read(text: str, *, whole: bool) -> Span | None:
-    """Return what a text says, None where it is neither address nor network nor range."""
+    """Return the addresses that a text means; None if it is no address, network or range."""
     address = _address(text)
     if address is not None:
         return Span(address, address)

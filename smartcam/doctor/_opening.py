@@ -26,21 +26,21 @@ _OUTCOMES: dict[int, Outcome] = {
     errno.EHOSTDOWN: "unreachable",
     errno.ENETDOWN: "unreachable",
 }
-"""What errors of an opening mean; others are this machine's, and failures."""
+"""Outcomes of an opening by its error; others are failures of this machine."""
 
 SCARCE = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
 """Errors of a machine that has no socket left."""
 
 
 class Opened(NamedTuple):
-    """What came of opening a port.
+    """The outcome of opening a port.
 
     Attributes:
-        outcome: what it came to.
-        seconds: until the connection was there.
-        said: what came by itself.
-        ended: whether the other end closed it by itself.
-        why: of a failure.
+        outcome: outcome of the opening.
+        seconds: time until the connection was open.
+        said: bytes that came by themselves.
+        ended: whether the other end closed the connection by itself.
+        why: reason of a failure.
     """
 
     outcome: Outcome
@@ -61,11 +61,11 @@ async def open_port(
     """Open a port, hear what comes by itself until that is ``enough``, and close it.
 
     Args:
-        sock: of the address' family; it is closed in the end.
-        address: the host's.
-        port: its port.
+        sock: socket of the address' family; it is closed in the end.
+        address: address of the host.
+        port: number of the port.
         timeout: seconds until it is open, and as many again to hear.
-        enough: called with all that came.
+        enough: called with all bytes that came; True ends the hearing.
 
     Cancellation: the connection is closed.
     """
@@ -101,9 +101,9 @@ async def open_port(
 
 
 def is_own(sock: socket.socket) -> bool:
-    """Return whether a socket is connected with itself.
+    """Return True if a socket is connected with itself.
 
-    The system may take the very port that is opened for our end, where that is a free one of this
-    machine: then they meet.
+    The system may choose for our end the very port that is to be opened, if that is a free port of
+    this machine: then the socket meets itself.
     """
     return bool(sock.getsockname() == sock.getpeername())

@@ -1,4 +1,4 @@
-"""Asking an address how it speaks: transports and dialects, each on a fresh link, and what came.
+"""Asking an address how it speaks: protocols, transports and dialects, each on a fresh link.
 
 Every try is a :class:`Trial` with all that was sent and received, decoded where that is possible
 and as hex in any case. A camera that hangs up without a byte is asked once more without the
@@ -9,24 +9,30 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import contextlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
-from smartcam._client.attempts import Try
-from smartcam._client.handshake import attempt, names_of
-from smartcam.exceptions import SmartCamError
+from smartcam._client._inside import SessionRefusedError, Try, attempt, explain, names_of
+from smartcam.exceptions import (
+    CommandRejectedError,
+    ConfigurationError,
+    ConnectFailedError,
+    ProtocolError,
+    SmartCamError,
+)
 from smartcam.models import Status
 from smartcam.observers import TraceEntry
-from smartcam.protocols._base import Transport, load_protocol
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH
+from smartcam.protocols import Transport
+from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, load_protocol
 from smartcam.protocols.messages import QueryAnswer, StatusReport
+from smartcam.settings import Address, known_protocols, masked, parse_address
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Callable
+    from collections.abc import AsyncGenerator, Callable, Iterable, Sequence
 
-    from smartcam._client.handshake import Session
-    from smartcam.protocols._base import Dialect
-    from smartcam.settings import Address
+    from smartcam._client._inside import Session
+    from smartcam.protocols import Dialect, Protocol
 
 MAX_FRAMES = 64
 """Entries that a trial keeps: making a session takes six, and a camera may send results at once."""
@@ -36,13 +42,13 @@ CLOSE_TIMEOUT = 1.0
 
 
 class CameraAnswer(NamedTuple):
-    """What a camera said of itself.
+    """A camera's description of itself.
 
     Attributes:
-        url: its address, transport and dialect pinned.
-        status: its first status.
+        url: URL of the camera, with transport and dialect pinned.
+        status: first status that the camera sent.
         application: id of the active application.
-        protocol_version: from the answer to Connect.
+        protocol_version: protocol version in the answer to Connect.
     """
 
     url: str
@@ -56,16 +62,25 @@ class Trial(Try):
     """One try and what came of it; ``outcome`` is ``session`` where a camera answered.
 
     Attributes:
-        address: where, with the scheme of the transport.
+        address: address that was tried, with the scheme of the transport.
         frames: what went over the wire, in order; direction ``!`` for bytes that make no frame.
-        omitted: entries beyond those.
-        answer: what the camera said, None where none answered.
+        omitted: number of entries beyond ``frames``.
+        answer: answer of the camera; None where none answered.
+        other: whether the protocol is another one than that of the address asked for.
     """
 
     address: Address
     frames: list[TraceEntry] = field(default_factory=list[TraceEntry])
     omitted: int = 0
     answer: CameraAnswer | None = None
+    other: bool = False
+
+    def __str__(self) -> str:
+        """One line for an error text."""
+        text = super(Trial, self).__str__()
+        return (
+            f"{self.address.protocol} at port {self.address.port}: {text}" if self.other else text
+        )
 
     def keep(self, entry: TraceEntry) -> None:
         """Keep an entry, as long as this is not over."""
@@ -103,33 +118,134 @@ def ways(address: Address) -> list[Way]:
     return found
 
 
+def other_ways(address: Address) -> list[Way]:
+    """Return every way to speak to an address's host in the other registered protocols.
+
+    Their port is that of the address; where that is its protocol's own, it is theirs.
+    """
+    own = load_protocol(address.protocol)
+    found: list[Way] = []
+    for protocol in known_protocols():
+        if protocol.name == own.name:
+            continue
+        port = protocol.default_port if address.port == own.default_port else address.port
+        scheme = next(iter(protocol.schemes))
+        try:
+            found += ways(Address(protocol.name, scheme, address.host, port))
+        except ConfigurationError:  # it wants what the URL cannot say, such as a login
+            continue
+    return found
+
+
 async def trials(
     address: Address,
     *,
     timeout: float,
     trace: Callable[[TraceEntry], None] | None = None,
     go_on: bool = False,
+    every_protocol: bool = False,
 ) -> AsyncGenerator[Trial]:
     """Try every way in turn and yield each try; the session of one that answers is ended first.
 
     What ``address`` pins is tried first. ``timeout``: seconds for all of them; each has an equal
     share of what is left. ``trace``: called with everything that goes over the wire. ``go_on``: go
-    on behind the first way that answers.
+    on behind the first way that answers. ``every_protocol``: try the other registered protocols,
+    too; one whose greeting was heard is next.
 
     Cancellation: the link is dropped, after a Disconnect where there was a session.
     """
     loop = asyncio.get_running_loop()
     deadline = loop.time() + timeout
-    left = collections.deque((way, True) for way in ways(address))
+    found = ways(address)
+    if every_protocol:
+        first = found[0].transport
+        found = sorted([*found, *other_ways(address)], key=lambda way: way.transport is not first)
+    left = collections.deque((way, True) for way in found)
     while left:
         way, disconnect_first = left.popleft()
         share = max(0.0, deadline - loop.time()) / (len(left) + 1)
         trial = await _try(way, share, trace, disconnect_first=disconnect_first)
+        trial.other = trial.address.protocol != address.protocol
         if trial.hung_up and disconnect_first and way.transport is Transport.TCP:
             left.appendleft((way, False))  # perhaps at the Disconnect
+        _put_greeted_first(left, trial)
         yield trial
         if trial.answer is not None and not go_on:
             return
+
+
+def _put_greeted_first(left: collections.deque[tuple[Way, bool]], trial: Trial) -> None:
+    """Have the ways that are left begin with those of the protocol that a try has heard greet."""
+    greeted = _greeted(trial, {way.address.protocol for way, _ in left})
+    if greeted is not None:
+        place = (greeted, trial.address.port)
+        order = sorted(
+            left, key=lambda one: (one[0].address.protocol, one[0].address.port) != place
+        )
+        left.clear()
+        left.extend(order)
+
+
+def _greeted(trial: Trial, names: Iterable[str]) -> str | None:
+    """Return the one of these protocols whose greeting a try has heard, None where none is."""
+    if trial.answer is not None or trial.transport != Transport.TCP.value:
+        return None
+    heard = next((one.hex for one in trial.frames if one.direction == "!"), "")
+    said = bytes.fromhex(heard).lstrip()
+    return next((name for name in names if _greets(load_protocol(name), said)), None)
+
+
+def _greets(protocol: Protocol, said: bytes) -> bool:
+    return bool(protocol.greeting) and said.startswith(protocol.greeting or b"")
+
+
+async def locate(host: str, *, timeout: float) -> str:
+    """Return the URL of the camera at a bare ``HOST[:PORT]``, in whichever protocol it answers.
+
+    The session that says so is over then. ``timeout``: seconds for all ways together.
+
+    Raises:
+        ConnectFailedError: none answered; says what the most telling way met, and what to do.
+
+    Cancellation: the link is dropped.
+    """
+    failed: list[Trial] = []
+    address = parse_address(host)
+    async with contextlib.aclosing(trials(address, timeout=timeout, every_protocol=True)) as tries:
+        async for trial in tries:
+            if trial.answer is not None:
+                return trial.answer.url
+            failed.append(trial)
+    raise no_session(host, address, failed) from by_telling(failed)[0].error
+
+
+def no_session(host: str, address: Address, failed: Sequence[Trial]) -> ConnectFailedError:
+    """Return the error for tries in vain: what the most telling one met, and what to do."""
+    told = by_telling(failed)
+    where = told[0].address
+    why = explain(told[:1], where, load_protocol(where.protocol))
+    return ConnectFailedError(
+        f"no session with {masked(host)}: {why}",
+        host=address.host,
+        port=address.port,
+        attempts=tuple(map(str, told)),
+    )
+
+
+def by_telling(found: Iterable[Trial]) -> list[Trial]:
+    """Return tries in vain, the most telling first.
+
+    A refusal tells more than bytes that are no message, these more than other bytes, bytes more
+    than silence, and that more than no link.
+    """
+
+    def rank(trial: Trial) -> tuple[bool, bool, bool, bool]:
+        refused = isinstance(trial.error, (CommandRejectedError, SessionRefusedError))
+        linked = trial.opened and trial.transport == Transport.TCP.value
+        garbage = isinstance(trial.error, ProtocolError)
+        return (not refused, not trial.received, not garbage, not linked)
+
+    return sorted(found, key=rank)
 
 
 async def _try(

@@ -10,19 +10,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from smartcam.doctor._context import called
 from smartcam.doctor._findings import Exit
 from smartcam.exceptions import hex_excerpt
-from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.interpreters._inside import LocalizationsInterpreter
+from smartcam.layout._inside import SI_SYMBOLS, UNITS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from smartcam.doctor._context import Examination, Reading
     from smartcam.exceptions import InterpretationError
-    from smartcam.interpreters._base import Interpreter
+    from smartcam.interpreters import Interpreter
     from smartcam.layout import Field, Layout
     from smartcam.models import ByteOrder, Result
 
 MAX_ROWS = 40
-"""Rows of a dump: a screen."""
+"""Rows of a dump at most: a screen."""
 
 
 # ---------------------------------------------------------------------- the layout
@@ -32,10 +33,10 @@ class DumpRow(NamedTuple):
     """One field of a container as the layout has it, beside the bytes that stand there.
 
     Attributes:
-        offset: of its first byte, from the start of the container's data.
-        field: its name and type.
+        offset: place of the field's first byte, from the start of the container's data.
+        field: name and type of the field.
         hex: the bytes that are there, at most 32.
-        value: what they mean; what is missing, or too many.
+        value: what the bytes mean; what is missing, or too many.
     """
 
     offset: int
@@ -192,7 +193,7 @@ def _say_misfit(
 
 
 class _Plausible(NamedTuple):
-    """What a field without a unit may be."""
+    """The plausible values of a field without a unit."""
 
     quantity: str  # what it measures
     names: re.Pattern[str]  # which fields do, by their name
@@ -235,6 +236,27 @@ PLAUSIBLE: tuple[_Plausible, ...] = (
 )
 """The limits that a value must exceed to be called implausible; the first row that names it."""
 
+
+class _Converted(NamedTuple):
+    """The signs of a field with a unit whose values were in SI already."""
+
+    most: float  # the largest magnitude, SI, up to which it does
+    text: str  # what the camera may send instead
+    reason: str  # why the limit
+
+
+CONVERTED: dict[str, _Converted] = {
+    "mm": _Converted(
+        2e-3, "metres", "a camera whose field of view is two metres sends up to 2 for it in metres"
+    ),
+    "deg": _Converted(
+        2 * math.pi * math.pi / 180 + 1e-6, "radians", "a turn is 6.28 in radians, 360 in degrees"
+    ),
+}
+"""The limits that no value of any field may exceed to look like SI that was converted, by the unit.
+Of parts that all lie within two millimetres, or are turned by no more than six degrees, they say
+too much: so the hint asks."""
+
 NONSENSE = (1e-20, 1e20)
 """Reals beyond, zero apart, are hardly measured by anything: they are bytes of something else."""
 
@@ -242,8 +264,10 @@ NONSENSE = (1e-20, 1e20)
 def _look_at_values(
     exam: Examination, layout: Layout, readings: list[Reading], *, integers: bool
 ) -> None:
-    """Give a hint for each field without a unit whose values are not plausible in SI."""
+    """Give a hint for each field whose values are not plausible in its unit, or without one."""
     found: dict[str, float] = {}  # largest magnitude by field
+    # the same, by unit
+    converted: dict[str, dict[str, float]] = {unit: {} for unit in CONVERTED}
     nonsense: dict[str, float] = {}
     fields = [f for f in layout.fields if f.wire.is_number and (integers or not f.wire.is_integer)]
     for reading in readings:
@@ -254,6 +278,11 @@ def _look_at_values(
                     nonsense.setdefault(field.name, value)
                 elif field.unit is None:
                     found[field.name] = max(value, found.get(field.name, 0.0))
+                elif field.unit in CONVERTED and not field.wire.is_integer:
+                    of_unit = converted[field.unit]
+                    of_unit[field.name] = max(value, of_unit.get(field.name, 0.0))
+    for unit, magnitudes in converted.items():
+        _ask_for_si(exam, unit, magnitudes)
     for name, value in nonsense.items():
         exam.say(
             "hint",
@@ -279,6 +308,25 @@ def _look_at_values(
                 value=value,
                 most=rule.most,
             )
+
+
+def _ask_for_si(exam: Examination, unit: str, found: Mapping[str, float]) -> None:
+    """Give a hint where all fields of a unit look as if their values had been SI before."""
+    rule, most = CONVERTED[unit], max(found.values(), default=0.0)
+    if not 0.0 < most <= rule.most:
+        return
+    made, names = UNITS[unit], ", ".join(found)
+    symbol = SI_SYMBOLS[made.quantity]
+    exam.say(
+        "hint",
+        f"{names}: no more than {most * made.divide / made.multiply:.4g} {unit}, which looks like "
+        f"{rule.text}: {rule.reason}",
+        f"If the camera sends {rule.text}, write {symbol} instead of {unit} in the layout.",
+        check="values",
+        field=names,
+        value=most,
+        most=rule.most,
+    )
 
 
 _SI = {"angle": "radians", "length": "metres", "ratio": "a ratio from 0 to 1"}

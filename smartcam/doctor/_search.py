@@ -13,7 +13,22 @@ import socket
 from contextlib import aclosing
 from typing import TYPE_CHECKING
 
-from smartcam.doctor._found import check_consent, decided, judged, ports_of
+from smartcam._arguments import (
+    check_all,
+    check_flag,
+    check_integer,
+    check_number,
+    check_text,
+    shown,
+)
+from smartcam.doctor._found import (
+    check_consent,
+    decided,
+    judged,
+    ports_of,
+    serves_one,
+    tcp_protocols,
+)
 from smartcam.doctor._networks import AddressSet, Span, address_of, read_span
 from smartcam.doctor._opening import SCARCE, open_port
 from smartcam.doctor._probing import trials
@@ -26,19 +41,22 @@ if TYPE_CHECKING:
     from smartcam.doctor._found import FoundPort
     from smartcam.doctor._networks import HostAddress
 
-MAX_ADDRESSES = 65_536
+DEFAULT_ADDRESSES = 65_536
 """Addresses of one search, unless more are asked for."""
 
-MOST_ADDRESSES = 1 << 24
+MAX_ADDRESSES = 1 << 24
 """Addresses of one search at most."""
 
-MOST_AT_ONCE = 1_000
+MAX_NETWORK_TEXT = 300
+"""Characters of a network's text: a host's name has 253 at most."""
+
+MAX_OPEN_CONNECTIONS = 1_000
 """Connections at a time at most."""
 
-MOST_RATE = 10_000.0
+MAX_OPENINGS_PER_SECOND = 10_000.0
 """Openings a second at most."""
 
-MOST_SECONDS = 60.0
+MAX_SECONDS = 60.0
 """Seconds that one opening may take at most."""
 
 ASK_TIMEOUT = 10.0
@@ -64,27 +82,26 @@ async def find(
     rate: float = 100.0,
     at_once: int = 64,
     timeout: float = 1.0,
-    max_addresses: int = MAX_ADDRESSES,
+    max_addresses: int = DEFAULT_ADDRESSES,
 ) -> list[FoundPort]:
-    """Return what listens in networks where cameras do, sorted by address.
+    """Return the open ports of networks where cameras may listen, sorted by address.
 
     The protocols' ports are opened, one opening after the other at ``rate``; nothing is sent. A
-    camera that speaks UDP cannot be found so.
+    camera that speaks UDP cannot be found so. Of a camera that serves one client no document says
+    that a connection which sends nothing leaves that client alone: ``leave`` keeps away from it.
 
     Args:
         networks: each ``192.168.0.0/24``, ``192.168.0.10-20``, an address or a host's name. An IPv6
             network has at most 256 addresses.
         ports: further ports to open; each of the protocols may be spoken there.
-        protocols: names of those to look for; default all that are known.
-        leave: addresses that are not touched, in the same words: cameras that are at work.
-        may_disturb: allows opening ports of protocols whose cameras serve one client, such as
-            ``bvs``: it is not known of all of them that a connection that says nothing leaves the
-            client alone.
-        ask: also speak to what was found, which takes a camera from its client; allows the same.
+        protocols: names of the protocols to look for; default: all that are known.
+        leave: addresses of cameras at work, which are not touched; written as ``networks``.
+        may_disturb: allows asking cameras that serve one client, such as those of ``bvs``.
+        ask: also speak to what was found, which takes such a camera from its client.
         rate: openings a second at most.
         at_once: connections at a time at most.
         timeout: seconds until a port is open, and as many again to hear what comes by itself.
-        max_addresses: refuse more than that.
+        max_addresses: number of addresses above which a search is refused.
 
     Raises:
         ConfigurationError: a network, a number or a protocol cannot work, there are too many
@@ -113,12 +130,12 @@ class CameraSearch:
     """One search; what was found stays, however it ends. Arguments as in :func:`find`.
 
     Attributes:
-        opened: how many ports were tried.
-        total: how many there are to try, once names are looked up.
-        counts: how many of the tries came to what.
+        opened: number of ports that were tried.
+        total: number of ports to try, once names are looked up.
+        counts: numbers of tries, by their outcome.
         why: the first failure that is this machine's.
         left: addresses that were left alone, to the texts that say so.
-        begun: whether it has come as far as the first port.
+        begun: whether the search has come as far as the first port.
     """
 
     def __init__(
@@ -133,27 +150,28 @@ class CameraSearch:
         rate: float = 100.0,
         at_once: int = 64,
         timeout: float = 1.0,
-        max_addresses: int = MAX_ADDRESSES,
+        max_addresses: int = DEFAULT_ADDRESSES,
     ) -> None:
-        for name, value, most in (
-            ("rate", rate, MOST_RATE),
-            ("at_once", at_once, MOST_AT_ONCE),
-            ("timeout", timeout, MOST_SECONDS),
-            ("max_addresses", max_addresses, MOST_ADDRESSES),
-        ):
-            if not 0 < value <= most:
-                raise ConfigurationError(
-                    f"find: {name}={value!r}: expected more than 0, at most {most:,}"
-                )
+        rate = check_number(rate, "rate", 0, MAX_OPENINGS_PER_SECOND, "find", above=True)
+        at_once = check_integer(at_once, "at_once", 1, MAX_OPEN_CONNECTIONS, "find")
+        timeout = check_number(timeout, "timeout", 0, MAX_SECONDS, "find", above=True)
+        max_addresses = check_integer(max_addresses, "max_addresses", 1, MAX_ADDRESSES, "find")
+        may_disturb = check_flag(may_disturb, "may_disturb", "find")
+        ask = check_flag(ask, "ask", "find")
         if not networks or not all(isinstance(text, str) for text in networks):
             raise ConfigurationError(
                 "find: expected one network or several, each a text of its own; got "
-                f"{networks!r:.80}"
+                f"{shown(networks)}"
             )
+        networks = [check_text(text, "network", "find", most=MAX_NETWORK_TEXT) for text in networks]
+        leave = [
+            check_text(text, "leave", "find", most=MAX_NETWORK_TEXT)
+            for text in check_all(leave, "leave", "texts of addresses", "find")
+        ]
         self._networks = [(text, read_span(text)) for text in networks]
         self._leave = [(text, read_span(text, whole=True)) for text in leave]
         self._ports = ports_of(ports, protocols)
-        if not (may_disturb or ask):
+        if ask and not may_disturb:
             check_consent(self._ports)
         self._ask = ask
         self._interval = 1.0 / rate
@@ -170,8 +188,17 @@ class CameraSearch:
         self.left: dict[str, str] = {}
         self.begun = False
 
+    @property
+    def exclusive(self) -> list[str]:
+        """Names of protocols whose cameras serve one client, and were found but not asked."""
+        if self._ask:
+            return []
+        found = {name for one in self._found.values() for name in one.protocols}
+        known = tcp_protocols()
+        return sorted(name for name in found if serves_one(known[name]))
+
     def results(self) -> list[FoundPort]:
-        """Return what was found, sorted by address."""
+        """Return the ports found so far, sorted by address."""
         return [self._found[key] for key in sorted(self._found)]
 
     async def run(self) -> None:
@@ -292,7 +319,7 @@ def _check_count(count: int, most: int) -> None:
     if count > most:
         raise ConfigurationError(
             f"find: {count:,} addresses are more than {most:,}: name smaller networks, or allow "
-            f"them by max_addresses={count} (--max-addresses {count}), {MOST_ADDRESSES:,} at most"
+            f"them by max_addresses={count} (--max-addresses {count}), {MAX_ADDRESSES:,} at most"
         )
 
 

@@ -7,20 +7,20 @@ import contextlib
 import socket
 from typing import TYPE_CHECKING, Any
 
-from smartcam._client.attempts import reason_for, words
-from smartcam._client.handshake import remarks
+from smartcam._client._inside import reason_for, remarks, words
 from smartcam.doctor._findings import Exit
-from smartcam.doctor._probing import trials
+from smartcam.doctor._probing import by_telling, trials
 from smartcam.doctor._timing import figures
 from smartcam.exceptions import (
     ConnectFailedError,
     ProtocolError,
     ResponseTimeoutError,
 )
-from smartcam.protocols._base import Transport, load_protocol
+from smartcam.protocols import Transport
+from smartcam.protocols._inside import load_protocol
 
 if TYPE_CHECKING:
-    from smartcam._client.attempts import Reason, Try
+    from smartcam._client._inside import Reason, Try
     from smartcam.camera import Camera
     from smartcam.doctor._context import Examination
     from smartcam.doctor._probing import CameraAnswer, Trial
@@ -30,13 +30,13 @@ CONNECTS = 5
 """Sessions made one after the other, so that the connect time has a spread."""
 
 CONNECTS_WITHIN = 3.0
-"""Seconds after which no further one is begun: on a slow link one or two must do."""
+"""Seconds after which no further session is begun: on a slow link one or two must do."""
 
 KNOCK_TIMEOUT = 1.0
 """Seconds for a bare TCP connection, to tell a camera that is away from one that hung up."""
 
 KNOCK_AFTER = 0.25
-"""Seconds before that: what goes down closes its connections a moment before its port."""
+"""Seconds to wait before this connection: a camera going down closes its port a moment later."""
 
 SOON = 10.0
 """Seconds: a session that is lost so soon after its Connect was probably taken, as the client's
@@ -159,7 +159,7 @@ async def _diagnose(exam: Examination, failure: ConnectFailedError) -> Camera | 
 async def _try_all(exam: Examination) -> list[Trial]:
     """Return every try, up to the one that is answered."""
     timeout = exam.options.step(10.0)
-    tries = trials(exam.address, timeout=timeout, trace=exam.trace)
+    tries = trials(exam.address, timeout=timeout, trace=exam.trace, every_protocol=True)
     async with contextlib.aclosing(tries):
         return [trial async for trial in tries]
 
@@ -171,7 +171,7 @@ def _say_no_session(exam: Examination, found: list[Trial], answer: CameraAnswer 
     if answer is not None:
         cure = f"A camera answers at {answer.url}: use this URL. What follows was seen there."
     else:
-        others = [one for one in found if one is not trial]
+        others = [one for one in by_telling(found) if one is not trial]
         also = f" Also tried: {_folded(others)}." if others else ""
         cure = reason.cure.format(**filled) + also
     exam.fail(
@@ -189,7 +189,9 @@ def _reason(found: list[Trial], *, pinned: bool) -> tuple[Reason, Try]:
     own = [
         trial
         for trial in found
-        if trial.transport == first.transport and (trial.dialect == first.dialect or not pinned)
+        if trial.transport == first.transport
+        and not trial.other
+        and (trial.dialect == first.dialect or not pinned)
     ]
     return reason_for(own)
 
@@ -198,7 +200,8 @@ def _folded(found: list[Trial]) -> str:
     """Return tries in one line; dialects of a transport with the same outcome together."""
     groups: dict[tuple[str, str, str], list[str]] = {}
     for trial in found:
-        key = (trial.transport.upper(), trial.step, trial.outcome)
+        at = f" at port {trial.address.port}" if trial.other else ""
+        key = (f"{trial.transport.upper()}{at}", trial.step, trial.outcome)
         groups.setdefault(key, []).append(trial.dialect)
     return "; ".join(
         f"{', '.join(dialects)} over {transport}: {step}: {outcome}"
@@ -258,7 +261,7 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
 
 
 async def _knock(exam: Examination) -> bool:
-    """Whether something takes a TCP connection there."""
+    """Return True if the camera's port takes a TCP connection."""
     await asyncio.sleep(KNOCK_AFTER)
     try:
         async with asyncio.timeout(KNOCK_TIMEOUT):

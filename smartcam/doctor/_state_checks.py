@@ -23,7 +23,7 @@ QUERIES = 30
 """Requests for the round-trip time: enough for a median, done in a moment."""
 
 QUERIES_WITHIN = 3.0
-"""Seconds after which no further one is sent: on a slow link fewer must do."""
+"""Seconds after which no further request is sent: on a slow link fewer must do."""
 
 SLOW = 0.05
 """Seconds of round trip from which on a hint is given: on a local network it takes milliseconds."""
@@ -32,7 +32,7 @@ MAX_SEEN = 1000
 """Statuses kept while watching; the last ones."""
 
 CLOCK_MAY_DIFFER = timedelta(minutes=1)
-"""A camera's clock is set by hand or by a client; a minute is what a day or two make of it."""
+"""Time by which a camera's clock may be off: a day or two of drift since it was set."""
 
 
 # ---------------------------------------------------------------------- status
@@ -150,7 +150,7 @@ _RUN_STATES: tuple[Diagnosis[list[Status]], ...] = (
         Exit.RAN_OUT,
     ),
 )
-"""Those in which no result comes."""
+"""Diagnoses of a camera that sends no result while it is watched; the first that fits holds."""
 
 
 async def watch(exam: Examination) -> None:
@@ -294,7 +294,7 @@ async def look_at_clock(exam: Examination) -> None:
 
 
 def _rounded(off: timedelta) -> str:
-    """Return it in whole seconds, in whole days where it is more than a week."""
+    """Return a time in whole seconds, or in whole days where it is more than a week."""
     if off > timedelta(days=7):
         return f"{off.days} days"
     return str(timedelta(seconds=round(off.total_seconds())))

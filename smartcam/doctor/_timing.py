@@ -15,9 +15,9 @@ class Figures(NamedTuple):
     """Figures of a row of times; seconds.
 
     Attributes:
-        times: how many.
-        min: the shortest.
-        median: the one in the middle.
+        times: number of times in the row.
+        min: shortest time.
+        median: median of the times.
         p99: the 99th percentile by nearest rank: the longest where there are 100 or fewer.
         jitter: mean of the absolute differences of successive times; 0 for a single one.
     """
@@ -29,7 +29,7 @@ class Figures(NamedTuple):
     jitter: float
 
     def __str__(self) -> str:
-        """Return them as text, in milliseconds."""
+        """Return the figures as text, in milliseconds."""
         low, middle, high, jitter = (f"{1e3 * one:.1f}" for one in self[1:])
         return f"min {low}, median {middle}, p99 {high} ms, jitter {jitter} ms"
 

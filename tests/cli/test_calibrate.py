@@ -9,14 +9,15 @@ import shlex
 import signal
 import urllib.request
 from collections.abc import Iterator
+from datetime import date
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from smartcam._cli.calibrate import STALE, calibrate
-from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
-from smartcam.emulator._scene import PIECES
+from smartcam.calibration import PlaneCalibration, fit_plane
+from smartcam.emulator._inside import PIECES
 from tests.cli.commandline import closed_port, emulators, run
 from tests.processes import PATIENCE, Outcome, Process, printed_by
 
@@ -59,6 +60,8 @@ def as_lines(*answers: dict[str, Any]) -> list[str]:
     return [json.dumps({"answers": one}) for one in answers]
 
 
+TWO_TOUCHES = ["touch-1", "touch-2"]
+
 ABOUT = {"touch_sigma": 0.2, "unit": "m"}
 
 
@@ -80,11 +83,11 @@ def test_calibrate_in_json_gives_a_calibration(url: str, tmp_path: Path) -> None
 
 def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Path) -> None:
     typed = [str(value) for one in TOUCHES for value in one.values()]
-    about = ["marks", "m", "", "", "pin", "inch", "m", "", "0,2"]
+    about = ["marks", "m", "", "", "pin", "inch", "m", "", "0,2", ""]
     touches = [*typed[:1], "much", "", ":repeat", *typed[1:18], ":undo", *typed[15:18]]
     lines = [*about, "", *["yes"] * 6, "n", *touches, "", "", ""]
     done = calibrating(url, tmp_path, lines).done()
-    assert "1. Camera, robot and tool  (:abort)" in done.out
+    assert "Step 1 of about 9: Camera, robot and tool  (:abort)" in done.out
     unit, again = done.out.split(
         "! Unit of the robot's coordinates: 'inch': expected one of mm, m\n"
     )
@@ -100,7 +103,7 @@ def test_calibrate_in_the_terminal_asks_and_shows_errors(url: str, tmp_path: Pat
 
 def test_calibrate_ends_with_lines_that_work_as_printed(url: str, tmp_path: Path) -> None:
     folder = tmp_path / "two words"
-    about = ["", "", "cell", "", "", "m", "", "0,2"]
+    about = ["", "", "cell", "", "", "m", "", "0,2", ""]
     typed = [str(value) for one in TOUCHES for value in one.values()]
     lines = [*about, "", *[""] * 7, *typed, "", "", ""]
     done = calibrating(url, folder, lines, "--name", "table").done()
@@ -167,8 +170,8 @@ def test_calibrate_check_in_the_terminal_shows_the_verdict(url: str, tmp_path: P
     typed = [str(value) for value in TOUCHES[0].values()]
     lines = ["m", "", "", "", *["n"] * 6, *typed, ""]
     done = calibrating(url, tmp_path, lines, "--check", "plane").done()
-    assert "1. Is plane still true?  (:abort)" in done.out
-    assert ". plane still holds  (:undo, :abort)" in done.out
+    assert "Step 1 of about 5: Is plane still true?  (:abort)" in done.out
+    assert ": plane still holds  (:undo, :abort)" in done.out
     assert "\ndone\nStill true: 0." in done.out
     assert " mm rms off\n  name: plane\n  stale: no\n  touches: 1\n" in done.out
 
@@ -215,9 +218,39 @@ def test_calibrate_broken_off_goes_on(url: str, tmp_path: Path) -> None:
     assert first.code == 2
     assert "the same command goes on with it" in first.err
     second = calibrating(url, tmp_path, lines[5:], "--json").done()
-    assert second.lines[0] == last
+    (going_on, *_) = second.lines
+    resumed = going_on.pop("resumed")
+    assert first_lines[0]["resumed"] is None
+    assert going_on == last
+    assert [one["step"] for one in resumed["done"]] == ["about", "picture", "which", *TWO_TOUCHES]
+    assert resumed["since"] <= resumed["done"][0]["at"] <= resumed["last"]
     assert len(first_lines) == 6
     assert second.lines[-1]["type"] == "result"
+
+
+def test_calibrate_broken_off_says_since_when_and_asks(url: str, tmp_path: Path) -> None:
+    calibrating(url, tmp_path, as_lines(ABOUT, {}, {}, *TOUCHES[:2]), "--json")
+    text = (tmp_path / "plane.journal").read_text()
+    (tmp_path / "plane.journal").write_text(text.replace(str(date.today().year), "2025"))  # noqa: DTZ011
+    again = calibrating(url, tmp_path, ["perhaps", "", ":abort"])
+    assert re.search(r"Broken off: begun 2025-\d\d-\d\d \d\d:\d\d UTC \(\d+ days ago\)", again.out)
+    assert "  4. touch-1: x " in again.out
+    assert "! 'perhaps': expected 'go on' or 'begin anew'" in again.out
+    assert "Step 6 of about 9: " in again.out
+
+
+@pytest.mark.parametrize("json_lines", [False, True])
+def test_calibrate_broken_off_begins_anew_when_told(
+    url: str, tmp_path: Path, json_lines: bool
+) -> None:
+    calibrating(url, tmp_path, as_lines(ABOUT, {}, {}, *TOUCHES[:2]), "--json")
+    lines = ['{"do": "anew"}', '{"do": "abort"}'] if json_lines else ["begin anew", ":abort"]
+    done = calibrating(url, tmp_path, lines, *(("--json",) if json_lines else ()))
+    assert done.code == 130
+    if json_lines:
+        assert [line["number"] for line in done.lines[:2]] == [6, 1]
+    else:
+        assert "Step 1 of about 9: Camera, robot and tool" in done.out
 
 
 @pytest.mark.long

@@ -10,17 +10,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam._cli.calibrate_lens import MOVED, Collecting
-from smartcam.calibration import CameraModel, Checkerboard, IntrinsicCalibration, TargetView
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._targets import target_to_data
+from smartcam._cli.calibrate_lens import MIN_NEW_VIEW_SHARE, Collecting
+from smartcam._extras import load
+from smartcam.calibration import (
+    CameraModel,
+    Checkerboard,
+    IntrinsicCalibration,
+    TargetView,
+    target_to_data,
+)
 from smartcam.calibration.formats import read_cameras
 from smartcam.calibration.simulation import around, render
 from smartcam.exceptions import FrameSourceError
-from smartcam.frames import FrameDriver, FrameSink, StreamFormat, find_format
+from smartcam.frames import FrameSink, StreamFormat, find_format
 from smartcam.registry import FRAMES
 from tests.cli.commandline import run
-from tests.frames.drivers import frame
+from tests.frames.drivers import ShowingDriver, frame
 from tests.processes import Outcome
 
 BOARD = Checkerboard(columns=5, rows=4, square=0.04, origin_mark=True)
@@ -124,21 +129,16 @@ def test_lens_of_too_few_views_is_refused(tmp_path: Path, target: str) -> None:
 # ---------------------------------------------------------------------- a source
 
 
-class Table(FrameDriver):
+class Table(ShowingDriver):
     """Shows images one after the other, each for a while, as somebody holds a sheet."""
 
     images: tuple[Any, ...] = ()
     ends: Any = "not"
 
-    _task: asyncio.Task[None] | None = None
-
     async def open(self) -> StreamFormat:
         return StreamFormat(find_format("Mono8"), 320, 240)
 
-    async def start(self, sink: FrameSink) -> None:
-        self._task = asyncio.create_task(self._show(sink))
-
-    async def _show(self, sink: FrameSink) -> None:
+    async def show(self, sink: FrameSink) -> None:
         about: dict[str, Any] = {"format": find_format("Mono8"), "width": 320, "height": 240}
         for image in self.images:
             for _ in range(40):
@@ -146,15 +146,6 @@ class Table(FrameDriver):
                 await asyncio.sleep(0.01)
         if self.ends != "not":
             sink.ended(self.ends)
-
-    async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
-
-    async def close(self) -> None:
-        await self.stop()
 
 
 @pytest.fixture
@@ -226,7 +217,7 @@ def view(shift: float, ids: Any = None) -> TargetView:
 
 def test_view_is_taken_of_a_target_that_stands_still_and_elsewhere() -> None:
     taken = Collecting()
-    far = MOVED * 320
+    far = MIN_NEW_VIEW_SHARE * 320
     assert not taken.offer(view(0.0))  # it may be moving
     assert taken.offer(view(0.5))
     assert not taken.offer(view(0.5))  # is there already

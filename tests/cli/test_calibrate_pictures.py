@@ -13,20 +13,25 @@ import numpy as np
 import pytest
 
 from smartcam._cli.calibrate import calibrate
-from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._lens.model import CameraModel
-from smartcam.calibration._optional_imports import load
-from smartcam.calibration._sheet.calibration import SheetCalibration, calibrate_sheet, fit_corners
-from smartcam.calibration._targets import Checkerboard, target_to_data
-from smartcam.calibration.formats._cameras import write_camera_info
-from smartcam.calibration.simulation._images import render
-from smartcam.emulator._insight.camera import EmulatedInSight
+from smartcam._extras import load
+from smartcam.calibration import (
+    CameraModel,
+    Checkerboard,
+    SheetCalibration,
+    Transform,
+    calibrate_sheet,
+    find_target,
+    fit_corners,
+    target_to_data,
+)
+from smartcam.calibration.formats import write_camera_info
+from smartcam.calibration.simulation import render
+from smartcam.emulator import EmulatedInSight
 from smartcam.exceptions import FrameSourceError
-from smartcam.frames import FrameDriver, FrameSink, StreamFormat, find_format
+from smartcam.frames import FrameSink, StreamFormat, find_format
 from smartcam.registry import FRAMES
 from tests.cli.commandline import closed_port, emulators, run
-from tests.frames.drivers import frame
+from tests.frames.drivers import ShowingDriver, frame
 from tests.processes import Outcome, Process, printed_by
 
 pytestmark = pytest.mark.long
@@ -119,7 +124,8 @@ def test_calibrate_by_a_sheet_ends_with_lines_for_the_camera_that_was_named(
 
 
 def test_calibration_by_a_sheet_wants_y_down_where_it_is_used(tmp_path: Path) -> None:
-    plane = fit_corners(TARGET, [0, 8, 53], OFFSET + TARGET.points[[0, 8, 53]])
+    ids = [0, 8, 22, 45, 53]
+    plane = fit_corners(TARGET, ids, OFFSET + TARGET.points[ids], tool_z=(0, 0, -1))
     path = tmp_path / "sheet.json"
     calibrate_sheet(find_target(render(TARGET, CAMERA, SEEN), TARGET), plane).save(path)
     options = ("--interpret-as", "localizations", "--calibration", str(path))
@@ -176,34 +182,20 @@ def test_calibrate_by_a_sheet_with_a_camera_that_sends_no_pictures_says_so(
     )
 
 
-class Sheet(FrameDriver):
+class Sheet(ShowingDriver):
     """Shows the sheet, ten times a second."""
-
-    _task: asyncio.Task[None] | None = None
 
     async def open(self) -> StreamFormat:
         if self.address.host == "gone":
             raise FrameSourceError("sheet: no such device")
         return StreamFormat(find_format("Mono8"), 640, 480)
 
-    async def start(self, sink: FrameSink) -> None:
-        self._task = asyncio.create_task(self._show(sink))
-
-    async def _show(self, sink: FrameSink) -> None:
+    async def show(self, sink: FrameSink) -> None:
         data = render(TARGET, CAMERA, SEEN).tobytes()
         about: dict[str, Any] = {"format": find_format("Mono8"), "width": 640, "height": 480}
         for number in itertools.count(1):
             sink.frame(frame(number, data=data, stride=640, **about))
             await asyncio.sleep(0.02)
-
-    async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
-
-    async def close(self) -> None:
-        await self.stop()
 
 
 @pytest.fixture
@@ -286,7 +278,7 @@ def test_calibrate_with_options_that_cannot_work_says_so(
 
 @pytest.mark.parametrize(
     ("content", "text"),
-    [("{", "no JSON"), ("[]", "expected what smartcam sheet"), ("{}", "expected a kind of")],
+    [("{", "not valid JSON"), ("[]", "expected what smartcam sheet"), ("{}", "expected a kind of")],
 )
 def test_calibrate_with_a_target_that_is_none_says_so(
     tmp_path: Path, content: str, text: str
@@ -299,3 +291,17 @@ def test_calibrate_with_a_target_that_is_none_says_so(
 def test_calibrate_with_a_lens_that_is_none_says_so(tmp_path: Path) -> None:
     (tmp_path / "lens.yaml").write_text("no: lens\n")
     calibrating(tmp_path, [], "bvs://x", "--lens", str(tmp_path / "lens.yaml")).failed(2, "--lens:")
+
+
+def test_terminal_names_the_file_of_a_step_s_picture(tmp_path: Path) -> None:
+    from smartcam._cli.calibrate_terminal import _drawn, _step_text
+
+    path = tmp_path / "table.step.svg"
+    view = {"preview": {"svg": "<svg>ring</svg>"}, "can": ["abort"], "number": 4, "of": 10}
+    view |= {"title": "Touch point 1", "description": "", "notes": [], "errors": {}}
+    view |= {"schema": {"properties": {}}}
+    assert _drawn(view, path) == path
+    assert path.read_text() == "<svg>ring</svg>"
+    text = _step_text(view, path)
+    assert text == f"\nStep 4 of about 10: Touch point 1  (:abort)\n  picture: {path}"
+    assert _drawn({"preview": None}, path) is None

@@ -14,17 +14,17 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import PlaneCalibration, fit_plane
-from smartcam.emulator._scene import PIECES
+from smartcam.emulator._inside import PIECES
 from tests.cli.commandline import emulators, run
 
-CORNERS = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2]])
+MARKS = np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2], [0.1, 0.1]])
 SHIFT = np.array([0.5, -0.1, 0.2])
 
 
 def calibrated(**options: Any) -> PlaneCalibration:
     """Return the calibration of a table that stands upright: its y is the robot's z."""
-    upright = np.stack([CORNERS[:, 0], 0 * CORNERS[:, 0], CORNERS[:, 1]], axis=-1)
-    return fit_plane(CORNERS, upright + SHIFT, model="rigid", **options)
+    upright = np.stack([MARKS[:, 0], 0 * MARKS[:, 0], MARKS[:, 1]], axis=-1)
+    return fit_plane(MARKS, upright + SHIFT, model="rigid", tool_z=(0, 1, 0), **options)
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +63,23 @@ def test_trigger_calibration_shows_people_poses_in_space(seven: list[str], table
     assert " ".join(titles.split()) == "feature_id quality x [m] y [m] z [m] qx qy qz qw"
     assert [row.split()[0] for row in rows] == list(PIECES)
     assert {row.split()[3] for row in rows} == {"-0.1"}
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_trigger_calibration_that_is_not_good_warns(
+    seven: list[str], tmp_path: Path, wrong: bool
+) -> None:
+    path = tmp_path / "table.json"
+    marks = np.array([(0.15 * i, 0.1 * j) for i in range(3) for j in range(3)])
+    touched = np.column_stack([marks, np.zeros(9)])
+    if wrong:
+        touched[[2, 4]] = touched[[4, 2]]
+    fit_plane(marks, touched, tool_z=(0, 0, -1)).save(path)
+    for _ in range(2):
+        outcome = run(*seven, "--calibration", str(path))
+        told = f"warning: --calibration {path}: this calibration is not known to be good. Not good"
+        assert outcome.err.startswith(told) == wrong
+        assert (outcome.code, outcome.err == "") == (0, not wrong)
 
 
 def test_watch_calibration_maps_each_result(url: str, table: str) -> None:

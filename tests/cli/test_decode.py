@@ -124,7 +124,7 @@ def test_decode_container_big_endian_turns_the_numbers() -> None:
         ("localizations", "(nothing)"),
         ("raw", "00 00"),
         ("strings50", "  \n"),
-        ("table: (x: real32 mm)*", "  x\n  0\n"),
+        ("table: (x: real32 mm)*", "  x [m]\n      0\n"),
     ],
 )
 def test_decode_container_of_zeros_for_people(spec: str, text: str) -> None:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from smartcam._cli import demo_pick
 from smartcam._cli.demo_pick import SimulatedRobot, nine_marks, pick
 from smartcam._cli.options import Options
-from smartcam.emulator._scene import PIECES, TABLE_SIZE, TablePose, TableScene
+from smartcam.emulator import TablePose, TableScene
+from smartcam.emulator._inside import PIECES, TABLE_SIZE
 from smartcam.exceptions import ConfigurationError, MissingExtraError
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 from tests.cli.commandline import run
@@ -95,7 +96,7 @@ async def test_pick_without_the_extra_names_it_before_anything_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "scipy", None)
-    with pytest.raises(MissingExtraError, match=r"scipy: pip install .smartcam\[calibration\]"):
+    with pytest.raises(MissingExtraError, match=r"SciPy: pip install .smartcam\[calibration\]"):
         await pick(Options(), str(tmp_path / "pick.svg"), 1)
     assert capsys.readouterr().out == ""
 

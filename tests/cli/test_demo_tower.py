@@ -13,16 +13,8 @@ from smartcam._cli import demo_tower
 from smartcam._cli.demo_tower import MISSED, BlockPose, measured_block, tower
 from smartcam._cli.options import Options
 from smartcam.depth import ColourRange
-from smartcam.depth._simulation import (
-    BASELINE,
-    BLOCK,
-    DISPARITY_SIGMA,
-    FOCAL,
-    TowerTable,
-    WoodenBlock,
-    laid,
-    to_robot,
-)
+from smartcam.depth._inside import BLOCK, FOCAL, TowerTable, WoodenBlock, laid, to_robot
+from smartcam.depth._simulation import BASELINE, DISPARITY_SIGMA
 from smartcam.exceptions import FrameFormatError
 from tests.cli.commandline import run
 

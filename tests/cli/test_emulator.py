@@ -131,7 +131,7 @@ def test_emulator_port_taken_exits_2(transport: str) -> None:
 
 
 def test_emulator_ports_beyond_the_last_exit_2() -> None:
-    run_emulator("--port", "65535", "--cameras", "2").failed(2, "cannot listen on tcp 127.0.0.1:")
+    run_emulator("--port", "65535", "--cameras", "2").failed(2, "emulator: port: expected")
 
 
 def test_emulator_unknown_host_exits_2() -> None:

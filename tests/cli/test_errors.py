@@ -243,7 +243,7 @@ def test_trigger_layout_too_short_exits_6(url: str) -> None:
 def test_trigger_wrong_layout_text_exits_2_with_the_position() -> None:
     # nothing listens on port 1: what is wrong is seen before anything is tried
     outcome = run("trigger", "bvs://127.0.0.1:1", "--interpret-as", "n: int33")
-    outcome.failed(2, "'int33'", "did you mean int32?", "at character 3")
+    outcome.failed(2, "'int33'", "did you mean 'int32'?", "at character 3")
 
 
 @pytest.mark.parametrize("spec", ["nonsense", ""])
@@ -416,3 +416,74 @@ def test_trigger_narrow_encoding_escapes_what_it_lacks() -> None:
         ) as process,
     ):  # fmt: skip
         process.read_until(b"t = Gr\xf6\xdfe\\u2192\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("trigger", "bvs://HOST", "--application", "seven"), "'seven' is not a whole number."),
+        (("trigger", "bvs://HOST", "--timeout", "0,5"), "not a number; did you mean 0.5?"),
+        (("calibrate", "plan"), "No such command 'plan'; commands are compare, draw"),
+        (("calibrate", "len"), "No such command 'len'; did you mean 'lens'"),
+        (("calibrate", "plane", "bvs://HOST"), "smartcam calibrate URL --wizard plane"),
+        (("calibrate", "show", "file.json"), "No such command 'show'; commands are compare"),
+    ],
+)
+def test_wrong_use_is_told_in_words(arguments: tuple[str, ...], text: str) -> None:
+    outcome = run(*arguments)
+    assert outcome.code == 2
+    assert text in " ".join(outcome.err.split())
+
+
+def test_name_of_a_host_is_no_mistyped_command() -> None:
+    outcome = run("calibrate", "vision1.invalid", "--application", "7", "--timeout", "0.5")
+    assert "No such command" not in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("address", "text"),
+    [
+        ("bvs:/127.0.0.1", "has a path, which means nothing: expected bvs://HOST[:PORT]"),
+        ("insight://127.0.0.1/cam", "means nothing: expected insight://HOST[:PORT]"),
+    ],
+)
+def test_address_with_a_path_is_told_its_form(address: str, text: str) -> None:
+    run("status", address).failed(2, text)
+
+
+def test_file_that_is_not_there_is_told_which_one_was_meant(tmp_path: Path) -> None:
+    (tmp_path / "fleet.yaml").write_text("cameras: {}\n", encoding="utf-8")
+    where = str(tmp_path / "fleet.yml")
+    failed = run("serve", where).failed(2, "No such file or directory; did you mean 'fleet.yaml'?")
+    assert "Errno" not in failed.err
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("cameras: [line1]", "cameras: Input should be a valid dictionary (got a list)"),
+        ("cameras: {a: {emulated: {count: many}}}", "count: Input should be a valid integer"),
+        ("cameras: {a: {emulated: {count: many}}}", "(got 'many')"),
+    ],
+)
+def test_mistake_in_a_file_says_what_came(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "fleet.yaml"
+    path.write_text(text, encoding="utf-8")
+    run("serve", str(path)).failed(2, told)
+
+
+def test_layout_in_a_file_is_told_without_the_mark_below_it(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.yaml"
+    entry = '{url: "bvs://HOST", interpret_as: "x: real32 mmm"}'
+    path.write_text(f"cameras:\n  a: {entry}\n", encoding="utf-8")
+    failed = run("serve", str(path)).failed(2, "got 'mmm' at character 10")
+    assert failed.err.endswith("at character 10\n")
+
+
+def test_hex_that_is_none_is_told_without_pythons_words() -> None:
+    failed = run("decode", "zz", "--interpret-as", "x: real32").failed(2, "two of 0-9 and a-f")
+    assert "fromhex" not in failed.err
+
+
+def test_port_of_an_address_that_is_searched_has_no_place() -> None:
+    run("find", "127.0.0.1:36701", "--may-disturb").failed(2, "a port has no place here")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from smartcam.fleet._authority import make_certificates
+from smartcam.fleet._inside import make_certificates
 from tests.cli.commandline import run
 from tests.fleet.plantkit import CAMERA
 from tests.processes import Process

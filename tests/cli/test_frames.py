@@ -22,7 +22,6 @@ from smartcam.exceptions import FrameFormatError, FrameSourceError
 from smartcam.frames import (
     FoundSource,
     Frame,
-    FrameDriver,
     FrameSink,
     Moment,
     StreamFormat,
@@ -32,6 +31,7 @@ from smartcam.frames import open as open_frames
 from smartcam.frames._synthetic import stripes, write_stamp
 from smartcam.registry import FRAMES
 from tests.cli.commandline import run
+from tests.frames.drivers import ShowingDriver
 from tests.processes import PATIENCE, Process
 
 codecs = pytest.importorskip("imagecodecs", reason="needs the extra frames")
@@ -58,7 +58,7 @@ def shot(levels: Any, format: str = "Mono8", **other: Any) -> Frame:
     return Frame(**(about | other))
 
 
-class Shelf(FrameDriver):
+class Shelf(ShowingDriver):
     """Gives the frames that a test put there, one after the other, and then ends or does not."""
 
     frames: tuple[Frame, ...] = ()
@@ -66,8 +66,6 @@ class Shelf(FrameDriver):
     ends: Any = "not"
     fails: BaseException | None = None
     period = 0.005
-
-    _task: asyncio.Task[None] | None = None
 
     @classmethod
     async def discover(cls) -> list[FoundSource]:
@@ -84,24 +82,12 @@ class Shelf(FrameDriver):
             raise self.fails
         return StreamFormat(find_format("Mono8"), 24, 16)
 
-    async def start(self, sink: FrameSink) -> None:
-        self._task = asyncio.create_task(self._give(sink))
-
-    async def _give(self, sink: FrameSink) -> None:
+    async def show(self, sink: FrameSink) -> None:
         for one in self.frames:
             sink.frame(one)
             await asyncio.sleep(self.period)
         if self.ends != "not":
             sink.ended(self.ends)
-
-    async def stop(self) -> None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
-
-    async def close(self) -> None:
-        await self.stop()
 
 
 Puts = Callable[..., None]

@@ -138,7 +138,7 @@ def test_trigger_prints_cells_as_the_layout_says(online: str) -> None:
         "C001": "ABC",
     }
     out = run("trigger", cells, "--interpret-as", layout, "--count", "2").done().out
-    assert out.count("  x = 0.1015\n  ok = True\n  code = ABC\n") == 2
+    assert out.count("  x = 0.1015 m\n  ok = True\n  code = ABC\n") == 2
 
 
 def test_trigger_with_an_application_has_it_online(url: str) -> None:
@@ -161,7 +161,7 @@ def test_trigger_of_a_camera_that_is_offline_exits_5_and_says_how_to_start(url: 
         ("?cells=A1", "x: int32", 6, "cell A001 holds '101.500': no whole number"),
         ("?cells=A1", "x: real32, y: real32", 6, "1 cells came, the layout has 2 fields"),
         ("?cells=A999", "x: int32", 2, "'A999' is no cell"),
-        ("?cells=A1", "x: int", 2, "did you mean int32?"),
+        ("?cells=A1", "x: int", 2, "did you mean 'int32'?"),
     ],
 )
 def test_trigger_that_cannot_be_read_exits(
@@ -203,7 +203,9 @@ def test_switch_to_a_number_that_is_no_id_is_wrong_usage(url: str, job: str) -> 
 def test_switch_to_a_file_is_unsupported_where_there_are_none() -> None:
     with Process("smartcam-emulator") as emulator:
         url = emulator.read_until(b"\n").strip()
-        run("switch", url, "7bolts.job").failed(5, "dialect handbook has no LoadFile")
+        run("switch", url, "7bolts.job").failed(
+            5, "'7bolts.job' is no id, and so the name of a file: dialect handbook has no LoadFile"
+        )
         emulator.send_signal(signal.SIGTERM)
         emulator.wait().done()
 

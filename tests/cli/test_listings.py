@@ -7,6 +7,7 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
+import click
 import pytest
 from click.testing import CliRunner
 
@@ -17,7 +18,7 @@ from smartcam._cli.smartcam import LISTED, TOPICS
 from smartcam._cli.smartcam import command as smartcam_command
 from smartcam._cli.smartcam_emulator import PROTOCOL
 from smartcam._dissector import lua_source
-from smartcam.protocols._bvs import BVS
+from smartcam.protocols import BVS
 from smartcam.registry import INTERPRETERS, PROTOCOLS
 from tests.cli.commandline import each, run, run_emulator
 from tests.processes import Process, printed_by
@@ -80,6 +81,20 @@ def test_list_has_the_first_sentence_of_each_commands_help() -> None:
             assert listed.summary == command.get_short_help_str(limit=400)
 
 
+def test_every_group_lists_its_commands_with_whole_summaries() -> None:
+    for name in ("fleet", "frames", "depth", "sheet", "calibrate"):
+        with each(name):
+            group = smartcam_command.commands[name]
+            assert isinstance(group, click.Group)
+            out = run(name, "--help").done().out.partition("Commands:\n")[2]
+            listed = " ".join(out.split())
+            shown = {key: one for key, one in group.commands.items() if not one.hidden}
+            assert shown
+            for key, one in shown.items():
+                assert f"{key} {one.get_short_help_str(400)}" in listed
+            assert "..." not in listed
+
+
 def test_dialects_of_options_are_those_of_the_protocol() -> None:
     assert tuple(BVS.dialects) == DIALECTS
     assert BVS.name == PROTOCOL
@@ -105,7 +120,7 @@ def test_help_imports_what_it_shows_and_nothing_else(main: str, argument: str) -
     assert "click" in found
     assert not found & HEAVY
     own = {name for name in found if name.startswith("smartcam.")}
-    assert {name.split(".")[1] for name in own} <= {"_cli", "_lazy", "exceptions"}
+    assert {name.split(".")[1] for name in own} <= {"_cli", "_extras", "_lazy", "exceptions"}
 
 
 HELPS = """
@@ -130,7 +145,7 @@ def test_help_of_a_command_imports_no_room() -> None:
     assert not found & (HEAVY - {"asyncio", "logging", "socket"})
     own = {name for name in found if name.startswith("smartcam.")}
     assert own >= {f"smartcam._cli.{listed.module}" for listed in LISTED.values()}
-    light = {"_cli", "_lazy", "backoff", "exceptions", "models"}
+    light = {"_arguments", "_cli", "_extras", "_lazy", "backoff", "exceptions", "models"}
     assert {name.split(".")[1] for name in own} <= light
 
 

@@ -19,6 +19,7 @@ from tests.cli.commandline import (
     SESSION,
     WAITING,
     Peer,
+    closed_port,
     emulators,
     run,
     run_as_far_as,
@@ -150,7 +151,7 @@ def test_probe_broken_datagram_is_shown() -> None:
     with datagrams(b"nonsense") as address:
         url = f"bvs+udp://{address}?dialect=handbook"
         outcome = run_as_far_as(b"nonsense".hex(), "probe", url)
-    outcome.failed(3, "handbook over UDP")
+    outcome.failed(3, " bytes, then silence", "Something else listens there")
     shown = [each for each in lines_of(outcome.out, "udp handbook") if each.startswith("!")]
     assert shown
     assert all(each.endswith(b"nonsense".hex() + "  'nonsense'") for each in shown)
@@ -175,3 +176,9 @@ def test_probe_trace_has_the_end_of_the_session_too(tmp_path: Path) -> None:
         "Disconnect", "Connect", "ConnectAnswer", "StatusReport", "Query", "QueryAnswer",
         "Disconnect",
     ]  # fmt: skip
+
+
+def test_no_answer_is_told_once_with_what_to_do() -> None:
+    with closed_port() as place:
+        failed = run("probe", place).failed(3, f"no session with {place}", "Look at the port")
+    assert failed.err.count("Connection refused") == 1

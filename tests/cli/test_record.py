@@ -246,7 +246,7 @@ def test_replay_wrong_camera_and_speed_are_told(url: str, tmp_path: Path) -> Non
     path = tmp_path / "run.mcap"
     run("record", url, "-o", str(path), "--seconds", "0.1", "--name", "left").done()
     run("replay", str(path), "--camera", "x").failed(2, "no camera 'x' is in it; there are: left")
-    run("replay", str(path), "--speed", "0").failed(2, "a speed from 0.001 to 1000 was expected")
+    run("replay", str(path), "--speed", "0").failed(2, "speed: expected a number, 0.001 to 1000")
 
 
 @needs_tshark

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from smartcam.recording import _folder_writer as folder_writer
 from smartcam.recording import _recorder as recorder
 from smartcam.recording import load_recording
+from smartcam.recording._folders import writer as folder_writer
 from tests.cli.commandline import emulators, run
 from tests.fleet.fleetkit import NumberedCamera
 from tests.processes import Process, wait_until

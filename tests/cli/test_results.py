@@ -230,7 +230,10 @@ def test_watch_count_prints_as_many_results(url: str) -> None:
 
 def test_watch_seconds_without_result_ends_well(url: str) -> None:
     run("switch", url, "2").done()
-    assert run("watch", url, "--seconds", "0.1").done().out == ""
+    seen = run("watch", url, "--seconds", "0.1")
+    assert (seen.code, seen.out) == (0, "")
+    assert seen.err.startswith("note: no result came in 0.1 s; status: ")
+    assert run("watch", url, "--seconds", "0.1", "--json").done().err == ""
 
 
 # ---------------------------------------------------------------------- status, switch, start, stop
@@ -347,7 +350,8 @@ def test_watch_application_named_results_of_the_one_before_are_not_shown() -> No
             "--seconds",
             "0.3",
         )
-    assert (shown.code, shown.out, shown.err) == (0, "", "")
+    assert (shown.code, shown.out) == (0, "")
+    assert shown.err.startswith("note: no result came in 0.3 s")
 
 
 def test_probe_json_gives_every_try_then_the_url(urls: dict[tuple[str, str], str]) -> None:
@@ -388,8 +392,7 @@ def test_probe_nothing_there_exits_3_and_names_each_try() -> None:
     with closed_port() as address:
         outcome = run("probe", address, "--timeout", "0.3")
     every = [(way, " or ".join(group)) for way in TRIED for group in TRIED[way]]
-    names = [f"{dialects} over {transport.upper()}" for transport, dialects in every]
-    outcome.failed(3, address, *names)
+    outcome.failed(3, address)
     assert probed(outcome.out) == every
 
 

@@ -144,3 +144,31 @@ def test_a_wrong_file_is_told_as_json(tmp_path: Path) -> None:
     line = json.loads(ended.err)
     assert (ended.code, line["level"], line["logger"]) == (2, "critical", "smartcam.serve")
     assert "operations.listen: expected HOST:PORT" in line["message"]
+
+
+def test_agent_whose_router_is_away_tries_again_and_a_router_has_no_cameras(
+    tmp_path: Path,
+) -> None:
+    place = free_place()
+    south, router = tmp_path / "south.yaml", tmp_path / "router.yaml"
+    router.write_text(f"agent: router\nlisten: {place}\ncameras: {{}}\n")
+    south.write_text(
+        f"agent: south\nconnect: {place}\ncameras: {{line1/cam3: {{emulated: {{}}}}}}\n"
+    )
+    with Process("smartcam", "serve", str(south), merged=True) as agent:
+        said = agent.read_until(b"\n")
+        assert "cannot reach" in said
+        assert said.endswith("; it is tried on\n")
+        with Process("smartcam", "serve", str(router)) as other:
+            host = place.removeprefix("tcp/")
+            assert other.read_until(b"\n") == f"fleet://{host}  a router, without cameras\n"
+            shared = agent.read_until(b"\n", count=2).splitlines()[-1]
+            assert shared.startswith(f"fleet://{host}/line1/cam3")
+            with Process(
+                "smartcam", "trigger", f"fleet://{host}/line1/cam3", "--application", "7"
+            ) as it:
+                assert it.wait().code == 0
+            agent.send_signal(signal.SIGTERM)
+            assert agent.wait().code == 0
+            other.send_signal(signal.SIGTERM)
+            assert other.wait().code == 0

@@ -8,8 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from smartcam.calibration._printing.sheets import Rays, make_sheet
-from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid, target_from_data
+from smartcam.calibration import (
+    Charuco,
+    Checkerboard,
+    CircleGrid,
+    MarkerGrid,
+    make_sheet,
+    target_from_data,
+)
+from smartcam.calibration._printing.sheets import Rays
 from tests.cli.commandline import run
 
 BOARD = ("sheet", "checkerboard", "--columns", "9", "--rows", "6", "--square", "25")
@@ -35,6 +42,17 @@ def test_sheet_with_json_says_id_files_page_and_target() -> None:
     assert (line["files"], line["page_mm"]) == (["a.svg"], [297, 420])
     assert line["origin_mm"] == pytest.approx(make_sheet(target, page="A3").origin)
     assert target_from_data(line["target"]) == target
+
+
+def test_sheet_of_markers_is_opencvs_or_kalibrs() -> None:
+    grid = ("sheet", "marker_grid", "--columns", "4", "--rows", "3", "--marker", "30", "--gap", "9")
+    (line,) = run(*grid, "-o", "a.svg", "--json").done().lines
+    target = MarkerGrid(columns=4, rows=3, marker=0.03, gap=0.009)
+    assert target_from_data(line["target"]) == target
+    assert line["id"] == make_sheet(target).id
+    (line,) = run(*grid, "--kalibr", "-o", "b.svg", "--json").done().lines
+    april = MarkerGrid.april_grid(columns=4, rows=3, tag=0.03, spacing=0.3)
+    assert target_from_data(line["target"]) == april
 
 
 def test_sheet_describes_the_target(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from smartcam._cli.systemd import MOST_UNSENT, Notifier
+from smartcam._cli.systemd import MAX_UNSENT, Notifier
 
 pytestmark = pytest.mark.skipif(not hasattr(socket, "AF_UNIX"), reason="no such sockets here")
 
@@ -76,7 +76,7 @@ def test_who_does_not_read_stops_nothing_and_hears_of_states_later(
     assert read(heard) == [["READY=1", "STATUS=here"], ["WATCHDOG=1"]]
     for _ in range(1000):
         notifier.ready("again")
-    assert len(notifier._unsent) <= MOST_UNSENT
+    assert len(notifier._unsent) <= MAX_UNSENT
     notifier.close()
 
 

@@ -15,7 +15,7 @@ from smartcam.emulator import EmulatedCamera
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
 
-    from smartcam.emulator._client_link import ClientLink
+    from smartcam.emulator._inside import ClientLink
 
 NETWORK = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250 + 1}."
 """Of this process alone, so that tests side by side do not meet."""

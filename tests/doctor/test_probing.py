@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from smartcam._client.link import MAX_REST
-from smartcam.doctor._probing import MAX_FRAMES, Trial, trials, ways
+from smartcam.doctor._inside import Trial, trials
+from smartcam.doctor._probing import MAX_FRAMES, ways
 from smartcam.emulator import EmulatedCamera
 from smartcam.models import Status
 from smartcam.observers import TraceEntry

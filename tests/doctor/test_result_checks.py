@@ -256,3 +256,33 @@ def test_limits_say_why() -> None:
     page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
     assert [rule.reason for rule in PLAUSIBLE if f"| {rule.reason} |" not in page] == []
     assert PLAUSIBLE[0].most == pytest.approx(2 * math.pi)
+
+
+@pytest.mark.parametrize(
+    ("layout", "values", "text"),
+    [
+        ("x: real32 mm, y: real32 mm", {"x": 0.00012, "y": -0.0015}, "x, y: no more than 1.5 mm"),
+        ("theta: real32 deg", {"theta": 0.0548}, "theta: no more than 3.14 deg"),
+        ("(a: real64 deg)*", [{"a": 0.01}, {"a": -0.02}], "a: no more than 1.146 deg"),
+    ],
+)
+async def test_si_that_a_layout_takes_for_a_unit_is_told(
+    layout: str, values: Any, text: str
+) -> None:
+    found = of(await read(layout, values, layout), "values")
+    assert (found.severity, found.text.startswith(text)) == ("hint", True), found.text
+    assert found.text.count("which looks like metres") + found.text.count("like radians") == 1
+
+
+@pytest.mark.parametrize(
+    ("layout", "values"),
+    [
+        ("x: real32 mm, y: real32 mm", {"x": 0.00012, "y": 0.112}),  # one is large enough
+        ("x: real32 mm", {"x": 0}),
+        ("theta: real32 deg", {"theta": 0.5}),
+        ("x: int32 mm", {"x": 0.001}),  # metres are no integers
+        ("x: real32 um", {"x": 0.0001}),
+    ],
+)
+async def test_small_values_that_need_no_question(layout: str, values: Any) -> None:
+    assert severities(await read(layout, values, layout), "values") == []

@@ -1,0 +1,80 @@
+"""Having a shell complete the commands: a line in the file that it reads when it starts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from smartcam._suggestions import did_you_mean
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PROGRAMS = ("smartcam", "smartcam-emulator")
+"""Commands that are completed."""
+
+_EVAL = 'command -v {program} >/dev/null && eval "$({variable}={shell}_source {program})"'
+
+LINES: Mapping[str, str] = {
+    "bash": _EVAL,
+    "zsh": _EVAL,
+    "fish": "command -q {program}; and {variable}=fish_source {program} | source",
+}
+"""A line of each shell that has it complete a program which is there."""
+
+
+def install(shell: str) -> str:
+    """Write the lines into the shell's file where they are not there, and return what was done.
+
+    Args:
+        shell: name of the shell; "": that of the variable SHELL.
+
+    Raises:
+        click.UsageError: the shell is none of those known, or its file cannot be written.
+    """
+    name = shell or Path(os.environ.get("SHELL", "")).name
+    if name not in LINES:
+        known = ", ".join(LINES)
+        raise click.UsageError(
+            f"--install-completion: expected one of {known}, got {name!r}"
+            f"{did_you_mean(name, LINES)}"
+        )
+    path = _file_of(name)
+    try:
+        written = _append(path, [_line(name, program) for program in PROGRAMS])
+    except (OSError, UnicodeDecodeError) as exc:
+        raise click.UsageError(f"--install-completion: {path}: {exc}") from exc
+    if not written:
+        return f"{path}: has the lines already"
+    return f"{path}: {written} lines added; a new {name} completes {' and '.join(PROGRAMS)}"
+
+
+def _line(shell: str, program: str) -> str:
+    variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
+    return LINES[shell].format(program=program, variable=variable, shell=shell)
+
+
+def _file_of(shell: str) -> Path:
+    """Return the file that a shell reads when somebody opens it."""
+    home = Path.home()
+    if shell == "fish":
+        config = Path(os.environ.get("XDG_CONFIG_HOME") or home / ".config")
+        return config / "fish" / "conf.d" / "smartcam.fish"
+    folder = Path(os.environ.get("ZDOTDIR") or home) if shell == "zsh" else home
+    return folder / f".{shell}rc"
+
+
+def _append(path: Path, lines: list[str]) -> int:
+    """Append the lines that a file lacks; return how many these are."""
+    text = path.read_text(encoding="utf-8") if path.exists() else ""
+    there = text.splitlines()
+    lacking = [line for line in lines if line not in there]
+    if lacking:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as stream:
+            stream.write("\n" * (bool(text) and not text.endswith("\n")))
+            stream.writelines(f"{line}\n" for line in lacking)
+    return len(lacking)

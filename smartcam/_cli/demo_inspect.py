@@ -1,0 +1,190 @@
+"""``smartcam demo --inspect``: a software camera that checks drawn parts, beside the truth."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._cli.demo import Steps
+from smartcam._cli.options import naming
+from smartcam._cli.texts import table_text
+from smartcam._extras import load
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from smartcam._cli.options import Options
+    from smartcam.inspection import Inspection
+
+    Pixels = NDArray[np.uint8]
+
+USE: Final = "inspection needs"
+
+SIZE_PX: Final = (640, 400)
+"""Width and height of a picture."""
+
+PART_PX: Final = (320, 180)
+"""Width and height of the part."""
+
+OVERSAMPLING: Final = 3
+"""Samples of a pixel along each side."""
+
+LOGO: Final = (-40, 20, 160, 50)
+"""The print, in the part's frame of reference: x, y, width, height."""
+
+CELL: Final = f"""\
+cameras:
+  desk/drawn:
+    software:
+      frames: pictures
+      applications:
+        1:
+          name: part
+          present: {{grey: [175, 255], area: [40000, 70000]}}
+        2:
+          name: label
+          read: {{codes: DataMatrix, expect: 'LOT-\\d{{4}}'}}
+        3:
+          name: check
+          read: {{codes: DataMatrix, expect: 'LOT-\\d{{4}}'}}
+          present hole:
+            {{follow: part, region: [-155, -85, 60, 60], grey: [0, 90], area: [700, 1500]}}
+          compare print:
+            {{follow: part, taught: print.png, region: {list(LOGO)}, shift: 6, area: 40}}
+"""
+
+
+class DrawnPart(NamedTuple):
+    """A part on the table.
+
+    Attributes:
+        name: name of its picture.
+        fault: what is wrong with it; "" for nothing.
+        x: place of its middle, pixels.
+        y: place of its middle, pixels.
+        degrees: turn, clockwise.
+        code: text of its code.
+        print: text of its print.
+        hole: False: the hole is missing.
+        noise: standard deviation of the noise, grey levels.
+    """
+
+    name: str
+    fault: str
+    x: float = 320.0
+    y: float = 200.0
+    degrees: float = 0.0
+    code: str = "LOT-4711"
+    print: str = "smartcam"
+    hole: bool = True
+    noise: float = 3.0
+
+
+PARTS: Final = (
+    DrawnPart("good", ""),
+    DrawnPart("turned", "", 300.0, 215.0, 14.0),
+    DrawnPart("dim", "", 330.0, 190.0, -11.0, noise=9.0),
+    DrawnPart("no-hole", "hole", 310.0, 205.0, 5.0, hole=False),
+    DrawnPart("wrong-code", "read", 325.0, 195.0, -6.0, code="LOT-47X1"),
+    DrawnPart("bad-print", "print", 315.0, 210.0, 9.0, print="smartcar"),
+)
+"""The parts that the demonstration draws."""
+
+
+async def inspect(options: Options, folder: Path, seed: int) -> None:
+    """Draw parts, write a cell file, and inspect the pictures."""
+    from smartcam.inspection import Picture, load_cell
+
+    say = Steps(options)
+    with naming(f"--folder {folder}"):
+        await asyncio.to_thread(_write, folder, seed)
+    say.step(
+        f"A folder with drawn pictures of {len(PARTS)} parts, and a file that says what is to be "
+        f"seen in them: {folder / 'cell.yaml'}",
+        folder=str(folder),
+    )
+    camera = load_cell(folder / "cell.yaml")["desk/drawn"]
+    check = camera.program("check")
+    say.step("The application 3 reads, looks for a hole, and compares a print. Its results are:")
+    say.detail(f"   {check.interpret_as}", layout=check.interpret_as)
+    say.step("Inspected, beside the truth:")
+    rows: list[tuple[object, ...]] = []
+    parts: list[dict[str, Any]] = []
+    for part in PARTS:
+        picture = await asyncio.to_thread(Picture.read, folder / "pictures" / f"{part.name}.png")
+        found = await asyncio.to_thread(check.inspect, picture)
+        with naming(f"--folder {folder}"):
+            await asyncio.to_thread(_draw, folder / "seen" / f"{part.name}.png", found)
+        wrong = [name for name, one in found.findings.items() if not one.ok]
+        milliseconds = 1e3 * sum(found.seconds.values())
+        rows.append(
+            (part.name, part.fault or "none", ", ".join(wrong) or "none", f"{milliseconds:.1f} ms")
+        )
+        parts.append({"picture": part.name, "fault": part.fault, "found": wrong})
+    say.detail(table_text(("picture", "fault", "found", "took"), rows), parts=parts)
+    say.step(
+        f"What the tools saw stands in {folder / 'seen'}. Change {folder / 'cell.yaml'}, and try "
+        "it:"
+    )
+    say.detail(f"   smartcam inspect {folder}/cell.yaml desk/drawn check {folder}/pictures")
+
+
+def _write(folder: Path, seed: int) -> None:
+    for name in ("pictures", "seen"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(seed)
+    taught = draw_part(PARTS[0], random)
+    x, y = round(PARTS[0].x) + LOGO[0], round(PARTS[0].y) + LOGO[1]
+    _save(folder / "print.png", taught[y : y + LOGO[3], x : x + LOGO[2]])
+    for part in PARTS:
+        _save(folder / "pictures" / f"{part.name}.png", draw_part(part, random))
+    (folder / "cell.yaml").write_text(CELL, encoding="utf-8")
+
+
+def _draw(path: Path, found: Inspection) -> None:
+    _save(path, found.drawn()[:, :, ::-1])
+
+
+def _save(path: Path, pixels: NDArray[Any]) -> None:
+    path.write_bytes(load("cv2", USE).imencode(".png", pixels)[1].tobytes())
+
+
+def draw_part(part: DrawnPart, random: np.random.Generator) -> Pixels:
+    """Return a picture of a part, (H, W), uint8."""
+    cv2 = load("cv2", USE)
+    face = _face(part)
+    cos, sin = math.cos(math.radians(part.degrees)), math.sin(math.radians(part.degrees))
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]])
+    middle = (np.array(face.shape[::-1]) - 1) / 2
+    place = OVERSAMPLING * (np.array([part.x, part.y]) + 0.5) - 0.5
+    turn[:, 2] = place - turn[:, :2] @ middle
+    large = tuple(OVERSAMPLING * side for side in SIZE_PX)
+    canvas = cv2.warpAffine(face, turn, large, flags=cv2.INTER_LINEAR, borderValue=120)
+    levels = cv2.resize(canvas, SIZE_PX, interpolation=cv2.INTER_AREA).astype(np.float64)
+    levels += random.normal(0.0, part.noise, levels.shape)
+    picture: Pixels = np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    return picture
+
+
+def _face(part: DrawnPart) -> Pixels:
+    """Return the part from above, upright, oversampled."""
+    cv2, zxing = load("cv2", USE), load("zxingcpp", "codes need")
+    many = OVERSAMPLING
+    face = np.full((many * PART_PX[1], many * PART_PX[0]), 215, np.uint8)
+    if part.hole:
+        cv2.circle(face, (many * 35, many * 35), many * 18, 40, -1, cv2.LINE_AA)
+    code = np.array(
+        zxing.create_barcode(part.code, zxing.BarcodeFormat.DataMatrix).to_image(scale=4 * many)
+    )
+    rows, columns = code.shape
+    left = face.shape[1] - columns - many * 12
+    face[many * 10 : many * 10 + rows, left : left + columns] = np.clip(code, 30, 215)
+    place = (many * 124, many * 146)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(face, part.print, place, font, 0.95 * many, 30, 2 * many, cv2.LINE_AA)
+    return face

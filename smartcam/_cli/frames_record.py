@@ -1,0 +1,188 @@
+"""``smartcam frames record``: a camera's pictures in a file, or in files that follow each other."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.frame_sources import TIMEOUT, opened
+from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.running import first
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.exceptions import RecordingError
+    from smartcam.frames import FrameSource
+    from smartcam.recording import Recorder, RotatingRecorder
+
+BYTES = {"kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+SECONDS = {"s": 1, "min": 60, "h": 3600, "d": 86_400}
+
+
+if TYPE_CHECKING:
+    _AmountType = click.ParamType[float]
+else:
+    _AmountType = click.ParamType
+
+
+class _Amount(_AmountType):
+    """A number with a unit, such as ``100 MB``."""
+
+    def __init__(self, name: str, units: Mapping[str, int]) -> None:
+        self.name = name
+        self._units = units
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]+)\s*", str(value))
+        if found is None or found[2] not in self._units:
+            self.fail(
+                f"{value!r}: expected a number and one of {', '.join(self._units)}", param, ctx
+            )
+        return float(found[1]) * self._units[found[2]]
+
+
+@click.command(
+    name="record",
+    help="Record a source until Ctrl-C, its end, --count or --seconds. FILE.mcap holds every frame "
+    "as it came, with its times, number and losses; Foxglove shows it, and smartcam frames and "
+    "frames.open() play it. FILE.mkv is a video without loss (JPEGs as they came) for players, "
+    "with the captures' times in milliseconds; it needs the extra "
+    '"video". FOLDER gets files that follow each other, the oldest of which are deleted. A slow '
+    "disk costs pictures, never the camera: how many is told. Needs the extra "
+    '"record".',
+)
+@click.argument("url")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE.mcap|FILE.mkv|FOLDER",
+    required=True,
+    help="Where to write.",
+)
+@option("--force")
+@option("--name", help="The camera's name in the file; default made of the URL.")
+@option("--count", help="End after so many pictures.")
+@option("--seconds", help="End so many seconds after the first picture.")
+@click.option(
+    "--size",
+    type=_Amount("SIZE", BYTES),
+    help="Of a folder: the next file begins behind so much.  [default: 1 GB]",
+)
+@click.option(
+    "--age",
+    type=_Amount("AGE", SECONDS),
+    help="Of a folder: the next file begins behind so long.  [default: 1 h]",
+)
+@click.option(
+    "--keep",
+    type=_Amount("SIZE", BYTES),
+    help="Of a folder: of all files together; the oldest are deleted.  [default: 10 GB]",
+)
+@option("--timeout", help=TIMEOUT)
+@runs(*OUTPUT, interrupted=0)
+async def record(
+    url: str,
+    output: str,
+    force: bool,
+    size: float | None,
+    age: float | None,
+    keep: float | None,
+    options: Options,
+) -> None:
+    """Record a source of frames."""
+    from smartcam.recording import Recorder
+    from smartcam.recording._inside import file_name
+
+    bounds = {"size": size, "age": age, "keep": keep}
+    given = {name: bound for name, bound in bounds.items() if bound is not None}
+    recorder = _recorder(output, given, force=force)
+    async with opened(url, options) as source:
+        recorder.open()
+        try:
+            if isinstance(recorder, Recorder):
+                recorder.describe(options.name or file_name(source.name), frames=source.name)
+            options.show(
+                {"url": source.name, "file": str(recorder.path)},
+                f"recording {source.name} to {recorder.path}, Ctrl-C to end",
+            )
+            await _record(source, recorder, options.name or file_name(source.name), options)
+        finally:
+            await _end(recorder, source.statistics().lost, options)
+
+
+def _recorder(output: str, bounds: dict[str, float], *, force: bool) -> Recorder | RotatingRecorder:
+    """Return the recorder of a path: of a recording, a video, or a folder."""
+    from smartcam.recording import Recorder, RotatingRecorder
+
+    suffix = Path(output).suffix.lower()
+    if suffix in (".mcap", ".mkv") and not Path(output).is_dir():
+        if bounds:
+            raise click.UsageError(
+                f"--{next(iter(bounds))} is for a folder, whose files follow each other: "
+                f"-o {Path(output).with_suffix('')}"
+            )
+        return Recorder(output, overwrite=force)
+    if suffix:
+        raise click.BadParameter(
+            f"{output}: expected FILE.mcap, FILE.mkv, or a folder, whose name has no suffix",
+            param_hint="'-o' / '--output'",
+        )
+    return RotatingRecorder(output, on_trouble=_tell_trouble, **bounds)
+
+
+def _tell_trouble(trouble: RecordingError | None) -> None:
+    text = "it is recorded again" if trouble is None else f"{trouble}; pictures are lost"
+    click.echo(f"smartcam: note: {text}", err=True)
+
+
+async def _record(
+    source: FrameSource, recorder: Recorder | RotatingRecorder, name: str, options: Options
+) -> None:
+    """Record, for as long as the options say."""
+    began = asyncio.Event()
+
+    async def pictures() -> None:
+        await recorder.record(source, camera=name, count=options.count, on_start=began.set)
+
+    async def bound(seconds: float) -> None:
+        await began.wait()
+        await asyncio.sleep(seconds)
+
+    jobs = [pictures()]
+    if options.seconds is not None:
+        jobs.append(bound(options.seconds))
+    await first(jobs, None)
+
+
+async def _end(recorder: Recorder | RotatingRecorder, lost: int, options: Options) -> None:
+    """End the recording and tell what is in it; a file without a picture is removed."""
+    from smartcam.recording import RotatingRecorder
+
+    await asyncio.to_thread(recorder.close)
+    if isinstance(recorder, RotatingRecorder):
+        for name, account in recorder.accounts.items():
+            value = {"camera": name, "pictures": account.written, "left_out": account.lost}
+            _show(f"{recorder.path}: {name}", {"file": str(recorder.path), **value}, lost, options)
+        return
+    counts = recorder.counts
+    if not counts.pictures:
+        recorder.path.unlink(missing_ok=True)
+        return
+    for path in recorder.files:
+        size = path.stat().st_size
+        value = {"pictures": counts.pictures, "left_out": counts.left_out, "bytes": size}
+        _show(str(path), {"file": str(path), **value}, lost, options)
+
+
+def _show(what: str, value: dict[str, Any], lost: int, options: Options) -> None:
+    value["lost"] = lost
+    told = f"pictures {value['pictures']}, left out {value['left_out']}, lost {lost}"
+    size = f"; {value['bytes']} bytes" if "bytes" in value else ""
+    options.show(value, f"{what}: {told}{size}")

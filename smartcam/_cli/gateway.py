@@ -1,0 +1,188 @@
+"""``smartcam gateway``: robots and PLCs ask a camera for parts, line by line."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from smartcam._cli.options import CAMERA, CONNECTS, SECONDS, Options, runs
+from smartcam.backoff import Backoff
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from smartcam.camera import Camera
+    from smartcam.gateway import Gateway, GatewayFile, GatewaySettings
+
+DEMO_APPLICATION = 7
+"""The application of the emulated camera that localizes parts."""
+
+
+def _style_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give the command the options that say how answers are written."""
+    options = [
+        click.option(
+            "--listen",
+            metavar="tcp/HOST:PORT",
+            help="Where robots connect.  [default: tcp/127.0.0.1:7001]",
+        ),
+        click.option(
+            "--robot",
+            type=click.Choice(["plain", "ur", "kuka", "fanuc", "siemens"]),
+            help="The make of the controller, for what is not said below.  [default: plain]",
+        ),
+        click.option("--form", type=click.Choice(["text", "brackets", "xml"])),
+        click.option(
+            "--pose",
+            type=click.Choice(["ur", "abb", "kuka", "fanuc", "meca500"]),
+            help="Whose way of writing how a part is turned.",
+        ),
+        click.option("--length", type=click.Choice(["m", "mm"])),
+        click.option("--angle", type=click.Choice(["rad", "deg"])),
+        click.option("--decimals", type=click.IntRange(0, 9)),
+        click.option("--separator", metavar="CHARACTER"),
+        click.option("--line-end", type=click.Choice(["lf", "crlf", "cr", "none"])),
+        click.option("--width", type=click.IntRange(0, 1000), help="Bytes of each answer."),
+        click.option(
+            "--also",
+            multiple=True,
+            type=click.Choice(["quality", "photo_index", "feature_id"]),
+            help="What stands behind the pose; several times for several.",
+        ),
+        click.option("--tool-flip", is_flag=True, help="Have z point into the table, as a tool's."),
+        click.option("--max-age", type=SECONDS, help="How old a result may be that NEXT asks of."),
+        click.option("--idle", type=SECONDS, help="When a silent robot is hung up on."),
+        click.option("--clients", type=click.IntRange(1, 100), help="Robots at a time."),
+    ]
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+@click.command(
+    help="Answer robots and PLCs that ask for parts, line by line over TCP, until Ctrl-C. A "
+    "controller sends TRIGGER, then NEXT for each further part; --timeout bounds each answer. "
+    "CAMERA is a URL, or a YAML file that says all that the options say. --demo has an emulated "
+    f'camera behind it. Needs the extra "calibration". {CONNECTS}'
+)
+@click.argument("camera", metavar="[URL|FILE.yaml]", required=False)
+@click.option("--demo", is_flag=True, help="An emulated camera instead of CAMERA.")
+@_style_options
+@runs(
+    *("--application", "--interpret-as", "--y-down", "--calibration", "--name", "--seconds"),
+    *CAMERA,
+    interrupted=0,
+)
+async def gateway(camera: str | None, demo: bool, options: Options, **style: Any) -> None:
+    """Answer robots."""
+    from smartcam.gateway import Gateway
+
+    file = _file(camera, demo)
+    settings = _settings(file, style, options)
+    _fill(options, file)
+    async with contextlib.AsyncExitStack() as stack:
+        url = file.url
+        if url is None:
+            url = await stack.enter_async_context(_emulated(options))
+        make = stack.enter_context(options.cameras(url, reconnect=Backoff()))
+        first = make()
+        server = await stack.enter_async_context(Gateway(first, settings))
+        stack.callback(_tell_account, server, options)
+
+        def show() -> None:
+            value = {"gateway": server.address, "camera": url}
+            options.show(value, f"gateway: {server.address}  camera: {url}")
+
+        with contextlib.suppress(TimeoutError):  # --seconds are over
+            async with asyncio.timeout(options.seconds):
+                await _have_open(server, make, show)
+
+
+async def _have_open(server: Gateway, make: Callable[[], Camera], show: Callable[[], None]) -> None:
+    """Have the camera open, and show the gateway once it was tried for the first time."""
+    from smartcam._cli.live import have_open
+
+    first, shown = server.camera, False
+
+    def tried() -> None:
+        nonlocal shown
+        if not shown:
+            show()
+        shown = True
+
+    async def follow(camera: Camera, why: str) -> None:
+        if server.camera is first:
+            click.echo(f"note: {why}; it is tried on", err=True)
+        server.camera = camera
+        tried()
+
+    await have_open(first, make, follow, tried)
+
+
+def _file(camera: str | None, demo: bool) -> GatewayFile:
+    from smartcam.gateway import GatewayFile
+
+    if demo == (camera is not None):
+        raise click.UsageError(
+            "expected a camera's URL, a YAML file, or --demo: smartcam gateway URL"
+        )
+    if camera is None:
+        return GatewayFile(emulated=True)
+    return GatewayFile(url=camera) if "://" in camera else GatewayFile.load(camera)
+
+
+def _settings(file: GatewayFile, style: dict[str, Any], options: Options) -> GatewaySettings:
+    from pydantic import ValidationError
+
+    from smartcam.exceptions import ConfigurationError
+
+    said = {name: value for name, value in style.items() if value not in (None, (), False)}
+    if options.timeout is not None:
+        said["timeout"] = options.timeout
+    try:
+        return file.settings(**said)
+    except ValidationError as exc:
+        (first, *_) = exc.errors()
+        where = "".join(f"--{one}: " for one in first["loc"][:1]).replace("_", "-")
+        raise ConfigurationError(where + first["msg"].removeprefix("Value error, ")) from exc
+
+
+def _fill(options: Options, file: GatewayFile) -> None:
+    """Take from the file what the command line does not say."""
+    from smartcam.settings import is_fleet
+
+    for name in ("application", "interpret_as", "calibration", "name"):
+        if getattr(options, name) is None:
+            setattr(options, name, getattr(file, name))
+    options.y_down = options.y_down or file.y_down
+    if options.interpret_as is None and not is_fleet(file.url or ""):
+        options.interpret_as = "localizations"
+
+
+@contextlib.asynccontextmanager
+async def _emulated(options: Options) -> AsyncIterator[str]:
+    """Give the URL of an emulated camera, whose parts lie still."""
+    from smartcam.emulator import EmulatedCamera
+
+    if options.application is None:
+        options.application = DEMO_APPLICATION
+    async with EmulatedCamera() as emulator:
+        yield emulator.url
+
+
+def _tell_account(server: Gateway, options: Options) -> None:
+    """Print what became of all requests and parts."""
+    found = server.account
+    if options.as_json:
+        options.show({"account": dataclasses.asdict(found)}, "")
+        return
+    click.echo(
+        f"requests {found.requests} = answered {found.answered} + errors {found.errors} + "
+        f"abandoned {found.abandoned} + open {found.open}; parts {found.parts} = delivered "
+        f"{found.delivered} + forgotten {found.forgotten} + waiting {found.waiting}",
+        err=True,
+    )

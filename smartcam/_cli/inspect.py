@@ -1,0 +1,155 @@
+"""``smartcam inspect``: an application of a software camera, tried on pictures in files."""
+
+from __future__ import annotations
+
+import asyncio
+import html
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from smartcam._cli.options import OUTPUT, Options, from_hex, naming, option, runs
+from smartcam._cli.texts import value_text
+from smartcam.exceptions import ConfigurationError, FrameFormatError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from smartcam.inspection import Inspection, Program
+    from smartcam.layout._inside import ShownUnits
+
+SUFFIXES: Final = frozenset(
+    {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff", ".webp"}
+)
+"""Suffixes of the files in a folder that count as pictures, in small letters."""
+
+PAGE: Final = "index.html"
+
+
+@click.command(
+    help="Try an application of a software camera on pictures in files, and draw what it saw. CELL "
+    "is a cell file, or a fleet file with software cameras; APPLICATION a number or a name; "
+    "PICTURES files, or folders of them. Prints the results; with --output, draws what the tools "
+    "saw."
+)
+@click.argument("cell")
+@click.argument("camera")
+@click.argument("which", metavar="APPLICATION")
+@click.argument("pictures", nargs=-1, required=True)
+@option("--output", help="Draw what was seen into this folder: PNG files, and a page of them all.")
+@click.option("--input", "given", metavar="HEX", default="", help="Input data of each trigger.")
+@option("--units")
+@runs(*OUTPUT)
+async def inspect(
+    cell: str,
+    camera: str,
+    which: str,
+    pictures: Sequence[str],
+    output: str | None,
+    given: str,
+    options: Options,
+) -> None:
+    """Inspect the pictures one by one, print what was found, and draw it."""
+    from smartcam._suggestions import did_you_mean
+    from smartcam.inspection import load_cell
+    from smartcam.layout._inside import ShownUnits
+
+    units = ShownUnits([one for one in (options.units or "").split(",") if one])
+    data = from_hex(given, "--input")
+    cameras = load_cell(cell)
+    if camera not in cameras:
+        raise ConfigurationError(
+            f"{cell}: no software camera {camera!r:.80}; there are {', '.join(cameras)}"
+            f"{did_you_mean(camera, cameras)}"
+        )
+    program = cameras[camera].program(which)
+    files = [file for one in pictures for file in picture_files(Path(one))]
+    folder = None if output is None else Path(output)
+    if folder is not None:
+        with naming(f"--output {output}"):
+            folder.mkdir(parents=True, exist_ok=True)
+    failed: FrameFormatError | None = None
+    rows: list[str] = []
+    for number, file in enumerate(files, 1):
+        try:
+            found = await asyncio.to_thread(_inspect, program, file, data)
+        except FrameFormatError as exc:
+            failed = exc
+            options.show({"file": str(file), "error": str(exc)}, f"{file}: {exc}")
+            continue
+        drawn = None if folder is None else folder / f"{number:04}-{file.stem}.png"
+        if drawn is not None:
+            with naming(f"--output {output}"):
+                await asyncio.to_thread(_write, drawn, found)
+            rows.append(_row(file, found, drawn))
+        options.show(_fields(file, found, drawn), _text(file, found, units))
+    if folder is not None:
+        title = f"{camera}: {program.name}"
+        with naming(f"--output {output}"):
+            (folder / PAGE).write_text(_page(title, rows), encoding="utf-8")
+    if failed is not None:
+        raise failed
+
+
+def picture_files(path: Path) -> Iterator[Path]:
+    """Yield a file, or the pictures of a folder in the order of their names."""
+    from smartcam._natural import natural
+
+    if not path.is_dir():
+        yield path
+        return
+    found = [one for one in path.iterdir() if one.suffix.lower() in SUFFIXES]
+    if not found:
+        raise ConfigurationError(f"{path}: there is no picture in this folder")
+    yield from sorted(found, key=lambda one: natural(one.name))
+
+
+def _inspect(program: Program, file: Path, data: bytes) -> Inspection:
+    from smartcam.inspection import Picture
+
+    return program.inspect(Picture.read(file), input=data)
+
+
+def _write(path: Path, found: Inspection) -> None:
+    from smartcam._extras import load
+
+    coded = load("cv2", "inspection needs").imencode(".png", found.drawn()[:, :, ::-1])[1]
+    path.write_bytes(coded.tobytes())
+
+
+def _fields(file: Path, found: Inspection, drawn: Path | None) -> dict[str, Any]:
+    return {
+        "file": str(file),
+        "ok": found.ok,
+        "reason": found.reason,
+        "value": found.value,
+        "milliseconds": {name: 1e3 * one for name, one in found.seconds.items()},
+        **({} if drawn is None else {"drawn": str(drawn)}),
+    }
+
+
+def _text(file: Path, found: Inspection, units: ShownUnits) -> str:
+    verdict = "ok" if found.ok else "not ok"
+    took = 1e3 * sum(found.seconds.values())
+    return f"{file}: {verdict}, {took:.1f} ms\n{value_text(found.value, units, found.layout)}"
+
+
+def _row(file: Path, found: Inspection, drawn: Path) -> str:
+    kind = "ok" if found.ok else "not-ok"
+    text = html.escape(f"{file.name}: {found.reason or 'ok'}")
+    link = html.escape(drawn.name, quote=True)
+    return f'<figure class="{kind}"><img src="{link}" alt="{text}"><figcaption>{text}</figcaption>'
+
+
+def _page(title: str, rows: Sequence[str]) -> str:
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8">'
+        f"<title>{html.escape(title)}</title><style>"
+        "body{font:16px system-ui;margin:1em;display:flex;flex-wrap:wrap;gap:1em}"
+        "h1{flex-basis:100%}figure{margin:0;max-width:30em}img{max-width:100%}"
+        ".ok{border-top:4px solid #2ecc40}.not-ok{border-top:4px solid #ff4136}"
+        f"</style><h1>{html.escape(title)}</h1>"
+        + "".join(f"{row}</figure>" for row in rows)
+        + "</html>\n"
+    )

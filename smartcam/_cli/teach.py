@@ -1,0 +1,155 @@
+"""``smartcam teach``: an application of a software camera, made and tried on pictures."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from smartcam._cli.inspect import picture_files
+from smartcam._cli.options import OUTPUT, Options, option, runs
+from smartcam._cli.page import PageOptions, page_options
+from smartcam._cli.running import first
+from smartcam._cli.texts import value_text
+from smartcam._extras import from_part
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from smartcam.frames import FrameSource
+    from smartcam.inspection import Inspection, Teaching
+    from smartcam.web import TeachSite
+
+LINGER: Final = 3.0
+"""Seconds that the device streams on after a picture."""
+
+
+@click.command(
+    help="Teach an application of a software camera, on a page or by options: draw regions, "
+    "choose tools, see what they find, set tolerances, save. CELL is a cell file, or a fleet file "
+    "with software cameras; APPLICATION is its number, a new one is added. The page tries the "
+    "tools at once on all PICTURES (files, or folders of them; without any, the camera's own), and "
+    "sets tolerances from those that show good parts. Save writes the file; its comments stay. The "
+    "page's address goes to stdout. With --set, --learn or --save there is no page: the tools are "
+    'changed, tried on the PICTURES, and printed. The page needs the extra "web".'
+)
+@click.argument("cell")
+@click.argument("camera")
+@click.argument("which", metavar="APPLICATION", type=click.IntRange(1, 0xFFFFFFFF))
+@click.argument("pictures", nargs=-1)
+@click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="TOOL.SETTING=VALUE",
+    help="Change a setting, such as 'present.region=[10, 10, 80, 60]'; VALUE is YAML, an empty one "
+    "takes the setting out. A tool that is not there is added. Repeatable.",
+)
+@click.option("--learn", is_flag=True, help="Set tolerances by which all PICTURES are good.")
+@click.option("--save", is_flag=True, help="Write the file.")
+@page_options("", always=True)
+@option("--seconds")
+@runs(*OUTPUT)
+async def teach(
+    cell: str,
+    camera: str,
+    which: int,
+    pictures: Sequence[str],
+    changes: Sequence[str],
+    learn: bool,
+    save: bool,
+    web: PageOptions,
+    options: Options,
+) -> None:
+    """Serve the page, or do as the options say."""
+    with from_part("inspection", "smartcam teach needs"):
+        from smartcam.inspection import Teaching
+
+    teaching = Teaching(cell, camera, which)
+    files = [file for one in pictures for file in picture_files(Path(one))]
+    if changes or learn or save:
+        await asyncio.to_thread(_change, teaching, files, changes, learn, save, options)
+        return
+    from smartcam.web import TeachSite
+
+    async with contextlib.AsyncExitStack() as stack:
+        source: FrameSource | None = None
+        if not files:
+            from smartcam import frames
+
+            source = await stack.enter_async_context(frames.open(teaching.frames, linger=LINGER))
+        site = TeachSite(teaching, files, source=source, **web.place)
+        await first([_serve(site, options)], options.seconds)
+
+
+async def _serve(site: TeachSite, options: Options) -> None:
+    async with site:
+        options.show({"page": site.url}, f"page: {site.url}")
+        await asyncio.Event().wait()
+
+
+def _change(
+    teaching: Teaching,
+    files: Sequence[Path],
+    changes: Sequence[str],
+    learn: bool,
+    save: bool,
+    options: Options,
+) -> None:
+    """Change the tools, try them, and write them if that is wanted."""
+    from smartcam.inspection import Picture
+    from smartcam.inspection._inside import learned
+
+    tools = _changed(teaching.tools, changes)
+    program = teaching.program(tools)
+    pictures = [(file, Picture.read(file)) for file in files]
+    if learn:
+        if not pictures:
+            raise click.UsageError("--learn: expected PICTURES of good parts, got none")
+        tools = learned(tools, [program.inspect(picture) for _, picture in pictures])
+        program = teaching.program(tools)
+    for file, picture in pictures:
+        _show(str(file), program.inspect(picture), options)
+    if save:
+        teaching.save(tools)
+    value = {"application": teaching.application, "tools": tools, "saved": save}
+    text = [f"{'saved' if save else 'not saved'}: application {teaching.application}"]
+    text += [f"  {key}: {settings}" for key, settings in tools.items()]
+    options.show(value, "\n".join(text))
+
+
+def _show(file: str, found: Inspection, options: Options) -> None:
+    from smartcam.layout._inside import ShownUnits
+
+    verdict = "ok" if found.ok else f"not ok: {found.reason}"
+    value: dict[str, Any] = {"file": file, "ok": found.ok, "reason": found.reason}
+    value["value"] = found.value
+    text = value_text(found.value, ShownUnits([]), found.layout)
+    options.show(value, f"{file}: {verdict}\n{text}")
+
+
+def _changed(tools: dict[str, dict[str, Any]], changes: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the tools with other settings.
+
+    Raises ConfigurationError: a change is none.
+    """
+    from smartcam.layout._inside import BadYamlError, load
+
+    for change in changes:
+        place, equals, text = change.partition("=")
+        key, dot, name = place.strip().rpartition(".")
+        if not (equals and dot and key and name):
+            raise ConfigurationError(f"--set: expected TOOL.SETTING=VALUE, got {change!r:.100}")
+        settings = tools.setdefault(key, {})
+        if not text.strip():
+            settings.pop(name, None)
+            continue
+        try:
+            settings[name] = load(text, what=f"--set {place}")
+        except BadYamlError as exc:
+            raise ConfigurationError(f"--set {place}: {exc}") from exc
+    return tools

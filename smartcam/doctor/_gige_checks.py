@@ -1,0 +1,600 @@
+"""Examine a GigE Vision camera and the way to it: what keeps its pictures from coming."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import socket
+import struct
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from smartcam.doctor._findings import Exit, Finding, Severity
+from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
+from smartcam.frames import FrameAddress
+from smartcam.frames import open as open_frames
+from smartcam.frames._inside import (
+    ControlChannel,
+    GigESession,
+    Register,
+    discovery,
+    places,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+
+    from smartcam.frames._inside import GenicamFeatures, GigEDriver, PacketCounts
+
+PACKET_OVERHEAD_BYTES: Final = 36 + 38
+"""Bytes that a packet of a stream has beside pixels: IP, UDP and GVSP, and those of Ethernet."""
+
+STANDARD_MTU: Final = 1500
+JUMBO_MTU: Final = 9000
+
+MAX_LINK_LOAD: Final = 0.9
+"""Part of a link's speed beyond which a stream loses packets, as the switches on the way do."""
+
+SMALL_BUFFER_BYTES: Final = 1 << 20
+"""Receive buffer below which a busy machine loses packets of a large picture."""
+
+SPEED_UNKNOWN: Final = 0.0
+
+_SIOCGIFADDR: Final = 0x8915  # linux/sockios.h
+
+FRAMES_NOT_SHOWN: Final = "smartcam frames measure shows the same for as long as you like."
+
+
+class _ExaminationOverError(Exception):
+    """Nothing further can be examined."""
+
+
+@dataclass(eq=False)
+class _GigEExamination:
+    """One examination: what was asked for, and what is known so far."""
+
+    address: FrameAddress
+    seconds: float
+    timeout: float
+    findings: list[Finding] = field(default_factory=list[Finding])
+    check: str = ""
+    host: str = ""
+    port: int = 0
+    label: str = ""
+    path_mtu: int = STANDARD_MTU
+    local: str = ""
+    payload: int = 0
+    rate: float | None = None
+    camera_link: float = SPEED_UNKNOWN  # bits a second
+
+    def tell(
+        self,
+        severity: Severity,
+        text: str,
+        cure: str = "",
+        exit_code: Exit = Exit.DONE,
+        details: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Add a finding."""
+        found = Finding(
+            check=self.check,
+            severity=severity,
+            text=text,
+            cure=cure,
+            details=details or {},
+            exit_code=exit_code,
+        )
+        self.findings.append(found)
+
+    def fail(
+        self,
+        text: str,
+        cure: str,
+        exit_code: Exit = Exit.NO_SESSION,
+        details: Mapping[str, Any] | None = None,
+    ) -> _ExaminationOverError:
+        """Add an error, and return what ends the examination."""
+        self.tell("error", text, cure, exit_code, details)
+        return _ExaminationOverError()
+
+
+async def examine_gige(
+    url: str, *, seconds: float, timeout: float | None
+) -> AsyncGenerator[Finding]:
+    """Examine a camera and yield what is found, as it is found.
+
+    The camera is taken only where nobody else has it, and streams for a while as the URL says.
+
+    Raises:
+        ConfigurationError: the URL is wrong; nothing was tried.
+
+    Cancellation: the camera is given back.
+    """
+    address = FrameAddress.parse(url)
+    places.wanted(address)  # which sees to it that the URL can work
+    exam = _GigEExamination(address, seconds, timeout or 5.0)
+    checks: tuple[tuple[str, Callable[[_GigEExamination], Awaitable[None]]], ...] = (
+        ("address", _find_address),
+        ("subnet", _look_at_networks),
+        ("answers", _ask),
+        ("control", _look_at_control),
+        ("features", _read_features),
+        ("stream", _stream),
+    )
+    for exam.check, check in checks:
+        over = False
+        try:
+            await check(exam)
+        except _ExaminationOverError:
+            over = True
+        except FrameSourceError as exc:
+            exam.fail(f"this check failed: {exc}", "", Exit.NO_SESSION)
+            over = True
+        found, exam.findings = exam.findings, []
+        for finding in found:
+            yield finding
+        if over:
+            return
+
+
+# ---------------------------------------------------------------------- the way to it
+
+
+async def _find_address(exam: _GigEExamination) -> None:
+    """Find out which address the URL means."""
+    try:
+        host, exam.port = await places.place(exam.address, places.wanted(exam.address))
+        found = await asyncio.get_running_loop().getaddrinfo(host, None, family=socket.AF_INET)
+    except FrameSourceError as exc:
+        raise exam.fail(
+            str(exc),
+            "Write its address, gige://HOST. A search reaches the networks of this machine alone, "
+            "and a firewall that drops answers from UDP port 3956 makes it find nothing.",
+        ) from exc
+    except OSError as exc:
+        raise exam.fail(
+            f"the name {exam.address.host} has no IPv4 address: {exc}", "Write the address itself."
+        ) from exc
+    exam.host = str(found[0][4][0])
+    exam.tell("ok", f"the camera is looked for at {exam.host}, UDP port {exam.port}")
+
+
+async def _look_at_networks(exam: _GigEExamination) -> None:
+    """See whether the camera's address is of one of this machine's networks."""
+    own = [one for one in discovery.networks() if one.network is not None]
+    if not own:
+        exam.tell("hint", "the networks of this machine cannot be listed here")
+        return
+    host = ipaddress.IPv4Address(exam.host)
+    around = [one for one in own if one.network is not None and host in one.network]
+    named = ", ".join(f"{one.address} in {one.network}" for one in own)
+    if not around:
+        exam.tell(
+            "warning",
+            f"{exam.host} is of another subnet than this machine, which is {named}",
+            f"Give the camera an address of a network here, or this machine one of {exam.host}'s: "
+            "by the maker's tool (ForceIP), or by ip address add. Through a router a camera is not "
+            "found by a search, and its stream rarely comes.",
+            details={"networks": [str(one.network) for one in own]},
+        )
+    elif len(around) > 1:
+        exam.tell(
+            "warning",
+            f"{exam.host} is of {len(around)} networks of this machine: "
+            f"{', '.join(f'{one.address} in {one.network}' for one in around)}",
+            "Give the two interfaces different subnets: the system sends by one of them, which may "
+            "be the wrong one.",
+        )
+    else:
+        exam.tell("ok", f"{exam.host} is of the same subnet: {around[0].network}")
+
+
+async def _ask(exam: _GigEExamination) -> None:
+    """Ask the camera something that it tells anybody."""
+    try:
+        control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
+    except FrameSourceError as exc:
+        raise exam.fail(
+            f"no way leads there: {exc}",
+            "Give this machine an address of the camera's network, or the camera one of this "
+            "machine's.",
+        ) from exc
+    try:
+        exam.local, exam.path_mtu = control.local_address, control.path_mtu
+        began = time.monotonic()
+        try:
+            taken = await control.read_register(Register.CONTROL_PRIVILEGE)
+        except FrameSourceError as exc:
+            raise await _no_answer(exam, exc) from exc
+        took = time.monotonic() - began
+        other = await _register_or_0(control, Register.PRIMARY_APPLICATION_ADDRESS)
+    finally:
+        control.close()
+    exam.tell("ok", f"it answers, after {took * 1e3:.1f} ms", details={"round_trip": took})
+    exam.check = "control"
+    if taken:
+        where = f" at {ipaddress.IPv4Address(other)}" if other else ""
+        own = other and str(ipaddress.IPv4Address(other)) in {
+            one.address for one in discovery.networks()
+        }
+        raise exam.fail(
+            f"another application{where} controls it{', on this machine' if own else ''}: one at a "
+            "time can",
+            "Close the other program: a viewer of the maker, a process of yours that is left over, "
+            "an agent. One that was killed loses the camera after its heartbeat's time, some "
+            "seconds; while a debugger holds a program, that time can be minutes.",
+            details={"controlled_by": where.removeprefix(" at ")},
+        )
+
+
+async def _no_answer(exam: _GigEExamination, error: FrameSourceError) -> _ExaminationOverError:
+    """Say why nothing answered, as far as it can be told."""
+    others = await discovery.find(discovery.networks())
+    at = [one for one in others if exam.host in (one.address, one.info.address)]
+    listed = ", ".join(f"gige://{one.address} {one.info.label}" for one in others)
+    if "refused" in str(error).lower():
+        return exam.fail(
+            f"{exam.host} is there, and nothing listens at UDP port {exam.port}: it is no GigE "
+            "Vision camera, or its service is down",
+            f"Found on this machine's networks: {listed}."
+            if listed
+            else "See whether the address is the camera's, and switch it off and on.",
+        )
+    if at:
+        return exam.fail(
+            f"it answers a search, and not a question to {exam.host} itself"
+            + (
+                ""
+                if at[0].reachable
+                else f": its address {at[0].info.address} is of another subnet"
+            ),
+            "Give it an address of this subnet (ForceIP), or let UDP port 3956 through the "
+            "firewall in both directions.",
+        )
+    return exam.fail(
+        f"nothing answers at {exam.host}, UDP port {exam.port}: {error}",
+        (
+            f"Cameras that answer a search: {listed}. Is it one of these?"
+            if listed
+            else "See to its power, cable and address (ping), then to a firewall, which must let "
+            "UDP port 3956 through: nothing answered a search either."
+        ),
+        details={"others": [one.address for one in others]},
+    )
+
+
+async def _register_or_0(control: ControlChannel, address: int) -> int:
+    with contextlib.suppress(FrameSourceError):
+        return await control.read_register(address)
+    return 0
+
+
+async def _look_at_control(exam: _GigEExamination) -> None:
+    """Take control, which nobody had a moment ago, and read what the camera is."""
+    async with _session(exam) as features:
+        exam.tell("ok", f"{exam.label}: nobody controlled it, and it lets us")
+        exam.payload = int(await _number(features, "PayloadSize") or 0)
+        exam.rate = await _number(
+            features, "AcquisitionResultingFrameRate", "ResultingFrameRate", "AcquisitionFrameRate"
+        )
+        bytes_a_second = await _number(features, "DeviceLinkSpeed")
+        megabits = await _number(features, "GevLinkSpeed")
+        exam.camera_link = (bytes_a_second or 0) * 8 or (megabits or 0) * 1e6
+        mode = await _text(features, "AcquisitionMode")
+    exam.check = "features"
+    if mode not in ("", "Continuous"):
+        exam.tell(
+            "hint",
+            f"AcquisitionMode is {mode}: a program that does not set it gets so many pictures, and "
+            "then none",
+            "smartcam sets Continuous when it opens the camera.",
+        )
+
+
+class _session:  # noqa: N801 - used as a function
+    """Features of the camera while it is ours."""
+
+    def __init__(self, exam: _GigEExamination) -> None:
+        self._exam = exam
+        self._session: GigESession | None = None
+
+    async def __aenter__(self) -> GenicamFeatures:
+        exam = self._exam
+        self._session = await GigESession.open(exam.host, exam.port, exam.address.shown)
+        exam.label = self._session.label
+        return self._session.features
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._session is not None:
+            await self._session.close()
+
+
+async def _number(features: GenicamFeatures, *names: str) -> float | None:
+    """Return the first of several features that the camera has, as a number."""
+    for name in names:
+        if name in features:
+            with contextlib.suppress(FrameSourceError):
+                found = await features.number(name)
+                if found is not None:
+                    return float(found)
+    return None
+
+
+async def _text(features: GenicamFeatures, name: str) -> str:
+    if name in features:
+        with contextlib.suppress(FrameSourceError):
+            return str(await features.get(name))
+    return ""
+
+
+async def _read_features(exam: _GigEExamination) -> None:
+    """Look at this side: the MTU, the link, the buffer."""
+    exam.check = "link"
+    link = _link_speed(exam.local)
+    known = [speed for speed in (link, exam.camera_link) if speed]
+    if exam.payload and exam.rate and known:
+        _look_at_bandwidth(exam, min(known))
+    elif known:
+        exam.tell("ok", f"the link has {min(known) / 1e6:,.0f} Mbit/s")
+    exam.check = "buffer"
+    most = _most_buffer()
+    if most is not None and most < SMALL_BUFFER_BYTES:
+        exam.tell(
+            "hint",
+            f"a program may have {most:,} bytes of receive buffer, which a busy machine fills "
+            "before it reads: then packets are lost",
+            "sysctl net.core.rmem_max=8388608",
+            details={"rmem_max": most},
+        )
+
+
+def _look_at_bandwidth(exam: _GigEExamination, link: float) -> None:
+    packet = min(exam.path_mtu, JUMBO_MTU)
+    share = 1 + PACKET_OVERHEAD_BYTES / max(1, packet - 36)
+    needed = exam.payload * 8 * (exam.rate or 0.0) * share
+    text = (
+        f"{exam.payload:,} bytes a picture, {exam.rate:.4g} a second: {needed / 1e6:,.0f} Mbit/s "
+        f"of a link of {link / 1e6:,.0f}"
+    )
+    details = {"needed": needed, "link": link}
+    if needed > MAX_LINK_LOAD * link:
+        most = MAX_LINK_LOAD * link / (exam.payload * 8 * share)
+        exam.tell(
+            "error",
+            f"{text}: it does not fit",
+            f"Ask for less: ?fps={most:.3g} or lower, a smaller ?size=, or a format of fewer bits. "
+            "See whether the cable or a switch made the link slow. Several cameras on one link "
+            "share it.",
+            Exit.REFUSED,
+            details=details,
+        )
+    else:
+        exam.tell("ok", text, details=details)
+
+
+def _link_speed(local: str) -> float:
+    """Return the speed of the interface with an address, bits a second; 0: not known."""
+    if sys.platform != "linux":
+        return SPEED_UNKNOWN
+    import fcntl
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        for _, name in socket.if_nameindex():
+            with contextlib.suppress(OSError, ValueError):
+                request = struct.pack("256s", name.encode()[:15])
+                answer = fcntl.ioctl(asking.fileno(), _SIOCGIFADDR, request)
+                if socket.inet_ntoa(answer[20:24]) == local:
+                    megabits = int(Path(f"/sys/class/net/{name}/speed").read_text())
+                    return max(0, megabits) * 1e6
+    return SPEED_UNKNOWN
+
+
+def _most_buffer() -> int | None:
+    """Return the largest receive buffer that a program gets, bytes; None: not known."""
+    try:
+        return int(Path("/proc/sys/net/core/rmem_max").read_text())
+    except (OSError, ValueError):
+        return None
+
+
+# ---------------------------------------------------------------------- the stream
+
+
+@dataclass(slots=True)
+class _StreamSeen:
+    """Frames and packets that came of the stream.
+
+    Attributes:
+        frames: frames that came.
+        counts: counts of their packets; None: it did not begin.
+        packet_size: bytes of an IP packet.
+        seconds: time for which it was watched.
+    """
+
+    frames: int
+    counts: PacketCounts | None
+    packet_size: int
+    seconds: float
+
+
+async def _stream(exam: _GigEExamination) -> None:
+    """Have it stream as the URL says, and count."""
+    try:
+        seen = await _watch(exam)
+    except FrameTimeoutError as exc:
+        raise exam.fail(str(exc), "", Exit.RAN_OUT) from exc
+    except FrameFormatError as exc:
+        raise exam.fail(f"the stream: {exc}", "", Exit.REFUSED) from exc
+    _look_at_packets(exam, seen)
+    exam.check = "stream"
+    if not seen.frames:
+        await _explain_silence(exam, seen)
+        return
+    counts = seen.counts
+    lost, again = (0, 0) if counts is None else (counts.lost, counts.requested)
+    details = {"frames": seen.frames, "lost": lost, "requested": again, "seconds": seen.seconds}
+    text = f"{seen.frames} pictures in {seen.seconds:.1f} s"
+    if lost or again:
+        exam.tell(
+            "warning" if lost else "hint",
+            f"{text}; {lost} more lost for missing packets, {again} packets asked for again",
+            "Make room for the packets: large ones (an MTU of 9000 on each side and switch), "
+            "net.core.rmem_max=8388608 against a machine that reads late, "
+            "?feature.GevSCPD=1000 (a pause between packets) or fewer pictures against a link that "
+            "is full; a bad cable or plug loses some at any speed.",
+            details=details,
+        )
+    else:
+        exam.tell("ok", f"{text}, none lost, no packet asked for again", details=details)
+    longest = 1 / exam.rate if exam.rate else 0.0
+    if longest > exam.timeout:
+        exam.tell(
+            "warning",
+            f"a picture comes each {longest:.3g} s, and a source waits {exam.timeout:g} s for one",
+            f"Wait longer: open(url, timeout={2 * longest:.3g}, stall=None).",
+        )
+
+
+async def _watch(exam: _GigEExamination) -> _StreamSeen:
+    frames = 0
+    source = open_frames(exam.address.url, timeout=None, stall=None)
+    async with source:
+        driver = cast("GigEDriver", source.driver)
+        found = source.format.rates
+        exam.rate = found[0] if found else exam.rate
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        async with source.reader() as reader:
+            try:
+                async with asyncio.timeout(exam.seconds):
+                    async for _ in reader:
+                        frames += 1
+            except FrameSourceError:  # some are timeouts, too
+                raise
+            except TimeoutError:
+                pass
+            else:
+                raise FrameSourceError("it ended by itself", source=exam.label)
+            counts, seconds = driver.counts, loop.time() - began
+            size = await _packet_size(exam)
+    return _StreamSeen(frames, counts, size, seconds)
+
+
+async def _packet_size(exam: _GigEExamination) -> int:
+    """Return the size that the camera's stream channel is set to; anybody may read it."""
+    control = await ControlChannel.connect(exam.host, exam.port, exam.address.shown)
+    try:
+        return await _register_or_0(control, Register.STREAM_PACKET_SIZE) & 0xFFFF
+    finally:
+        control.close()
+
+
+def _look_at_packets(exam: _GigEExamination, seen: _StreamSeen) -> None:
+    exam.check, size = "packet size", seen.packet_size
+    details = {"packet_size": size, "mtu": exam.path_mtu}
+    if size > exam.path_mtu and seen.frames:
+        exam.tell(
+            "warning",
+            f"packets of {size} bytes come in pieces, since this machine's side takes "
+            f"{exam.path_mtu} (MTU): a lost piece is a lost packet",
+            f"Write ?packet_size={exam.path_mtu}, or raise the MTU: ip link set DEVICE mtu 9000.",
+            details=details,
+        )
+    elif size > exam.path_mtu:
+        exam.tell(
+            "error",
+            f"packets of {size} bytes are asked for, and this machine's side takes {exam.path_mtu} "
+            "(MTU): none of them comes",
+            f"Leave packet_size to the test (gige://{exam.host} alone), write "
+            f"?packet_size={exam.path_mtu}, or raise the MTU: ip link set DEVICE mtu 9000.",
+            Exit.REFUSED,
+            details=details,
+        )
+    elif size < exam.path_mtu and size <= STANDARD_MTU < exam.path_mtu:
+        exam.tell(
+            "hint",
+            f"packets have {size} bytes, although this machine's side takes {exam.path_mtu} (MTU)",
+            "A switch on the way, or the camera, takes no larger ones: raise its MTU, too. Small "
+            "packets cost about three times the CPU time.",
+            details=details,
+        )
+    elif size <= STANDARD_MTU:
+        exam.tell(
+            "hint",
+            f"packets have {size} bytes, the MTU is {exam.path_mtu}",
+            "With an MTU of 9000 on both sides and on each switch a stream takes a third of the "
+            "CPU time, and loses fewer packets on a busy machine.",
+            details=details,
+        )
+    else:
+        exam.tell("ok", f"packets have {size} bytes, the MTU is {exam.path_mtu}", details=details)
+
+
+async def _explain_silence(exam: _GigEExamination, seen: _StreamSeen) -> None:
+    """Say why no picture came."""
+    waiting = await _waiting_triggers(exam)
+    counts = seen.counts
+    if counts is not None and (counts.lost or counts.requested or counts.malformed):
+        exam.tell(
+            "error",
+            f"packets come, and no picture is whole: {counts.lost} pictures lost, "
+            f"{counts.requested} packets asked for again, {counts.malformed} malformed",
+            "The link or a switch drops many of them: see the findings above on packet size and "
+            "bandwidth, and try ?size=320x240&fps=1.",
+            Exit.RAN_OUT,
+            details={"lost": counts.lost, "requested": counts.requested},
+        )
+    elif waiting:
+        exam.check = "trigger"
+        exam.tell(
+            "error",
+            f"TriggerMode is On ({waiting}), and no trigger came in {seen.seconds:.1f} s: the "
+            "camera waits",
+            "Trigger it, or have it run by itself: ?feature.TriggerMode=Off. Of a line see to its "
+            "wiring, TriggerActivation and the level that the input wants.",
+            Exit.RAN_OUT,
+            details={"trigger": waiting},
+        )
+    elif exam.rate and 1 / exam.rate > seen.seconds:
+        exam.tell(
+            "warning",
+            f"no picture came in {seen.seconds:.1f} s; one is due each {1 / exam.rate:.3g} s",
+            f"Watch for longer: --seconds {3 / exam.rate:.3g}.",
+        )
+    elif seen.packet_size <= exam.path_mtu:
+        exam.tell(
+            "error",
+            f"the camera obeys and streams, and no packet of the stream came in "
+            f"{seen.seconds:.1f} s: something on the way drops UDP that this machine did not ask "
+            "for",
+            f"Let UDP from {exam.host} through the firewall of this machine, to any port "
+            "(nft, ufw, firewalld, a virtual machine's NAT, a container without --network host). "
+            f"{FRAMES_NOT_SHOWN}",
+            Exit.RAN_OUT,
+        )
+
+
+async def _waiting_triggers(exam: _GigEExamination) -> str:
+    """Return the triggers that are on, and where each comes from; "" where none is."""
+    told: list[str] = []
+    try:
+        async with _session(exam) as features:
+            selectors, before = [""], ""
+            if "TriggerSelector" in features:
+                selectors = list(await features.entries("TriggerSelector"))
+                before = await _text(features, "TriggerSelector")
+            for selector in selectors:
+                if selector:
+                    await features.set("TriggerSelector", selector)
+                if await _text(features, "TriggerMode") == "On":
+                    source = await _text(features, "TriggerSource") or "unknown source"
+                    told.append(f"{selector} by {source}" if selector else f"by {source}")
+            if selectors != [""]:
+                await features.set("TriggerSelector", before)
+    except FrameSourceError:
+        pass
+    return ", ".join(told)

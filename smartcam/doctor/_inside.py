@@ -1,0 +1,35 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.doctor._context import FrameObserver
+    from smartcam.doctor._findings import summary
+    from smartcam.doctor._probing import CameraAnswer, Trial, locate, no_session, trials
+    from smartcam.doctor._search import CameraSearch
+
+__all__ = [
+    "CameraAnswer",
+    "CameraSearch",
+    "FrameObserver",
+    "Trial",
+    "locate",
+    "no_session",
+    "summary",
+    "trials",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_context": "FrameObserver",
+            "_findings": "summary",
+            "_probing": "CameraAnswer Trial locate no_session trials",
+            "_search": "CameraSearch",
+        },
+    )
