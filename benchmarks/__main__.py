@@ -41,6 +41,7 @@ BENCHMARKS = {
     "stereo": "squares of OpenCV's pairs that were left out; boards against dots",
     "hand_eye": "error of a camera on a robot over the bound, and of recorded poses left out",
     "frames": "a frame to its readers and to a JPEG, and the delay of the loop",
+    "inspection": "a software camera's trigger above its tools, and the delay of the loop",
     "pictures": "bytes of a picture at the same PSNR, and the CPU time of codecs",
     "transports": "pictures from stamp to stamp: bus, RTP, on request, GStreamer, rospy",
     "ros2": "pictures, calls and detections without ROS, and what a camera's node adds to it",
@@ -83,12 +84,12 @@ def main(arguments: list[str] | None = None) -> int:
     facts = as_json(comparisons, curves, took)
     if options.json is not None:
         _write(options.json, json.dumps(facts, indent=1))
-    if options.docs is not None:
+    if options.results is not None:
         from benchmarks import plots
 
-        _write(options.docs / "results.json", json.dumps(facts, indent=1))
-        pictures = plots.write(curves, comparisons, options.docs)
-        _write(options.docs / "results.md", markdown(comparisons, pictures, facts, BENCHMARKS))
+        _write(options.results / "results.json", json.dumps(facts, indent=1))
+        pictures = plots.write(curves, comparisons, options.results)
+        _write(options.results / "results.md", markdown(comparisons, pictures, facts, BENCHMARKS))
     missed = [one for one in comparisons if one.met is False]
     return 1 if missed and not plan.quick else 0
 
@@ -139,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write every figure to FILE")
     parser.add_argument(
-        "--docs", type=Path, metavar="DIR", help="write figures, tables and plots for the page"
+        "--results", type=Path, metavar="DIR", help="write figures, tables and plots to DIR"
     )
     return parser
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from benchmarks.measure import Cost
-    from smartcam.calibration._geometry.rotations import Array
+    from smartcam.geometry._inside import Array
 
     Fit = Callable[[Array, Array], Callable[[Array], Array]]
 

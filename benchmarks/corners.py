@@ -22,19 +22,18 @@ from benchmarks.measure import Comparison, Goal, Plan, Series
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.find import find_target
 from smartcam.calibration._detection.image import GreyImage
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
 from smartcam.calibration.simulation._images import render
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Transform
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._targets import Target
+    from smartcam.geometry._inside import Array
 
     Image = NDArray[np.uint8]
     Refine = Callable[[GreyImage, Array, Array], Array]

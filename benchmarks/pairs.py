@@ -24,9 +24,7 @@ import numpy as np
 
 from benchmarks.measure import Comparison, Goal, Series
 from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._lens.poses import locate
 from smartcam.calibration._stereo.calibration import calibrate_stereo
 from smartcam.calibration._stereo.errors import pair_errors
@@ -34,13 +32,13 @@ from smartcam.calibration._stereo.triangulation import CameraPair
 from smartcam.calibration._targets import Checkerboard
 from smartcam.calibration._views import TargetView
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import CameraModel, Transform
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import DistortionModel
+    from smartcam.geometry._inside import Array, DistortionModel
 
 __all__ = ["SETS", "RecordedPairs", "compared", "corners", "opencv_pair"]
 

@@ -17,10 +17,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._geometry.frames import Transform
 from smartcam.calibration._targets import Charuco, Checkerboard, CircleGrid
 from smartcam.calibration._views import TargetView
 from smartcam.exceptions import CalibrationError
+from smartcam.geometry import Transform
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

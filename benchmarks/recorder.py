@@ -38,8 +38,8 @@ GOAL = Goal("at most", 50, "us")
 
 def run(plan: Plan) -> Iterable[Comparison]:
     """Measure results with a recorder and without."""
-    if importlib.util.find_spec("mcap") is None:
-        print("recorder: left out: mcap is not installed (smartcam[record])", file=sys.stderr)
+    if importlib.util.find_spec("zstandard") is None:
+        print("recorder: left out: zstandard is not installed (smartcam[record])", file=sys.stderr)
         return
     with peer("stream") as port:
         series = asyncio.run(_measure(plan, port))

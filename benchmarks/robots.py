@@ -15,18 +15,17 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid, exp_rotation
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._targets import Checkerboard, resized
 from smartcam.calibration.simulation._scenes import around, view
+from smartcam.geometry import CameraModel, Transform
+from smartcam.geometry._inside import Rigid, exp_rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry._inside import Array
 
 __all__ = ["CAMERA", "KINDS", "SHEET", "Kind", "Measured"]
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._hand_eye.calibration import (
     calibrate_hand_eye,
     calibrate_hand_eye_from_poses,
@@ -20,17 +19,17 @@ from smartcam.calibration._hand_eye.calibration import (
 from smartcam.calibration._hand_eye.closed_forms import LINEAR, solve_linear
 from smartcam.calibration._hand_eye.equations import RobotPoses, Solution
 from smartcam.calibration._views import TargetView
+from smartcam.geometry._inside import Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from smartcam.calibration._geometry.frames import Transform
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.calibration._hand_eye.result import HandEyeCalibration
-    from smartcam.calibration._lens.model import CameraModel
+    from smartcam.geometry import CameraModel, Transform
+    from smartcam.geometry._inside import Array
 
     Numbers = NDArray[np.intp]
 

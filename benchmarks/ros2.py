@@ -250,7 +250,7 @@ async def _detections(plan: Plan, pair: Pair) -> list[Comparison]:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     from smartcam.ros2 import Node
-    from smartcam.ros2._messages import ResultMessages
+    from smartcam.ros2._cameras.messages import ResultMessages
 
     topic, count = "/bench/detections", plan.operations(MESSAGES, least=10)
     result = _ten()

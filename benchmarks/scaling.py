@@ -18,13 +18,14 @@ from benchmarks.measure import Comparison, Cost, Curve, Goal, Plan, Series, cpu_
 from benchmarks.peers import peer, wire
 from smartcam.protocols._base import Role, Transport
 from smartcam.protocols._bvs import BVS
-from smartcam.protocols._framed.machine import Machine, ResultBurst
+from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols._machine import ResultBurst
 from smartcam.protocols.messages import Connect, ResultContainer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from smartcam.protocols._framed.machine import Event
+    from smartcam.protocols._machine import Event
 
 __all__ = ["run"]
 

@@ -17,8 +17,6 @@ import cv2
 import numpy as np
 
 from benchmarks.measure import Comparison, Goal, Series
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._geometry.rigid import Rigid
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust
 from smartcam.calibration._lens.intrinsics import calibrate_intrinsics
 from smartcam.calibration._lens.projection import linearize
@@ -26,15 +24,17 @@ from smartcam.calibration._lens.sheet_shape import as_meant
 from smartcam.calibration._stereo.calibration import calibrate_stereo
 from smartcam.calibration._stereo.triangulation import CameraPair, triangulate
 from smartcam.calibration.simulation import _scenes as scenes
+from smartcam.geometry import Transform
+from smartcam.geometry._inside import Rigid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration._geometry.rotations import Array
-    from smartcam.calibration._lens.model import CameraModel
     from smartcam.calibration._targets import Checkerboard
     from smartcam.calibration._views import TargetView
+    from smartcam.geometry import CameraModel
+    from smartcam.geometry._inside import Array
 
 __all__ = ["KINDS", "Rig", "free_sheets", "sheet"]
 
@@ -122,7 +122,7 @@ class Rig:
         one = Bundle((self.left,), Rigid.stacked([]), motions, (columns,), points=points, free=True)
         sights = [Sight(0, number, view) for number, view in enumerate(views[0])]
         by_lens = linearize(self.rays, self.left).by_lens
-        lens = np.einsum("nij,jk,nik->n", by_lens, adjust(one, sights, 0.0).covariance, by_lens)
+        lens = np.einsum("nij,jk,nik->n", by_lens, adjust(one, sights, 0.0).by_noise, by_lens)
         both = Bundle(
             (self.left, self.right),
             Rigid.stacked([self.rig.rigid]),
@@ -132,7 +132,7 @@ class Rig:
             free=True,
         )
         sights += [Sight(1, number, view) for number, view in enumerate(views[1])]
-        covariance = adjust(both, sights, 0.0).covariance
+        covariance = adjust(both, sights, 0.0).by_noise
         by_unknown = self._derivatives(both, np.sqrt(np.diag(covariance)))
         space = np.einsum("nij,jk,nik->n", by_unknown, covariance, by_unknown)
         return math.sqrt(float(lens.mean())), 1e3 * math.sqrt(float(space.mean()))

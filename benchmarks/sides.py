@@ -129,8 +129,8 @@ def _slow_clock() -> None:
     """Let the client cut its work as it does at full speed: it goes by the CPU time of a chunk."""
     from smartcam._client import link
 
-    link.TURN *= SLOWER
-    link.SHARED_TURN *= SLOWER
+    link.TURN_TIME *= SLOWER
+    link.SHARED_TURN_TIME *= SLOWER
 
 
 async def main(module: str, side: str, port: str, count: str, how: str = "") -> None:

@@ -32,22 +32,21 @@ from benchmarks.measure import Comparison, Goal, Series
 from benchmarks.pairs import compared, corners, opencv_pair
 from benchmarks.sheets import Rig, free_sheets
 from smartcam.calibration._detection.find import find_target
-from smartcam.calibration._geometry.frames import Transform
-from smartcam.calibration._lens.model import CameraModel
 from smartcam.calibration._stereo.calibration import calibrate_stereo
 from smartcam.calibration._stereo.errors import pair_errors
 from smartcam.calibration._targets import Checkerboard, CircleGrid
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.simulation import _scenes as scenes
 from smartcam.calibration.simulation._images import render
+from smartcam.geometry import CameraModel, Transform
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from benchmarks.measure import Plan
-    from smartcam.calibration._geometry.rotations import Array
     from smartcam.calibration._stereo.calibration import StereoCalibration
     from smartcam.calibration._targets import Target
+    from smartcam.geometry._inside import Array
 
 __all__ = ["run"]
 

@@ -1,27 +1,27 @@
 """Pictures on their way: from the stamp drawn into one to the stamp read at the far end.
 
 640 x 480 grey at 30 a second over loopback, the ways of the papers that this follows: raw, as JPEG
-and as H.264, as a stream and one on request, beside GStreamer (with x264's defaults, and tuned) and
-rospy where Debian has installed them. It is the software's latency, of the wall clock; neither
-exposure nor a display is in it. The stream of frames itself, read in this process, is the first
-line: what the others have above it is the way. CPU time is that of both ends with the drawing.
+and as H.264, as a stream and one on request, beside GStreamer (with x264's defaults, and tuned, by
+appsrc and appsink, without a conversion) and rospy where Debian has installed them. It is the
+software's latency, of the wall clock; neither exposure nor a display is in it. The stream of frames
+itself, read in this process, is the first line: what the others have above it is the way. CPU time
+is that of both ends with the drawing.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
+import json
 import os
 import resource
-import shutil
 import socket
 import statistics
 import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,10 +29,11 @@ import smartcam
 import smartcam.fleet
 from benchmarks.measure import Comparison, Series
 from benchmarks.peers import peer
+from benchmarks.peers.gstreamer_pictures import has_gstreamer
 from benchmarks.peers.rospy_pictures import PYTHON, ROS, can
 from smartcam import frames
 from smartcam.fleet import FleetFile
-from smartcam.frames._synthetic import read_stamp, stripes, write_stamp
+from smartcam.frames._synthetic import read_stamp
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -47,8 +48,6 @@ SECONDS = 4.0
 URL = f"synthetic://?size={SIZE[0]}x{SIZE[1]}&fps={RATE}"
 ASKED = 10.0
 """Requests a second."""
-
-GSTREAMER = shutil.which("gst-launch-1.0")
 
 LIMIT = 30.0
 """Seconds until one that gives no picture is an error."""
@@ -89,7 +88,7 @@ def run(plan: Plan) -> Iterator[Comparison]:
         "one on request, JPEG q15": _awaited(_asked),
         "RTP, H.264": _awaited(_rtp),
     }
-    if GSTREAMER:
+    if has_gstreamer():
         ways["GStreamer, RTP, x264enc as it comes"] = lambda one: _gstreamer(one, "")
         ways["GStreamer, RTP, x264enc tuned"] = lambda one: _gstreamer(one, TUNED)
     if can(ROS):
@@ -199,74 +198,22 @@ def _note(latencies: list[float], picture: Any) -> None:
 # ---------------------------------------------------------------------- others
 
 
-TUNED = "tune=zerolatency speed-preset=ultrafast key-int-max=30"
+TUNED = (
+    "tune=zerolatency speed-preset=ultrafast key-int-max=30 intra-refresh=true pass=qual "
+    "quantizer=23 threads=1"
+)
+"""Options of x264enc that make the stream that smartcam makes: the same quality and bytes."""
 
 
 def _gstreamer(seconds: float, options: str) -> Way:
-    """Write pictures into a pipeline, and read them out of another one."""
-    port = _free_port()
-    raw = f"rawvideoparse format=gray8 width={SIZE[0]} height={SIZE[1]} framerate={RATE}/1"
-    caps = "application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96"
-    far = (
-        f"udpsrc port={port} caps={caps} ! rtph264depay ! avdec_h264 ! videoconvert ! "
-        "video/x-raw,format=GRAY8 ! fdsink fd=1 sync=false"
-    )
-    near = (
-        f"fdsrc fd=0 blocksize={SIZE[0] * SIZE[1]} do-timestamp=true ! {raw} ! videoconvert ! "
-        f"video/x-raw,format=I420 ! x264enc {options} ! rtph264pay config-interval=1 ! "
-        f"udpsink host=127.0.0.1 port={port} sync=false"
-    )
-    with (
-        _pipeline(far, stdout=subprocess.PIPE) as receiver,
-        _pipeline(near, stdin=subprocess.PIPE) as sender,
-    ):
-        assert sender.stdin is not None
-        assert receiver.stdout is not None
-        return _piped(sender.stdin, receiver.stdout, seconds)
-
-
-@contextlib.contextmanager
-def _pipeline(what: str, **pipes: Any) -> Iterator[subprocess.Popen[bytes]]:
-    process = subprocess.Popen(
-        [GSTREAMER or "", "-q", *what.split()], stderr=subprocess.DEVNULL, bufsize=0, **pipes
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
-def _piped(into: IO[bytes], out: IO[bytes], seconds: float) -> Way:
-    """Draw at the rate into one end, and read at the other, from its first picture on."""
-    picture = stripes(*SIZE)
-    os.set_blocking(out.fileno(), False)
-    latencies: list[float] = []
-    came = bytearray()
-    began, number = time.monotonic(), 0
-    first, cpu = math.inf, 0.0
-    while time.monotonic() < first + seconds:
-        if time.monotonic() > began + LIMIT + seconds:
-            raise RuntimeError("GStreamer: no picture came through")
-        number += 1
-        shown = np.roll(picture, number % SIZE[0], axis=1)
-        write_stamp(shown, number, time.monotonic_ns())
-        into.write(shown.tobytes())
-        while time.monotonic() < began + number / RATE:
-            came += out.read(1 << 20) or b""
-            _take(came, latencies)
-            if latencies and math.isinf(first):
-                first, cpu = time.monotonic(), _cpu()
-            time.sleep(0.0005)
-    return Way(latencies, [], _percent(cpu, first))
-
-
-def _take(came: bytearray, latencies: list[float]) -> None:
-    """Take the whole pictures out of what came."""
-    length = SIZE[0] * SIZE[1]
-    while len(came) >= length:
-        _note(latencies, np.frombuffer(came[:length], np.uint8).reshape(SIZE[1], SIZE[0]))
-        del came[:length]
+    """Have a process put pictures into a pipeline by appsrc, and take them out by appsink."""
+    command = [PYTHON, "-m", "benchmarks.peers.gstreamer_pictures", options, str(seconds)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=seconds + 2 * LIMIT)
+    if done.returncode:
+        raise RuntimeError(f"GStreamer: {done.stderr[-2000:]}")
+    found = json.loads(done.stdout.splitlines()[-1])
+    cpu = 100 * found["cpu"] / found["seconds"]
+    return Way(found["latencies"], [round(found["size"])], cpu)
 
 
 def _rospy(seconds: float, how: str) -> Way:

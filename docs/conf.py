@@ -29,10 +29,10 @@ from pydantic import BaseModel
 import smartcam
 from smartcam._client.handshake import load_protocol
 from smartcam.calibration._files.storage import Stored
-from smartcam.emulator import Quirks
-from smartcam.fleet._access import RIGHTS
-from smartcam.fleet._certificates import ROLES
-from smartcam.fleet._file import (
+from smartcam.emulator import Application, InSightQuirks, Quirks, Scenario, faults
+from smartcam.emulator._scenario.timeline import Cue
+from smartcam.emulator.faults._base import DeviceFault, WireFault
+from smartcam.fleet._file.fleet_file import (
     CameraEntry,
     Emulated,
     FleetFile,
@@ -40,17 +40,23 @@ from smartcam.fleet._file import (
     History,
     Retry,
 )
-from smartcam.fleet._operations_file import OperationsSection
-from smartcam.fleet._recording_file import RecordSection
-from smartcam.fleet._ros_file import RosCamera, RosSection
-from smartcam.fleet._standby_file import Standby
+from smartcam.fleet._file.operations import OperationsSection
+from smartcam.fleet._file.recording import RecordSection
+from smartcam.fleet._file.ros import RosCamera, RosSection
+from smartcam.fleet._file.standby import Standby
+from smartcam.fleet._security.access import RIGHTS
+from smartcam.fleet._security.certificates import ROLES
 from smartcam.protocols._base import POLICIES
 from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK, THESIS
 from smartcam.protocols._framed.dialect import MAX_SURPLUS
-from smartcam.protocols._framed.machine import TRANSITIONS, State
+from smartcam.protocols._framed.machine import TRANSITIONS
+from smartcam.protocols._machine import State
 from smartcam.protocols.messages import Request, Sender, Wire
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
+from smartcam.web import _clouds as cloud_page
+from smartcam.web import _colours as colour_page
+from smartcam.web import _emulator as emulator_page
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -63,7 +69,7 @@ project = "smartcam"
 version = release = smartcam.__version__
 copyright = "the smartcam maintainers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["benchmarks/*", "_build"]
+exclude_patterns = ["_build"]
 html_extra_path = ["fleet.schema.json", "scenario.schema.json"]
 html_theme = "furo"
 html_title = f"smartcam {release}"
@@ -93,8 +99,8 @@ LIMITS = (
     "protocols._framed.framing.DEFAULT_MAX_LENGTH",
     "protocols._framed.framing.LARGE",
     "protocols._framed.framing.FIRST_READ",
-    "protocols._framed.framing.MOST_READ",
-    "protocols._framed.framing.LEAST_READ",
+    "protocols._framed.framing.MAX_READ_BYTES",
+    "protocols._framed.framing.MIN_READ_BYTES",
     "protocols._framed.machine.MANY_EVENTS",
     "protocols._framed.machine.MANY_FRAMES",
     "protocols._framed.dialect.MAX_SURPLUS",
@@ -104,17 +110,19 @@ LIMITS = (
     "protocols._framed.frame_age.HINT_TIME",
     "_client.link.MAX_CHUNKS",
     "_client.link.MAX_DATAGRAMS",
-    "_client.link.LEAST_CHUNK",
+    "_client.link.MIN_FRAMES_PER_CHUNK",
     "_client.link.FIRST_CHUNK",
     "_client.link.LARGEST_CHUNK",
-    "_client.link.TURN",
+    "_client.link.TURN_TIME",
+    "_zenoh.TURN",
+    "_zenoh.PATIENT_TURN",
     "_client.link.MAX_REST",
     "camera.DEFAULT_MAX_QUEUE",
     "camera.DEFAULT_MAX_QUEUE_BYTES",
     "camera.MAX_INTERPRETATIONS",
     "camera.DEFAULT_TRIGGER_TIMEOUT",
     "_client.handshake.MAX_EARLY",
-    "_client.handshake.DETECTION_SHARE",
+    "_client.handshake.DETECTION_TIMEOUT",
     "_client.handshake.TELLING_ROUNDS",
     "_client.handshake.BUSY_PAUSE",
     "_client.status.BUSY_PAUSE",
@@ -128,11 +136,15 @@ LIMITS = (
     "_client.supervisor.TAKEN_WITHIN",
     "exceptions.MAX_EXCERPT",
     "_accepting.ACCEPT_PAUSE",
+    "_accepting.BACKLOG",
+    "_accepting.HANDSHAKE_TIMEOUT",
+    "_accepting.RESERVED_DESCRIPTORS",
+    "_accepting.RESERVED_BY_CAMERAS",
     "emulator._client_link.MAX_INPUT",
     "emulator._wire_camera.MAX_LINKS",
     "emulator._wire_camera.WRITE_LIMIT",
     "emulator._application.MAX_CONTAINER",
-    "emulator._links.FAREWELL",
+    "emulator._links.CLOSE_TIMEOUT",
     "emulator._traffic.MAX_ENTRIES",
     "emulator._traffic.MAX_BYTES",
     "emulator._traffic.MAX_IDS",
@@ -143,7 +155,7 @@ LIMITS = (
     "protocols._insight.words.MAX_CELLS",
     "protocols._insight.answers.MAX_IMAGE",
     "emulator._insight.connection.MAX_SESSIONS",
-    "emulator._line_camera.MAX_WAITING",
+    "emulator._line_camera.MAX_INPUT_BYTES",
     "emulator._insight.connection.WRITE_LIMIT",
     "emulator._line_camera.MAX_AGENDA",
     "emulator._insight.camera.MAX_ORDERED",
@@ -151,6 +163,10 @@ LIMITS = (
     "emulator._insight.job.MAX_CELL_TEXT",
     "protocols._insight.machine.READ_SIZE",
     "protocols._lines.READ_SIZE",
+    "emulator._ticketed_camera.MAX_REQUEST",
+    "makes._ifm.dialect.MAX_INPUT",
+    "makes._ifm.layouts.MAX_DEPTH",
+    "makes._keyence.words.MAX_LINE",
     "emulator._line_codec.MAX_LOGGED",
     "protocols._insight.dialect.MAX_LOGIN",
     "emulator._scenario.timeline.MAX_PENDING",
@@ -159,65 +175,76 @@ LIMITS = (
     "emulator._scenario.scenario.MAX_CUES",
     "emulator._traffic.MAX_VISITS",
     "layout._yamls.MAX_BITS",
+    "layout._yamls.MAX_DEPTH",
     "layout._yamls.MAX_NODES",
     "layout._yamls.MAX_YAML_TEXT",
-    "fleet._agent.MOST_CALLS",
-    "fleet._agent.KNOWN_CALLS",
-    "fleet._agent.FIRST_TRY",
-    "fleet._calls.MOST_FILLED",
-    "fleet._caller.HELLO_TIMEOUT",
-    "fleet._camera.REACH_TIMEOUT",
-    "fleet._errors.MAX_CHAIN",
-    "fleet._file.MOST_CAMERAS",
-    "fleet._program.LOOK_AGAIN",
-    "fleet._receiver.FILL_TIMEOUT",
-    "_zenoh.LEASE",
-    "fleet._zenoh.LONG",
-    "_zenoh.MOST_WAITING",
+    "_suggestions.MAX_WORD_CHARACTERS",
+    "_suggestions.MAX_KNOWN_WORDS",
+    "depth._tables.MAX_LINE",
+    "depth._tables.WORDS",
+    "depth._pcd.MAX_UNPACKED",
+    "frames._gige.assembler.MAX_GAPS_PER_BLOCK",
+    "frames._gige.description.LARGEST",
+    "frames._gige.description.LARGEST_PACKED",
+    "frames._gige.description.MAX_ELEMENTS",
+    "frames._gige.features.MAX_ELEMENTS_VISITED",
+    "fleet._security.certificates.MAX_BYTES",
+    "fleet._agent.agent.MAX_CALLS_PER_PROGRAM",
+    "fleet._agent.agent.KNOWN_CALLS",
+    "fleet._agent.agent.FIRST_TRY",
+    "fleet._agent.calls.MAX_REPLY_BYTES",
+    "fleet._program.caller.HELLO_TIMEOUT",
+    "fleet._program.camera.REACH_TIMEOUT",
+    "fleet._bus.errors.MAX_CHAIN",
+    "fleet._file.fleet_file.MAX_CAMERAS_PER_AGENT",
+    "fleet._program.program.LOOK_AGAIN",
+    "fleet._program.receiver.FILL_TIMEOUT",
+    "_zenoh.LEASE_TIME",
+    "fleet._bus.zenoh.LONG",
+    "_zenoh.MAX_WAITING_BYTES",
     "_zenoh.TURN",
-    "recording._form.MAX_CAMERAS",
-    "recording._form.MAX_MESSAGE",
-    "recording._form.MAX_NAME",
-    "recording._form.MAX_VALUES",
-    "recording._schedule.MAX_REPLAY",
+    "recording._mcap.form.MAX_CAMERAS",
+    "recording._mcap.form.MAX_MESSAGE",
+    "recording._mcap.form.MAX_NAME",
+    "recording._mcap.form.MAX_VALUES",
+    "recording._replays.schedule.MAX_REPLAY",
     "recording._reader.MIN_VALUES",
     "recording._reader.VALUES_PER_BYTE",
-    "recording._records.MAX_CHUNK",
-    "recording._records.MAX_FACTS",
-    "recording._records.MAX_RECORD",
-    "recording._records.MIN_RECORDS",
-    "recording._records.MIN_UNPACKED",
-    "recording._records.UNPACKED_PER_BYTE",
+    "recording._mcap.records.MAX_CHUNK",
+    "recording._mcap.records.MAX_FACTS",
+    "recording._mcap.records.MAX_RECORD",
+    "recording._mcap.records.MIN_RECORDS",
+    "recording._mcap.records.MIN_UNPACKED",
+    "recording._mcap.records.UNPACKED_PER_BYTE",
     "_loop_thread.CALL_TIMEOUT",
-    "calibration._plane.fitting.MOST_STEPS",
+    "calibration._plane.fitting.MAX_STEPS",
     "calibration._files.directory.MAX_NAME",
-    "calibration._files.store.LOCK_TIMEOUT",
+    "_whole_files.LOCK_TIMEOUT",
     "calibration.formats._file_format.MAX_FILE",
     "calibration.formats._file_format.MAX_TEXT",
     "calibration.formats._file_format.MAX_YAML",
     "calibration.formats._plain.MAX_DEPTH",
     "calibration.formats._plain.MAX_NUMBER",
+    "calibration.formats._plain.MAX_SIDE",
     "calibration.formats._trajectories.MAX_LINE",
-    "calibration._least_squares.MOST_STEPS",
-    "calibration.formats._cameras.MAX_CAMERAS",
+    "calibration._least_squares.MAX_STEPS",
+    "calibration.formats._foreign.MAX_CAMERAS",
     "calibration.formats._cameras.MAX_FILE",
-    "calibration.formats._cameras.MAX_SIDE",
     "calibration._detection.charucos.LARGEST_DOUBLED",
     "calibration._detection.circle_grids.MORE_SPOTS",
-    "calibration._detection.corners.MOST_REACH",
-    "calibration._detection.dots.MOST_REACH",
+    "calibration._detection.corners.MAX_REACH",
+    "calibration._detection.dots.MAX_REACH",
     "calibration._detection.image.LARGEST",
     "calibration._detection.image.SMALLEST",
     "calibration._detection.image.USUAL_SIZE",
-    "calibration._hand_eye.calibration.MOST_POSES",
-    "calibration._hand_eye.model_selection.MOST_FOLDS",
-    "calibration._detection.grid_growing.MOST_TRIES",
-    "calibration.wizards._hand_eye.MOST_VIEWS",
-    "calibration._detection.levenberg.MOST_STEPS",
+    "calibration._hand_eye.model_selection.MAX_FOLDS",
+    "calibration._detection.grid_growing.MAX_SEEDS_TRIED",
+    "calibration.wizards._hand_eye.MAX_VIEWS",
+    "calibration._detection.levenberg.MAX_STEPS",
     "calibration.wizards._pictures.DEADLINE",
     "calibration.wizards._pictures.MAX_FILES",
     "calibration.wizards._pictures.MAX_PICTURE",
-    "calibration._detection.ordering.LEAST_MARGIN",
+    "calibration._detection.ordering.MIN_ORIGIN_CONTRAST",
     "calibration.wizards._target_drawing.MAX_SIDE",
     "calibration._stereo.rectification.MAX_PIXELS",
     "calibration._printing.sheets.MAX_PAGE",
@@ -232,12 +259,12 @@ LIMITS = (
     "calibration.wizards._verification.MAX_TOUCHES",
     "calibration.wizards._marks.MAX_MARKS",
     "calibration.wizards._touch_previews.CELLS",
-    "calibration._plane.robust.MOST_ROUNDS",
-    "calibration._plane.robust.MOST_SUBSETS",
+    "calibration._plane.robust.MAX_ROUNDS",
+    "calibration._plane.robust.MAX_SUBSETS_TRIED",
     "calibration.wizards._points.MAX_POINTS",
     "recording._recorder.INTERVAL",
     "recording._recorder.CHUNK",
-    "recording._recorder.MAX_WAITING",
+    "recording._recorder.MAX_WAITING_BYTES",
     "recording._recorder.CLOSE_TIMEOUT",
     "conformance.client._tasks.MAX_OUTPUT",
     "conformance.client._runs.MAX_LINES",
@@ -257,7 +284,7 @@ LIMITS = (
     "web._streams.SLOW",
     "web._emulator.MAX_ENTRIES",
     "web._emulator.MAX_WAIT",
-    "web._emulator.MAX_WAITING",
+    "web._emulator.MAX_WAITING_CHANGES",
     "web._emulator.LOOK_AGAIN",
     "web._emulator.MAX_PARTS",
     "web._emulator.MAX_NAMES",
@@ -276,12 +303,11 @@ LIMITS = (
     "web._live_view.SERIES",
     "web._live_view.IMAGE_PERIOD",
     "web._site.FAREWELL",
-    "web._site.BACKLOG",
     "web._connections.MAX_CONNECTIONS",
     "web._connections.HEAD_TIMEOUT",
     "web._connections.KEEP_ALIVE",
     "web._connections.MAX_HEAD",
-    "web._site.RESOLVE_TIMEOUT",
+    "_accepting.RESOLVE_TIMEOUT",
     "web._guard.MIN_TOKEN",
     "web._errors.MAX_SHOWN",
 )
@@ -435,6 +461,66 @@ def quirks() -> str:
     return _table(("quirk", "default", "values", "why"), rows)
 
 
+def quirks_insight() -> str:
+    """Return those of the emulated In-Sight camera."""
+    rows = [
+        (f"`{name}`", f"`{field.default}`", _choices(field.annotation), field.description)
+        for name, field in InSightQuirks.model_fields.items()
+    ]
+    return _table(("quirk", "default", "values", "why"), rows)
+
+
+def application() -> str:
+    """Return the fields of an application of the emulator."""
+    return _fields(Application)
+
+
+def scenario() -> str:
+    """Return the fields of a scenario of one camera."""
+    return _fields(Scenario).replace("| below |", "|  |")
+
+
+def cue() -> str:
+    """Return the fields of a cue."""
+    return _fields(Cue)
+
+
+def faults_which() -> str:
+    """Return the fields that say which message a fault is about."""
+    fields = faults.FAULTS["drop"].model_fields
+    return _table(
+        ("field", "meaning"),
+        [(f"`{name}`", fields[name].description) for name in ("on", "sender", "nth", "times")],
+    )
+
+
+def faults_wire() -> str:
+    """Return the faults of the wire."""
+    return _faults(WireFault)
+
+
+def faults_device() -> str:
+    """Return the faults of the device."""
+    return _faults(DeviceFault)
+
+
+def _faults(family: type[BaseModel]) -> str:
+    shared = {"kind", "on", "sender", "nth", "times", "when"}
+    rows = []
+    for kind, made in faults.FAULTS.items():
+        if not issubclass(made, family):
+            continue
+        about = (inspect.getdoc(made) or "").partition("\n")[0].replace("``", "`")
+        fields = [
+            f"`{name}`: {field.description}"
+            for name, field in made.model_fields.items()
+            if name not in shared
+        ]
+        both_ways = issubclass(made, WireFault) and Sender.CLIENT in made.senders
+        rows.append((f"`{kind}`{' *' if both_ways else ''}", about, "<br>".join(fields)))
+    return _table(("kind", "what happens", "fields"), rows)
+
+
 def settings() -> str:
     """Return the options of ``connect()``."""
     rows = [
@@ -514,6 +600,29 @@ def access_rights() -> str:
     return _table(("may", "how", "keys behind `smartcam/FLEET/`", *ROLES[:3]), rows)
 
 
+def calls_emulator() -> str:
+    """Return the calls of the emulator's page."""
+    return _calls(emulator_page.CALLS)
+
+
+def calls_colours() -> str:
+    """Return the calls of the page of colours."""
+    return _calls(colour_page.CALLS)
+
+
+def calls_cloud() -> str:
+    """Return the calls of the page of clouds."""
+    return _calls(cloud_page.CALLS)
+
+
+def _calls(calls: Iterable[Any]) -> str:
+    rows = [
+        (call.method, f"`{call.path}`", call.about, f"`{call.sample}`" if call.sample else "")
+        for call in calls
+    ]
+    return _table(("method", "path", "what it does", "body, for example"), rows)
+
+
 def _fields(kind: type[BaseModel]) -> str:
     rows = [
         (f"`{name}`", field.description, _default(field))
@@ -525,7 +634,7 @@ def _fields(kind: type[BaseModel]) -> str:
 def _default(field: FieldInfo) -> str:
     if field.is_required():
         return "has to be there"
-    if field.default is None:
+    if field.default is None or field.default_factory is not None:
         return ""
     return "below" if isinstance(field.default, BaseModel) else f"`{json.dumps(field.default)}`"
 
@@ -609,10 +718,11 @@ GENERATED: dict[str, Callable[[], str]] = {
     for one in (
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
-        *(quirks, settings, transitions, policies, layers, limits),
+        *(quirks, quirks_insight, settings, transitions, policies, layers, limits),
+        *(application, scenario, cue, faults_which, faults_wire, faults_device),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
         *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
-        access_rights,
+        *(access_rights, calls_emulator, calls_colours, calls_cloud),
     )
 }
 """What ``{generated}`` knows."""
@@ -637,9 +747,15 @@ def setup(app: Any) -> None:
             return box.children
 
     app.add_directive("generated", Generated)
+    app.connect("source-read", _link_results)
     app.connect("autodoc-skip-member", _skip)
     app.connect("autodoc-process-signature", _plain_types)
     app.connect("autodoc-process-signature", _which_frame)
+
+
+def _link_results(_app: Any, _name: str, source: list[str]) -> None:
+    """Let a page's links to results, which are no pages, lead to these files."""
+    source[0] = source[0].replace("](../results/", "](path:../results/")
 
 
 def _plain_types(

@@ -53,7 +53,8 @@ class Fleet:
     """All connections of the process."""
 
     def __init__(self) -> None:
-        self.server = socket.create_server(("127.0.0.1", 0), backlog=4096)
+        # at every address of the loopback, since a fleet has a camera under one name only
+        self.server = socket.create_server(("0.0.0.0", 0), backlog=4096)  # noqa: S104
         self.selector = selectors.DefaultSelector()
         self.selector.register(self.server, selectors.EVENT_READ)
         self.cameras: list[Camera] = []
@@ -76,7 +77,10 @@ class Fleet:
 
     def accept(self) -> None:
         """Take one more."""
-        sock, _ = self.server.accept()
+        sock, (host, _) = self.server.accept()
+        if not host.startswith("127."):
+            sock.close()  # from outside this machine
+            return
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         camera = Camera(sock)
         self.cameras.append(camera)

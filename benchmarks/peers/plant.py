@@ -30,9 +30,9 @@ PATIENCE = 60.0
 """Seconds until cameras that do not connect are an error."""
 
 
-def url(port: int) -> str:
-    """Return the URL of any of the cameras."""
-    return f"bvs://127.0.0.1:{port}?dialect=handbook"
+def url(port: int, agent: int = 0) -> str:
+    """Return the URL of any of the cameras of an agent."""
+    return f"bvs://127.0.0.{1 + agent}:{port}?dialect=handbook"
 
 
 async def clients(count: int, port: int) -> None:
@@ -50,7 +50,8 @@ async def clients(count: int, port: int) -> None:
 
 async def agent(count: int, port: int, name: str, place: str, how: str) -> None:
     """Share the cameras."""
-    cameras = {f"{name}/cam{number:05}": {"url": url(port)} for number in range(count)}
+    where = url(port, int(name.removeprefix("agent")))
+    cameras = {f"{name}/cam{number:05}": {"url": where} for number in range(count)}
     file = FleetFile.model_validate(
         {"agent": name, how: place, "history": {"results": HISTORY}, "cameras": cameras}
     )

@@ -229,7 +229,7 @@ class ZenohEnd(End):
         self._port = port
         self._session: Any = None
         self._kept: list[Any] = []
-        from smartcam.ros2._types import RosTypes
+        from smartcam.ros2._types.types import RosTypes
 
         types = RosTypes()
         image, service = types.message(IMAGE), types.service(SET_BOOL)

@@ -43,7 +43,7 @@ def can(modules: str) -> bool:
 def publish(how: str) -> None:
     """Publish pictures with their stamps until killed."""
     import rospy  # type: ignore[import-not-found]
-    from sensor_msgs.msg import CompressedImage, Image  # type: ignore[import-not-found]
+    from sensor_msgs.msg import CompressedImage, Image
 
     rospy.init_node("near", disable_signals=True)
     kind = Image if how == "raw" else CompressedImage
