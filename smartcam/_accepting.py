@@ -1,55 +1,286 @@
-"""Accepting connections on a port, for whoever listens: the emulators and the pages.
+"""Accepting connections on a port: one policy for every server of the package.
 
-Not by ``asyncio.Server``. A connection that it has accepted but not yet wrapped when it is closed
-stays open until the garbage collector finds it, and a client would wait for ever. And where no file
-descriptor is left, it writes a traceback for each place of its backlog, every second.
+Emulators, pages, the RTSP server and the link proxy listen by it. :class:`Places` says who may
+stay; it knows no socket and no clock. :class:`Acceptor` accepts, and keeps its deadlines.
+
+- A newcomer always gets in as long as one of the others has no session: the one without a session
+  for longest makes room. One with a session never does. What a session is, the server says; what
+  anybody may ask without one, such as OPTIONS, is none.
+- A connection that has no session in time is closed, whatever it says meanwhile.
+- One address has three quarters of the places at most; the programs of this machine share one
+  address, so loopback may have all.
+- Some file descriptors of the process are left to others. Where only those are left, the connection
+  without a session for longest, of any server on this event loop, makes room.
+
+Connections are not accepted by ``asyncio.Server``. A connection that it has accepted but not yet
+wrapped when it is closed stays open until the garbage collector finds it, and a client would wait
+for ever. And where no file descriptor is left, it writes a traceback for each place of its backlog,
+every second.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
+import math
 import socket
+import sys
+import threading
+import weakref
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 if TYPE_CHECKING:
     import logging
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
+
+if sys.platform != "win32":
+    import resource
 
 ACCEPT_PAUSE = 1.0
-"""Seconds until the next try where the system has no socket left."""
+"""Seconds until the next try where the system has no socket left, and nobody can make room."""
+
+BACKLOG: Final = 128
+"""Connections that the system may queue before they are accepted."""
+
+HANDSHAKE_TIMEOUT: Final = 60.0
+"""Seconds that a connection may stay without a session, where a server says nothing else."""
+
+RESOLVE_TIMEOUT: Final = 10.0
+"""Seconds that the look-up of a host's address may take."""
+
+RESERVED_DESCRIPTORS: Final = 32
+"""File descriptors that a server's connections leave to the rest of the process, and to cameras."""
+
+RESERVED_BY_CAMERAS: Final = 8
+"""File descriptors that the connections of an emulated camera leave to the rest of the process."""
 
 
-class Acceptor:
-    """Gives each connection on a listening socket a protocol; how many may stay is theirs to say.
+def is_loopback(host: str) -> bool:
+    """Return True if a host's name or address reaches this machine only from itself."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        address = ipaddress.ip_address(host.strip("[]").partition("%")[0])
+    except ValueError:
+        return False
+    mapped = getattr(address, "ipv4_mapped", None)
+    return bool((mapped or address).is_loopback)
+
+
+def share_of(most: int) -> int:
+    """Return the number of ``most`` places that one address may take; loopback may take all."""
+    return max(1, most - most // 4)
+
+
+class Occupant(Protocol):
+    """A connection, as the policy sees it."""
+
+    @property
+    def settled(self) -> bool:
+        """True if it has a session or is being served, so that it never makes room for another."""
+        ...
+
+    def turn_away(self, why: str) -> None:
+        """End it at once; harmless when said twice."""
+        ...
+
+
+@dataclass(slots=True)
+class _TakenPlace:
+    peer: str  # its address, without a port
+    since: float  # when it came, or last had a session
+    within: float  # seconds that it has from then on
+    what: str  # is missing then
+    deadline: float
+
+
+G = TypeVar("G", bound=Occupant)
+
+
+class Places(Generic[G]):
+    """The policy of one port: which connections may stay.
+
+    Moments are seconds of any clock that does not go back.
+
+    Args:
+        most: connections at a time.
+        within: seconds that a connection may stay without a session.
+        what: text for the log that says what such a connection lacks, "no session".
+        own: name of a session in the log, "a session".
+
+    Attributes:
+        most: as given; may be changed.
+        crowded_out: connections that were closed, or refused, because too many were open.
+    """
+
+    def __init__(
+        self,
+        most: int,
+        *,
+        within: float = HANDSHAKE_TIMEOUT,
+        what: str = "no session",
+        own: str = "a session",
+    ) -> None:
+        self.most = most
+        self.crowded_out = 0
+        self._within, self._what, self._own = within, what, own
+        self._places: dict[
+            G, _TakenPlace
+        ] = {}  # the one without a session for longest stands first
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __iter__(self) -> Iterator[G]:
+        return iter(list(self._places))
+
+    def __contains__(self, occupant: object) -> bool:
+        return occupant in self._places
+
+    def enter(self, occupant: G, peer: str, now: float) -> str:
+        """Give a newcomer a place, for which another one may have to go.
+
+        Returns:
+            "", or why there is none for it.
+        """
+        crowd, taken = list(self._places), f"{self.most} others are open"
+        if len(crowd) < self.most:
+            crowd = []
+            if not is_loopback(peer):
+                theirs = [one for one, place in self._places.items() if place.peer == peer]
+                if len(theirs) >= share_of(self.most):
+                    crowd, taken = theirs, f"{len(theirs)} others of {peer} are open"
+        if crowd:
+            self.crowded_out += 1
+            one = next((one for one in crowd if not one.settled), None)
+            if one is None:
+                return f"{taken}, and each has {self._own}"
+            self._send_away(one, f"{taken}, it was without {self._own} for longest")
+        self._places[occupant] = _TakenPlace(
+            peer, now, self._within, self._what, now + self._within
+        )
+        return ""
+
+    def leave(self, occupant: G) -> None:
+        """Forget a connection that has ended; harmless when said twice."""
+        self._places.pop(occupant, None)
+
+    def move_back(self, occupant: G, now: float) -> None:
+        """Put a connection behind the others: it was served, or its session has ended."""
+        place = self._places.pop(occupant, None)
+        if place is not None:
+            place.since = now
+            self._places[occupant] = place
+
+    def expect(self, occupant: G, within: float | None, what: str, now: float) -> None:
+        """Set within how many seconds a connection must have a session; None: as long as it likes.
+
+        Args:
+            occupant: the connection.
+            within: from now on.
+            what: is missing then.
+            now: the moment.
+        """
+        place = self._places.get(occupant)
+        if place is not None:
+            place.within, place.what = math.inf if within is None else within, what
+            place.deadline = now + place.within
+
+    def longest(self) -> tuple[float, G] | None:
+        """Return the connection without a session for longest, and since when; None: no such."""
+        found = next((one for one in self._places.items() if not one[0].settled), None)
+        return None if found is None else (found[1].since, found[0])
+
+    def make_room(self, why: str) -> None:
+        """Have the connection without a session for longest go."""
+        found = self.longest()
+        if found is not None:
+            self.crowded_out += 1
+            self._send_away(found[1], why)
+
+    def end_overdue(self, now: float) -> None:
+        """Have those go whose time is over; one that has a session then gets the time anew."""
+        for occupant, place in list(self._places.items()):
+            if place.deadline > now or occupant not in self._places:
+                continue
+            if occupant.settled:
+                place.deadline = now + place.within
+            else:
+                self._send_away(occupant, f"{place.what} within {place.within:g} s")
+
+    def next_deadline(self) -> float:
+        """Return when :meth:`end_overdue` is to be called next; infinity: never."""
+        return min((place.deadline for place in self._places.values()), default=math.inf)
+
+    def _send_away(self, occupant: G, why: str) -> None:
+        self._places.pop(occupant, None)
+        occupant.turn_away(why)
+
+
+class _OnThisThread(threading.local):
+    """The acceptors of the event loops that run in a thread."""
+
+    def __init__(self) -> None:
+        self.acceptors: weakref.WeakSet[Acceptor[Any]] = weakref.WeakSet()
+
+
+_here = _OnThisThread()
+
+
+class Acceptor(Generic[G]):
+    """Gives each connection on a listening socket a protocol, which takes a place.
+
+    The protocol calls :meth:`enter` when its connection is made, and :meth:`leave` when that is
+    lost.
 
     Args:
         make: returns a new protocol. One that is made after :meth:`close` is for a connection that
             was accepted before.
-        log: the logger that is told of what fails.
-        name: for tasks.
+        places: places of the connections that may stay.
+        log: logger of failures.
+        name: name of the tasks.
+        reserve: file descriptors of the process that are left to others.
     """
 
     def __init__(
-        self, make: Callable[[], asyncio.BaseProtocol], log: logging.Logger, name: str
+        self,
+        make: Callable[[], asyncio.BaseProtocol],
+        places: Places[G],
+        log: logging.Logger,
+        name: str,
+        *,
+        reserve: int = RESERVED_DESCRIPTORS,
     ) -> None:
+        self.places = places
         self._make = make
         self._log = log
         self._name = name
+        self._reserve = reserve
         self._socket: socket.socket | None = None
         self._waiting: asyncio.Task[None] | asyncio.TimerHandle | None = None
         self._adopting: set[asyncio.Task[Any]] = set()
+        self._moving = 0  # connections that wait for a descriptor that becomes free
         self._scarce = False  # the last try has failed
+        self._timer: asyncio.TimerHandle | None = None  # of the next deadline
+        self.loop: asyncio.AbstractEventLoop | None = None  # while it is open
+
+    # ------------------------------------------------------------------ the port
 
     def open(self, sock: socket.socket) -> None:
         """Accept from now on; the socket listens and does not block."""
         self._socket = sock
+        self.loop = asyncio.get_running_loop()
+        _here.acceptors.add(self)
         self._listen(sock)
 
     def close(self) -> None:
-        """Accept nothing more, at once; the socket is its owner's to close."""
+        """Accept nothing more, at once; connections stay, and so does the socket."""
         sock, self._socket = self._socket, None
+        self.loop = None
+        _here.acceptors.discard(self)
         if sock is not None:
             with contextlib.suppress(NotImplementedError):
                 asyncio.get_running_loop().remove_reader(sock)
@@ -59,8 +290,72 @@ class Acceptor:
 
     async def wait_closed(self) -> None:
         """Wait until every connection that was accepted has its protocol, or is closed."""
+        if self._moving:  # which takes one turn of the loop
+            await asyncio.sleep(0)
         if self._adopting:
             await asyncio.wait(self._adopting)
+
+    # ------------------------------------------------------------------ its connections
+
+    def enter(self, occupant: G, address: Any) -> str:
+        """Give a new connection a place; return "", or why there is none.
+
+        Args:
+            occupant: the connection.
+            address: of its peer, as a socket has it.
+        """
+        now = asyncio.get_running_loop().time()
+        why = self.places.enter(occupant, str(address[0]) if address else "", now)
+        self._set_timer()
+        return why
+
+    def leave(self, occupant: G) -> None:
+        """Forget a connection that has ended; harmless when said twice."""
+        self.places.leave(occupant)
+        if not self.places and self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def move_back(self, occupant: G) -> None:
+        """Put a connection behind the others: it was served, or its session has ended."""
+        self.places.move_back(occupant, asyncio.get_running_loop().time())
+
+    def expect(self, occupant: G, within: float | None, what: str) -> None:
+        """Set within how many seconds a connection must have a session; None: as long as it likes.
+
+        Args:
+            occupant: the connection.
+            within: from now on.
+            what: is missing then, for the log.
+        """
+        self.places.expect(occupant, within, what, asyncio.get_running_loop().time())
+        self._set_timer()
+
+    def _set_timer(self) -> None:
+        due = self.places.next_deadline()
+        if self._timer is not None:
+            if self._timer.when() <= due:
+                return
+            self._timer.cancel()
+            self._timer = None
+        if due < math.inf:
+            self._timer = asyncio.get_running_loop().call_at(due, self._end_overdue)
+
+    def _end_overdue(self) -> None:
+        self._timer = None
+        self.places.end_overdue(asyncio.get_running_loop().time())
+        self._set_timer()
+
+    # ------------------------------------------------------------------ accepting
+
+    def adopt(self, connection: socket.socket) -> None:
+        """Give an accepted connection its protocol; one that is too late is closed by that."""
+        loop = asyncio.get_running_loop()
+        task = loop.create_task(
+            loop.connect_accepted_socket(self._make, connection), name=f"{self._name}.adopt"
+        )
+        self._adopting.add(task)
+        task.add_done_callback(partial(self._adopted, connection))
 
     def _listen(self, sock: socket.socket) -> None:
         loop = asyncio.get_running_loop()
@@ -77,13 +372,13 @@ class Acceptor:
         except (BlockingIOError, InterruptedError, ConnectionAbortedError):
             return  # the client has changed its mind
         except OSError as exc:  # no file descriptor is left: the reader would call without end
-            self._tell(exc)
+            self._tell(f"a connection cannot be accepted: {exc}")
             loop = asyncio.get_running_loop()
             loop.remove_reader(sock)
-            self._waiting = loop.call_later(ACCEPT_PAUSE, self._listen, sock)
+            pause = 0.0 if _make_room() else ACCEPT_PAUSE
+            self._waiting = loop.call_later(pause, self._listen, sock)
             return
-        connection.setblocking(False)
-        self._adopt(connection)
+        self._admit(connection)
 
     async def _accept_for_ever(self, sock: socket.socket) -> None:
         loop = asyncio.get_running_loop()
@@ -91,32 +386,97 @@ class Acceptor:
             try:
                 connection, _ = await loop.sock_accept(sock)
             except OSError as exc:
-                self._tell(exc)
-                await asyncio.sleep(ACCEPT_PAUSE)
+                self._tell(f"a connection cannot be accepted: {exc}")
+                await asyncio.sleep(0.0 if _make_room() else ACCEPT_PAUSE)
             else:
-                self._adopt(connection)
+                self._admit(connection)
 
-    def _tell(self, exc: OSError) -> None:
+    def _tell(self, what: str) -> None:
         """Say once that nothing can be accepted, until it can be again."""
         if not self._scarce:
-            self._log.warning("! a connection cannot be accepted: %s", exc)
+            self._log.warning("! %s", what)
         self._scarce = True
 
-    def _adopt(self, connection: socket.socket) -> None:
-        """Give an accepted connection its protocol; one that is too late is closed by that."""
+    def _admit(self, connection: socket.socket) -> None:
+        """Adopt a connection, where the process has descriptors left for it."""
+        if not _is_last(connection, self._reserve):
+            self._take(connection)
+        elif _make_room():
+            self._moving += 1
+            asyncio.get_running_loop().call_soon(self._move, connection)
+        else:
+            self._tell("a connection was refused: the process has too few file descriptors left")
+            connection.close()
+
+    def _move(self, connection: socket.socket) -> None:
+        """Take a connection with the descriptor that has become free, and give the last one back.
+
+        Else the last ones would stay in use, and the next connection would have the free one.
+        """
+        self._moving -= 1
+        try:
+            moved = connection.dup()
+        except OSError:
+            moved = connection
+        else:
+            connection.close()
+        self._take(moved)
+
+    def _take(self, connection: socket.socket) -> None:
         self._scarce = False
+        connection.setblocking(False)
         with contextlib.suppress(OSError):  # it is gone again
             # asyncio does so only where the listening socket was made with the protocol's number
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        loop = asyncio.get_running_loop()
-        task = loop.create_task(
-            loop.connect_accepted_socket(self._make, connection), name=f"{self._name}.adopt"
-        )
-        self._adopting.add(task)
-        task.add_done_callback(partial(self._adopted, connection))
+        self.adopt(connection)
 
     def _adopted(self, connection: socket.socket, task: asyncio.Task[Any]) -> None:
         self._adopting.discard(task)
         if task.cancelled() or task.exception() is not None:
             self._log.warning("! an accepted connection was lost: %s", task)
             connection.close()
+
+
+def _is_last(connection: socket.socket, reserve: int) -> bool:
+    """Return True if a new connection has one of the last descriptors of the process.
+
+    The system gives the lowest descriptor that is free: all below a high one are in use.
+    """
+    if sys.platform == "win32":
+        return False
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return most != resource.RLIM_INFINITY and connection.fileno() >= most - min(reserve, most // 4)
+
+
+def _make_room() -> bool:
+    """Have the connection go that is without a session for longest, of all on this event loop."""
+    loop = asyncio.get_running_loop()
+    open_here = [one.places for one in _here.acceptors if one.loop is loop]
+    waiting = [(found[0], one) for one in open_here if (found := one.longest()) is not None]
+    if not waiting:
+        return False
+    _, places = min(waiting, key=lambda one: one[0])
+    places.make_room("the process has too few file descriptors left")
+    return True
+
+
+async def listening(host: str, port: int, *, local: bool = False) -> socket.socket:
+    """Return a socket that listens and does not block.
+
+    Args:
+        host: name or address of this machine; "": all of them.
+        port: 0 for a free one.
+        local: whether only loopback will do.
+
+    Raises:
+        OSError, ValueError, OverflowError: it cannot be had, or is not ``local``.
+    """
+    loop = asyncio.get_running_loop()
+    async with asyncio.timeout(RESOLVE_TIMEOUT):
+        found = await loop.getaddrinfo(host or "0.0.0.0", port, type=socket.SOCK_STREAM)  # noqa: S104
+    family, _, _, _, address = found[0]
+    if local and not is_loopback(str(address[0])):
+        raise ValueError(f"{host} is {address[0]} here, which needs a token")
+    listener = socket.create_server((address[0], port), family=family, backlog=BACKLOG)
+    listener.setblocking(False)
+    return listener

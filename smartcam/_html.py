@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from smartcam.models import Localization, Result
 
-MOST_ROWS = 100
+MAX_ROWS = 100
 """Rows that are shown; the number of those left out is told."""
 
 
@@ -31,10 +31,39 @@ def result_html(result: Result) -> str:
         "received": f"{result.received_at:%Y-%m-%d %H:%M:%S} UTC",
         "latency": "" if result.latency is None else f"{1e3 * result.latency:.0f} ms",
         "raw": f"{len(result.raw)} bytes",
-        "value": f"{len(value)} localizations" if shown else f"{value!r:.1000}",
+        "value": _said(value),
     }
     rows = [[name, str(text)] for name, text in fields.items() if text != ""]
-    return _table((), rows) + (localizations_html(value) if shown else "")
+    if shown:
+        return _table((), rows) + localizations_html(value)
+    return _table((), rows) + (records_html(value) if _is_records(value) else "")
+
+
+def _said(value: Any) -> str:
+    """Return the text of a value in the table of its result."""
+    if _is_parts(value):
+        return f"{len(value)} localizations"
+    if _is_records(value):
+        return f"{len(value)} records" if isinstance(value, list) else "a record"
+    return f"{value!r:.1000}"
+
+
+def _is_records(value: Any) -> bool:
+    items: Any = value if isinstance(value, list) else [value]
+    return bool(items) and all(hasattr(type(item), "_units") for item in items)
+
+
+def records_html(value: Any) -> str:
+    """Return a table of a record of a layout, or of several, with the units in its head."""
+    records: Sequence[Any] = value if isinstance(value, list) else [value]
+    kind: Any = type(records[0])
+    units = kind._units  # noqa: SLF001 - of records, as their fields
+    names = [f"{name} [{units[name]}]" if name in units else name for name in kind._fields]
+    return _table(names, ([_cell(one) for one in record] for record in records))
+
+
+def _cell(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else f"{value!s:.1000}"
 
 
 def _is_parts(value: object) -> bool:
@@ -51,8 +80,8 @@ def _part(part: Localization) -> list[str]:
 def _table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     listed = list(rows)
     head = f"<tr>{_cells('th', names)}</tr>" if names else ""
-    body = "".join(f"<tr>{_cells('td', row)}</tr>" for row in listed[:MOST_ROWS])
-    more = len(listed) - MOST_ROWS
+    body = "".join(f"<tr>{_cells('td', row)}</tr>" for row in listed[:MAX_ROWS])
+    more = len(listed) - MAX_ROWS
     rest = f"<p>and {more} more</p>" if more > 0 else ""
     return f"<table>{head}{body}</table>{rest}"
 

@@ -10,25 +10,29 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 
-def lazy(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
-    """Return a package's ``__getattr__``, having given it its ``__dir__``.
+def lazy(door: str, names: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a package's door, having given the door its ``__dir__``.
 
-    For type checkers the package imports the same names where ``TYPE_CHECKING`` is set.
+    For type checkers the door imports the same names where ``TYPE_CHECKING`` is set.
 
     Args:
-        package: its name.
-        names: module of the package to the names that stand in it, with spaces between them; the
-            modules that are names themselves stand at ``""``.
+        door: name of the package, or of its module ``_inside``.
+        names: module of the package to the names that stand in it, with spaces between them. A
+            name that is itself a module stands at its parent with a dot behind, or at ``""``. What
+            begins with ``smartcam.`` is another room.
     """
     homes = {name: module for module, found in names.items() for name in found.split()}
-    own = vars(sys.modules[package])
+    own = vars(sys.modules[door])
+    package: str = own["__package__"]
 
     def resolve(name: str) -> Any:
         if name not in homes:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+            raise AttributeError(f"module {door!r} has no attribute {name!r}")
         home = homes[name]
-        module = importlib.import_module(f"{package}.{home or name}")
-        value = own[name] = getattr(module, name) if home else module
+        is_module = not home or home.endswith(".")
+        place = home if home.startswith("smartcam.") else f"{package}.{home}"
+        module = importlib.import_module(f"{place}{name if is_module else ''}")
+        value = own[name] = module if is_module else getattr(module, name)
         return value
 
     own["__dir__"] = lambda: sorted({*own, *homes})

@@ -10,9 +10,9 @@ import os
 import sys
 import threading
 import time
-import weakref
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
+from smartcam._forks import tell_of_forks
 from smartcam.exceptions import ConfigurationError, LocalProtocolError, ResponseTimeoutError
 
 if TYPE_CHECKING:
@@ -27,12 +27,12 @@ CALL_TIMEOUT = 10.0
 well under a millisecond; longer means that something in there, such as a generator of an
 application, does not return."""
 
-SLICE = 0.1
+LOCK_WAIT_TIME = 0.1
 """Seconds that Ctrl-C may have to wait where a lock's wait is not interrupted: on Windows, and
 elsewhere if it comes between the lock's look for signals and its wait."""
 
 
-def _start(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+def start_task(work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
     """Return a task that has begun, where Python can do that; it saves a turn of the loop."""
     loop = asyncio.get_running_loop()
     if sys.version_info >= (3, 12):
@@ -57,10 +57,10 @@ class _Mailbox:
             loop.add_reader(self._counter, self._woken)
 
     def post(self, function: Callable[[], object]) -> None:
-        """Have it called, from any thread.
+        """Schedule a function, from any thread.
 
         Raises:
-            ConfigurationError: the loop has ended; it is not called.
+            ConfigurationError: the loop has ended; the function is not called.
         """
         self._functions.append(function)
         if not self._closed:
@@ -116,6 +116,7 @@ class _ThreadCall:
     )
 
     def __init__(self, mailbox: _Mailbox, function: Callable[[], object]) -> None:
+        # it is begun by wait(), so that nobody can begin it and not be there to end it
         self._mailbox = mailbox
         self._function = function
         self._task: asyncio.Task[Any] | None = None
@@ -124,17 +125,17 @@ class _ThreadCall:
         self._cancelled = self._finished = False
         self._done = threading.Lock()
         self._done.acquire()
-        mailbox.post(self._begin)
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until it is done; return whether it is. Ctrl-C ends it, and is raised.
+        """Begin it, and wait until it is done; return whether it is. Ctrl-C ends it, and is raised.
 
         Args:
             timeout: seconds; None where what is called has deadlines of its own.
         """
         try:
+            self._mailbox.post(self._begin)
             deadline = None if timeout is None else time.monotonic() + timeout
-            while not self._done.acquire(timeout=SLICE):
+            while not self._done.acquire(timeout=LOCK_WAIT_TIME):
                 if deadline is not None and time.monotonic() >= deadline:
                     return False
         except BaseException:  # KeyboardInterrupt, in the main thread
@@ -145,12 +146,13 @@ class _ThreadCall:
         return True
 
     def cancel(self) -> None:
-        """Have it end, from any thread."""
+        """Cancel the call, from any thread; a call that has not begun will not begin."""
+        self._cancelled = True
         with contextlib.suppress(ConfigurationError):  # then it is over
             self._mailbox.post(self._cancel)
 
     def result(self) -> Any:
-        """Return what came of it, once it is done, or raise."""
+        """Return the result of the call once it is done, or raise its error."""
         if self._error is not None:
             try:
                 raise self._error
@@ -167,7 +169,9 @@ class _ThreadCall:
         try:
             got = self._function()
             if inspect.iscoroutine(got):
-                self._task = _start(self._finish_by(got))
+                self._task = start_task(self._finish_by(got))
+                if sys.version_info < (3, 12):
+                    self._task.add_done_callback(lambda _: self._never_begun(got))
                 return
         except BaseException as exc:  # noqa: BLE001 - it is raised where the call was made
             self._fail(exc)
@@ -186,6 +190,12 @@ class _ThreadCall:
         else:
             self._succeed(got)
 
+    def _never_begun(self, work: Coroutine[Any, Any, object]) -> None:
+        """End what was cancelled before its task's first step, which nobody else does."""
+        if not self._finished:
+            work.close()
+            self._fail(asyncio.CancelledError())
+
     def _succeed(self, result: object) -> None:
         self._result = result
         self._finish()
@@ -199,9 +209,10 @@ class _ThreadCall:
         self._done.release()
 
     def _cancel(self) -> None:
-        self._cancelled = True
         if self._task is not None:
             self._task.cancel()
+        elif not self._finished:  # it was not even asked to begin
+            self._fail(asyncio.CancelledError())
 
 
 class LoopThread:
@@ -218,7 +229,7 @@ class LoopThread:
         self._end: asyncio.Event | None = None
         self._thread: threading.Thread | None = None
         self._forked = False
-        _threads.add(self)
+        tell_of_forks(self)
 
     def start(self) -> None:
         """Start it; does nothing if it runs."""
@@ -228,15 +239,15 @@ class LoopThread:
 
         async def live() -> None:
             self._loop = asyncio.get_running_loop()
-            mailbox = self._mailbox = _Mailbox(self._loop)
             end = self._end = asyncio.Event()
+            mailbox = self._mailbox = _Mailbox(self._loop)  # last: it runs from now on
             ready.set()
             await end.wait()
             mailbox.close()
 
         # a daemon, so that a program that is killed does not wait for it
         self._thread = threading.Thread(
-            target=asyncio.run, args=(live(),), name=self._name, daemon=True
+            target=lambda: asyncio.run(live()), name=self._name, daemon=True
         )
         self._thread.start()
         if not ready.wait(CALL_TIMEOUT):
@@ -245,7 +256,9 @@ class LoopThread:
             )
 
     def stop(self) -> None:
-        """End it. Harmless when done twice."""
+        """End it. Harmless when done twice, and in a fork, which has no such thread."""
+        if self._forked:
+            return
         thread, self._thread = self._thread, None
         if thread is not None and self._mailbox is not None and self._end is not None:
             self._mailbox.post(self._end.set)
@@ -254,17 +267,17 @@ class LoopThread:
 
     @property
     def running(self) -> bool:
-        """Whether it runs, in this process."""
-        return self._loop is not None and not self._forked
+        """True while the thread runs in this process."""
+        return self._mailbox is not None and not self._forked
 
     @property
     def inside(self) -> bool:
-        """Whether this is asked in it."""
+        """True if the caller is in the loop's own thread."""
         return self._thread is not None and threading.get_ident() == self._thread.ident
 
     def forked(self) -> None:
-        """Note that this process is a fork of the one that has the thread."""
-        self._forked = True
+        """Note that this process is a fork of the one that has the thread, if there is one."""
+        self._forked = self._thread is not None
 
     def call(
         self, function: Callable[[], Coroutine[Any, Any, T]], timeout: float | None = None
@@ -272,8 +285,8 @@ class LoopThread:
         """Call a function in the thread, and run the coroutine that it returns to its end.
 
         Args:
-            function: it.
-            timeout: seconds; None where it has deadlines of its own.
+            function: function that returns the coroutine.
+            timeout: seconds; None where the coroutine has deadlines of its own.
 
         Raises:
             ConfigurationError: the thread does not run.
@@ -299,18 +312,15 @@ class LoopThread:
             )
         return call.result()
 
-    def wait(self, work: Coroutine[Any, Any, T], timeout: float = CALL_TIMEOUT) -> T:
-        """Run a coroutine in the thread to its end; errors as of :meth:`call`."""
-        try:
-            return self.call(lambda: work, timeout)
-        finally:
-            work.close()  # where it was not begun
-
     def submit(self, work: Coroutine[Any, Any, T]) -> Future[T]:
         """Run a coroutine in the thread, and do not wait; errors as of :meth:`call`."""
-        if self._loop is None:
+        try:
+            self._refuse_fork()
+            if self._loop is None:
+                raise self._not_running()
+        except BaseException:
             work.close()
-            raise ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
+            raise
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def post(self, function: Callable[[], object]) -> None:
@@ -321,13 +331,9 @@ class LoopThread:
 
     def _checked(self) -> _Mailbox:
         """Return the mailbox, or say why nothing can be called."""
-        if self._forked:
-            raise LocalProtocolError(
-                f"{self._name}: this process is a fork of the one that it was made in, and a fork "
-                "has no threads; make it in this process"
-            )
+        self._refuse_fork()
         if self._mailbox is None:
-            raise ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
+            raise self._not_running()
         if self.inside:
             raise LocalProtocolError(
                 f"{self._name}: called in its own thread (by a predicate, an observer or an "
@@ -335,14 +341,12 @@ class LoopThread:
             )
         return self._mailbox
 
+    def _refuse_fork(self) -> None:
+        if self._forked:
+            raise LocalProtocolError(
+                f"{self._name}: this process is a fork of the one that it was made in, and a fork "
+                "has no threads; make it in this process"
+            )
 
-_threads: weakref.WeakSet[LoopThread] = weakref.WeakSet()
-
-
-def _note_fork() -> None:
-    for thread in tuple(_threads):
-        thread.forked()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note_fork)
+    def _not_running(self) -> ConfigurationError:
+        return ConfigurationError(f"the thread {self._name} does not run: not started, or ended")

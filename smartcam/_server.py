@@ -1,4 +1,4 @@
-"""What the servers have in common: emulated cameras, sites, proxies."""
+"""Start and stop servers: what emulated cameras, sites and proxies have in common."""
 
 from __future__ import annotations
 

@@ -1,16 +1,164 @@
-"""What somebody may have meant by a word that is none."""
+"""Suggest the known word that somebody may have meant by an unknown one."""
 
 from __future__ import annotations
 
 import difflib
+import itertools
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
+
+    from pydantic_core import ErrorDetails
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return the end of an error text, with the known word that is closest; empty where none is."""
-    by_lower = {one.lower(): one for one in known}
-    close = difflib.get_close_matches(word.lower(), by_lower, n=1)
-    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
+MAX_WORD_CHARACTERS = 100
+"""Characters of a word, given or known, beyond which nothing close to it is looked for: comparing
+two words takes as many steps as the product of their lengths."""
+
+MAX_KNOWN_WORDS = 10_000
+"""Known words that are compared; a word that a file or a camera says may be one of many more."""
+
+MAX_PARTS = 8
+"""Parts of a word that are compared each for itself; what follows them counts as unexplained."""
+
+MAX_CANDIDATES = 20
+"""Known words, alike by their letters, whose edits are counted."""
+
+LETTERS_PER_EDIT = 3
+"""Letters of a word for each edit that it may be away: a typo in three letters, two in six."""
+
+MIN_PREFIX_LETTERS = 3
+"""Letters of a part that may stand for a longer one which begins with it, as ``int`` does."""
+
+MIN_EXPLAINED_SHARE = 0.6
+"""Share of a word's letters that the parts of a known one have to explain."""
+
+WEIGHT_OF_PARTS = 0.9
+"""Score of a word all of whose parts are in a known one; a word that is one typo away has more."""
+
+PREFIX_SCORE = 0.8
+"""Score of a part that a known one begins with; 1 is the same part."""
+
+MAX_NAMED_WORDS = 30
+"""Known words that an error names where none of them is close."""
+
+
+def did_you_mean(word: str, known: Iterable[str], meant: Mapping[str, str] | None = None) -> str:
+    """Return the end of an error text, with the known word that is closest; empty where none is.
+
+    ``meant``: known words by what others call them, such as ``real32`` for ``float``.
+    """
+    found = (meant or {}).get(word) or closest(word, known)
+    return f"; did you mean {found!r}?" if found else ""
+
+
+def closest(word: str, known: Iterable[str], *, least: float = 0.0) -> str | None:
+    """Return the known word that was probably meant, None where none is close.
+
+    ``least``: score, up to 1, below which a known word is not close.
+
+    A known word is close that is a few edits away, or whose parts explain those of the word:
+    ``timeout`` is a part of ``connect_timeout``. Of several that are as close the first is taken.
+    Words of more than :data:`MAX_WORD_CHARACTERS` are close to none.
+    """
+    if len(word) > MAX_WORD_CHARACTERS:
+        return None
+    short = (one for one in known if len(one) <= MAX_WORD_CHARACTERS)
+    words = dict.fromkeys(itertools.islice(short, MAX_KNOWN_WORDS))
+    scores = _scores_by_parts(word, words)
+    for one, score in _scores_by_edits(word, words).items():
+        scores[one] = max(score, scores.get(one, 0.0))
+    close = (one for one in words if scores.get(one, -1.0) >= least)
+    return max(close, key=scores.__getitem__, default=None)
+
+
+def hint(item: ErrorDetails, known: Iterable[str]) -> str:
+    """Return an end for pydantic's error that names the field or word that was meant; "" for none.
+
+    ``known``: names of the fields, where the error is a field that there is not.
+    """
+    context = item.get("ctx", {})
+    match item["type"]:
+        case "extra_forbidden":
+            names = list(dict.fromkeys(known))
+            said = did_you_mean(str(item["loc"][-1]), names)
+            some = names and len(names) <= MAX_NAMED_WORDS
+            return said or (f"; known are {', '.join(sorted(names))}" if some else "")
+        case "union_tag_invalid":
+            return did_you_mean(str(context["tag"]), _quoted(str(context["expected_tags"])))
+        case "literal_error" | "enum":
+            return did_you_mean(str(item.get("input")), _quoted(str(context["expected"])))
+    return ""
+
+
+def _quoted(text: str) -> list[str]:
+    """Return the words that stand between quotes."""
+    return re.findall(r"'([^']*)'", text)
+
+
+# ---------------------------------------------------------------------- scores
+
+
+def _scores_by_edits(word: str, known: Iterable[str]) -> dict[str, float]:
+    """Return the known words that a few edits make of a word, with their scores."""
+    by_fold: dict[str, str] = {}
+    for one in known:
+        by_fold.setdefault(one.lower(), one)
+    folded, scores = word.lower(), {}
+    for one in difflib.get_close_matches(folded, by_fold, n=MAX_CANDIDATES):
+        score = _likeness(folded, one)
+        if score:
+            scores[by_fold[one]] = score
+    return scores
+
+
+def _scores_by_parts(word: str, known: Iterable[str]) -> dict[str, float]:
+    """Return the known words whose parts explain those of a word, with their scores."""
+    parts = _parts(word)
+    of_known = {one: _parts(one)[:MAX_PARTS] for one in known}
+    every = dict.fromkeys(itertools.chain.from_iterable(of_known.values()))
+    near = [(len(part), _near(part, every)) for part in parts[:MAX_PARTS]]
+    letters = sum(map(len, parts)) or 1
+    scores = {}
+    for one, own in of_known.items():
+        explained = sum(n * max((like.get(p, 0.0) for p in own), default=0.0) for n, like in near)
+        if explained >= MIN_EXPLAINED_SHARE * letters:
+            scores[one] = WEIGHT_OF_PARTS * explained / letters
+    return scores
+
+
+def _parts(word: str) -> list[str]:
+    """Return the parts of a word in small letters: ``maxQueue_bytes`` has three."""
+    spaced = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", word)
+    return [part.lower() for part in re.split(r"[\W_]+", spaced) if part]
+
+
+def _near(part: str, every: Iterable[str]) -> dict[str, float]:
+    """Return the parts that are one part, begin with it, or are a few edits away, with scores."""
+    near = {one: _likeness(part, one) for one in difflib.get_close_matches(part, every, n=10)}
+    if len(part) >= MIN_PREFIX_LETTERS:
+        begun = (one for one in every if one.startswith(part))
+        near |= {one: max(PREFIX_SCORE, near.get(one, 0.0)) for one in begun}
+    return near
+
+
+def _likeness(one: str, other: str) -> float:
+    """Return 1 for equal words, less for each edit between them, 0 where those are too many."""
+    edits, longest = _edits(one, other), max(len(one), len(other))
+    return 0.0 if edits * LETTERS_PER_EDIT > longest else 1.0 - edits / longest
+
+
+def _edits(one: str, other: str) -> int:
+    """Return the number of letters to put in, take out, change or swap that make two equal."""
+    before: list[int] = []
+    row: list[int] = [*range(len(other) + 1)]
+    for i, letter in enumerate(one, 1):
+        last, before, row = before, row, [i]
+        for j, wanted in enumerate(other, 1):
+            cost = min(row[-1] + 1, before[j] + 1, before[j - 1] + (letter != wanted))
+            if i > 1 < j and (letter, one[i - 2]) == (other[j - 2], wanted):
+                cost = min(cost, last[j - 2] + 1)
+            row.append(cost)
+    return row[-1]

@@ -25,7 +25,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from smartcam.exceptions import ConfigurationError, ConnectFailedError, MissingExtraError
+from smartcam._extras import load
+from smartcam._forks import tell_of_forks
+from smartcam._user_code import ENDS_PROGRAM
+from smartcam.exceptions import (
+    ConfigurationError,
+    ConnectFailedError,
+    LocalProtocolError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -44,81 +51,107 @@ wait for itself until the link is given up. Its inner tasks have two of their ow
 publisher is closed, the binding waits for such a task and lets no thread of Python run meanwhile,
 also not the one that is to call back. The variable ZENOH_RUNTIME goes before it."""
 
-LEASE = 5.0
-"""Seconds until an end counts as gone that gives no sign of life; one that is killed is at once."""
+LEASE_TIME = 5.0
+"""Seconds without a sign of life after which an end counts as gone; a killed one goes at once."""
 
-MOST_PATIENCE = 120.0
+MAX_LISTING_TIME = 120.0
 """Seconds after which the engine ends the answer to who is there as if it was whole, however long
 who asks would wait. By itself it takes 10; thousands of presences on a busy machine take longer."""
 
 PORTS = range(20_000, 32_000)
-"""Those for port 0, below what systems give to who asks for any: between the look at one and the
-engine's listening no connection of another program takes it."""
+"""The ports tried for port 0, below the range from which systems give ports to connections.
+
+No connection of another program takes such a port after it was found free and before the engine
+listens there.
+"""
 
 INTERNET = (socket.AF_INET, socket.AF_INET6)
 
-MOST_WAITING = 1 << 26
-"""Bytes that wait for the event loop, or for the thread that says what is long; what comes beyond
-is dropped, and results are asked for again later."""
+MAX_WAITING_BYTES = 1 << 26
+"""Bytes that wait for the event loop, as many of patient things, or for the thread that says what
+is long; what comes beyond is dropped, and results are asked for again later."""
+
+QUERY_BYTES = 256
+"""Bytes that a query counts beside its payload."""
 
 REPLIERS = 4
-"""Threads that answer queries: who asks and does not read holds up one of them."""
+"""Threads that answer queries; a client that does not read its answer blocks one of them."""
 
-MOST_REPLYING = 4096
-"""Queries whose answers wait for these threads; one beyond gets none."""
+MAX_WAITING_QUERIES = 4096
+"""Queries that may wait for an answering thread; further ones get no answer."""
 
 TURN = 64
-"""Callbacks in one turn of the event loop."""
+"""Callbacks that run in one turn of the event loop."""
+
+PATIENT_TURN = 8
+"""Patient callbacks that run behind the others in one turn of the event loop.
+
+A flood of patient callbacks delays other work by the time of these few only.
+"""
 
 CLOSE_TIMEOUT = 5.0
+
+PEER_ENDPOINT = "tcp/127.0.0.1:0"
+"""Endpoint by which peers on this host have links of their own to a peer."""
+
+ROUTER_TIMEOUT = 3.0
+"""Seconds that a peer waits for a router before it goes on without one."""
 
 NOT_ZENOH = "nothing there speaks Zenoh"
 
 DECLARED_AT_ONCE = 32
-"""Things declared in one turn of the event loop, where there are many."""
+"""Declarations made in one turn of the event loop at most."""
 
 _ONE = (1).to_bytes(8, sys.byteorder)
 
 
 @dataclass(frozen=True)
 class BusLink:
-    """How an end comes to the bus.
+    """The endpoints by which an end comes to the bus.
 
     Attributes:
         listen: endpoints to listen on, such as ``tcp/127.0.0.1:7447``.
         connect: endpoints to connect to; with several, whichever answers.
         certificates: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``, for TLS.
+        peer: whether an end that only connects goes on without the routers at ``connect``, as the
+            nodes of rmw_zenoh do, by links of its own to the ends on this host that it has met.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     certificates: str | None = None
+    peer: bool = False
+
+    @property
+    def mode(self) -> str:
+        """The end's mode at the engine; one that only connects is a router's client, or a peer."""
+        return "router" if self.listen else "peer" if self.peer else "client"
 
     @property
     def place(self) -> str:
-        """Return where it is, for texts."""
+        """Return the endpoints of the link as a text, those that it listens on before others."""
         return ", ".join(self.listen or self.connect)
 
     def settings(self, timeout: float) -> dict[str, Any]:
         """Return the engine's settings by their paths."""
         found: dict[str, Any] = {
-            # who connects only is a client of a router, which whoever listens is
-            "mode": "router" if self.listen else "client",
-            "listen/endpoints": list(self.listen),
+            "mode": self.mode,
+            "listen/endpoints": [PEER_ENDPOINT] if self.mode == "peer" else list(self.listen),
             "connect/endpoints": list(self.connect),
-            "connect/timeout_ms": 0,  # one try; later ones are made without end
+            # one try; later ones are made without end, by a peer only where the first has no end
+            "connect/timeout_ms": -1 if self.mode == "peer" else 0,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000},
-            "connect/exit_on_failure": not self.listen,
+            "connect/exit_on_failure": self.mode == "client",
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "scouting/delay": 0,
             "transport/shared_memory/enabled": False,
-            "transport/link/tx/lease": int(1e3 * LEASE),
+            "transport/link/tx/lease": int(1e3 * LEASE_TIME),
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
-            "routing/interests/timeout": int(1e3 * MOST_PATIENCE),
+            "routing/interests/timeout": int(1e3 * MAX_LISTING_TIME),
             # of each later try, too: of one that began while a cable was cut the system repeats
             # the packets ever more seldom, so who stays with it for long is back that much later
-            "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE))),
+            "transport/unicast/open_timeout": max(1, int(1e3 * min(timeout, LEASE_TIME))),
         }
         for queue in ("control", "data", "interactive_high", "data_low"):
             found[f"transport/link/tx/queue/size/{queue}"] = 16
@@ -195,24 +228,32 @@ def engine() -> Any:
         MissingExtraError: it is not installed.
     """
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
-    try:
-        import zenoh
-    except ImportError as exc:
-        raise MissingExtraError(
-            'a fleet over the network needs Zenoh, which is not installed: pip install "'
-            'smartcam[fleet]"',
-            extra="fleet",
-        ) from exc
-    return zenoh
+    return load("zenoh")
+
+
+class _EngineUse:
+    """A record that this process has had a session, so that the engine's threads run in it."""
+
+    def __init__(self) -> None:
+        self.begun: bool = False
+        self.in_a_fork: bool = False
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        """Be without the engine's threads, if there were any."""
+        self.in_a_fork = self.begun
+
+
+_use = _EngineUse()
 
 
 class ZenohSession:
     """A session for one event loop, in which its callbacks run.
 
     Args:
-        link: how it comes there.
+        link: endpoints and certificates that the session uses.
         more: further settings of the engine, by their paths.
-        what: it is called in texts.
+        what: name of the bus in texts.
     """
 
     def __init__(
@@ -227,7 +268,8 @@ class ZenohSession:
         self._declared: dict[ZenohDeclared, None] = {}  # in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
-        self._bytes = 0
+        self._patient = self._waiting.copy()
+        self._bytes = self._patient_bytes = 0
         self._woken = False
         self._bell: _LoopBell | None = None
         self._lock = threading.Lock()
@@ -245,12 +287,20 @@ class ZenohSession:
         Raises:
             ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
             ConfigurationError: the engine refuses a setting.
+            LocalProtocolError: this process is a fork of one that had a session before.
         """
+        if _use.in_a_fork:
+            raise LocalProtocolError(
+                f"{self._what}: this process is a fork of one in which the engine's threads run, "
+                "and it has none of them: start it by another method, such as multiprocessing's "
+                "'spawn', or before the first session"
+            )
+        _use.begun = True
         self._loop = asyncio.get_running_loop()
         await self._open(timeout)
         self._end_lingering()
-        self._waiting.clear()
-        self._bytes, self._woken = 0, False
+        self._forget_waiting()
+        self._woken = False
         self._bell = _LoopBell.on(self._loop, self._drain)
         return self
 
@@ -264,10 +314,25 @@ class ZenohSession:
                         self._session = await self._opened(timeout)
                     except self._zenoh.ZError as exc:
                         # who is silent is given up after a lease: there may be time for another
-                        if loop.time() - begun < 0.9 * min(timeout, LEASE):
-                            raise self._failed(_reason(exc)) from exc
+                        if loop.time() - begun < 0.9 * min(timeout, LEASE_TIME):
+                            raise self._failed(await self._why(exc)) from exc
         except TimeoutError as exc:
             raise self._failed(f"no answer within {timeout:g} s") from exc
+        if self._link.mode == "peer":
+            await self._meet(min(timeout, ROUTER_TIMEOUT))
+
+    async def _meet(self, timeout: float) -> None:
+        """Wait for a router, so that what follows finds who is there; go on without one."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout):
+                while not self._session.info.routers_zid():  # noqa: ASYNC110 - nothing tells of it
+                    await asyncio.sleep(0.02)
+                return
+        logger.warning(
+            "%s ! no router at %s yet: who is to be met there will be when it is there",
+            self._what,
+            self._link.place,
+        )
 
     async def _opened(self, timeout: float) -> Any:
         """Return a session; one that comes after all when nobody waits any more is closed."""
@@ -285,7 +350,7 @@ class ZenohSession:
         try:
             return await asyncio.shield(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(_close_late)
+            opening.add_done_callback(functools.partial(_close_late, self._link.mode != "client"))
             raise
 
     async def reopen(self, timeout: float) -> None:
@@ -304,7 +369,9 @@ class ZenohSession:
         if session is not None:
             self._reopening = True
             old = [one.lose() for one in tuple(self._declared)]
-            closing = self._loop.run_in_executor(None, _lose, session, old, bool(self._link.listen))
+            closing = self._loop.run_in_executor(
+                None, _lose, session, old, self._link.mode != "client"
+            )
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(CLOSE_TIMEOUT):
                     await asyncio.shield(closing)
@@ -319,10 +386,21 @@ class ZenohSession:
 
     def _end_lingering(self) -> None:
         """Look at the connections now, and again before a new one can be cut off for its lease."""
-        self._look = self._loop.call_later(LEASE / 2, self._end_lingering)
+        self._look = self._loop.call_later(LEASE_TIME / 2, self._end_lingering)
         endpoints = (*self._link.listen, *self._link.connect)
         ports = frozenset(int(one.rpartition(":")[2]) for one in endpoints)
         self._loop.run_in_executor(None, _end_lingering, ports)
+
+    async def _why(self, error: Exception) -> str:
+        """Return why nothing was reached; the engine does not tell of names that do not resolve."""
+        reason = _reason(error)
+        for endpoint in self._link.connect if reason == NOT_ZENOH else ():
+            host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+            try:
+                await self._loop.getaddrinfo(host, None)
+            except OSError as exc:
+                return f"the name {host!r} does not resolve: {exc.strerror}"
+        return reason
 
     def _failed(self, why: str) -> ConnectFailedError:
         doing = "listen on" if self._link.listen else "reach"
@@ -335,8 +413,7 @@ class ZenohSession:
         self._reopening = False
         if self._look is not None:
             self._look.cancel()
-        self._waiting.clear()
-        self._bytes = 0
+        self._forget_waiting()
         bell, self._bell = self._bell, None
         if bell is not None:
             bell.close()
@@ -345,7 +422,7 @@ class ZenohSession:
         for one in tuple(self._declared):
             one.close()
         closing = self._loop.run_in_executor(
-            None, _end, session, self._threads(), bool(self._link.listen)
+            None, _end, session, self._threads(), self._link.mode != "client"
         )
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
@@ -358,11 +435,26 @@ class ZenohSession:
 
     # ------------------------------------------------------------------ to the loop
 
+    def _forget_waiting(self) -> None:
+        self._waiting.clear()
+        self._patient.clear()
+        self._bytes = self._patient_bytes = 0
+
     def in_loop(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
         """Have something called in the event loop, in order; for any thread."""
         with self._lock:
             self._waiting.append((call, arguments, size))
             self._bytes += size
+            if self._woken:
+                return
+            self._woken = True
+        self._wake()
+
+    def in_loop_patiently(self, call: Callable[..., None], size: int, *arguments: Any) -> None:
+        """Have something called as :meth:`in_loop` does, but behind all that is not patient."""
+        with self._lock:
+            self._patient.append((call, arguments, size))
+            self._patient_bytes += size
             if self._woken:
                 return
             self._woken = True
@@ -377,7 +469,7 @@ class ZenohSession:
             self._loop.call_soon_threadsafe(self._drain)
 
     def _drain(self) -> None:
-        waiting = self._waiting
+        waiting, patient = self._waiting, self._patient
         for _ in range(TURN):
             try:
                 call, arguments, size = waiting.popleft()
@@ -385,25 +477,37 @@ class ZenohSession:
                 break
             with self._lock:
                 self._bytes -= size
-            try:
-                call(*arguments)
-            except Exception:
-                logger.exception("%s ! what came from the bus was not taken", self._link.place)
+            self._take(call, arguments)
+        if patient:
+            for _ in range(min(PATIENT_TURN, len(patient))):
+                call, arguments, size = patient.popleft()
+                with self._lock:
+                    self._patient_bytes -= size
+                self._take(call, arguments)
         with self._lock:
-            self._woken = bool(waiting)
+            self._woken = bool(waiting or patient)
         if self._woken:
             self._loop.call_soon(self._drain)
 
-    def full(self, size: int) -> bool:
-        """Whether the loop is so far behind that what can be asked for again is dropped."""
-        if self._bytes + size <= MOST_WAITING:
+    def _take(self, call: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        try:
+            call(*arguments)
+        except ENDS_PROGRAM:
+            raise
+        except BaseException:
+            logger.exception("%s ! what came from the bus was not taken", self._link.place)
+
+    def full(self, size: int, *, patient: bool = False) -> bool:
+        """Return True if the loop is so far behind that repeatable messages are dropped."""
+        waiting = self._patient_bytes if patient else self._bytes
+        if waiting + size <= MAX_WAITING_BYTES:
             return False
         if not self._told_dropped:
             self._told_dropped = True
             logger.warning(
                 "%s ! this program does not read: %d bytes wait; more is dropped",
                 self._link.place,
-                self._bytes,
+                waiting,
             )
         return True
 
@@ -427,7 +531,7 @@ class ZenohSession:
         self._in_replier(query, _refuse, query, why)
 
     def _in_replier(self, query: Any, call: Callable[..., None], *arguments: Any) -> None:
-        if self._session is None or self._replying >= MOST_REPLYING:
+        if self._session is None or self._replying >= MAX_WAITING_QUERIES:
             quietly(query.drop)
             return
         if self._repliers is None:
@@ -447,7 +551,7 @@ class ZenohSession:
         return made
 
     def forget(self, one: ZenohDeclared) -> None:
-        """It is closed."""
+        """Remove a closed end from those that the session closes."""
         self._declared.pop(one, None)
 
     @property
@@ -463,7 +567,7 @@ class ZenohSession:
 
     @property
     def opened(self) -> bool:
-        """Whether it is open."""
+        """True while the session is open."""
         return self._session is not None
 
     @property
@@ -520,9 +624,10 @@ class ZenohDeclared:
 
     Args:
         end: the session.
-        by_dropping: it ends with its last reference, and this has the only one: to undeclare an
-            advanced end the binding holds the interpreter while it waits for a thread that may
-            wait for the interpreter; to drop one it gives the interpreter free.
+        by_dropping: True if the end is dropped instead of undeclared, since this object has its
+            only reference. To undeclare an advanced end, the binding holds the interpreter while
+            it waits for a thread that may wait for the interpreter; to drop one, it releases the
+            interpreter.
     """
 
     def __init__(self, end: ZenohSession, *, by_dropping: bool = False) -> None:
@@ -545,7 +650,7 @@ class ZenohDeclared:
         return self
 
     def lose(self) -> Any:
-        """Its session is about to end; return what is to be kept until it has."""
+        """Prepare for the end of the session; return what is to be kept until then."""
         it, self._it = self._it, None
         if self._on_lost is not None:
             self._end.later(self.call, self._on_lost)
@@ -562,7 +667,7 @@ class ZenohDeclared:
             call(*arguments)
 
     def close(self) -> None:
-        """Take it back. Idempotent."""
+        """Take the declaration back; a second call does nothing."""
         if not self._closed:
             self._closed = True
             self._end.forget(self)
@@ -592,7 +697,7 @@ def _refuse(query: Any, why: str) -> None:
 
 
 def _end(session: Any, threads: list[ThreadPoolExecutor], router: bool) -> None:
-    """Say what is to be said yet, then end the session.
+    """Wait for the threads that still send, then end the session.
 
     A router that is closed is never freed: its last reference would wait for an engine's thread,
     and hold the interpreter, which that thread may wait for to tell another session of this process
@@ -625,14 +730,18 @@ def quietly(call: Callable[..., Any], *arguments: Any, **named: Any) -> None:
         logger.debug("the engine: %s, in another thread", exc)
 
 
-def _close_late(opening: asyncio.Future[Any]) -> None:
-    """Close a session that came after nobody wanted it any more."""
+def _close_late(router: bool, opening: asyncio.Future[Any]) -> None:
+    """Close a session that came after nobody wanted it any more.
+
+    The interpreter waits for that at its end: where it ends under a thread that is in the engine,
+    that thread cannot come back to Python, and the engine aborts the process.
+    """
     if not opening.cancelled() and opening.exception() is None:
-        threading.Thread(target=opening.result().close, daemon=True).start()
+        threading.Thread(target=_end, args=(opening.result(), [], router), daemon=False).start()
 
 
 def _reason(error: Exception) -> str:
-    """Return what the engine says without its source's places, or the system's own words."""
+    """Return an error's text without the engine's source lines, or the system's own words."""
     text = str(error).partition(" at /")[0].strip(" .")
     system = re.search(r": ([^:]+) \(os error \d+\)", text)
     if system is not None:

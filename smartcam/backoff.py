@@ -1,12 +1,19 @@
-"""When a lost camera is tried again, as a value."""
+"""The delays between attempts to reach a lost camera again, as a value."""
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Callable, Iterator  # noqa: TC003 - old pydantic looks them up
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from smartcam._arguments import (
+    MAX_SECONDS,
+    check_callable,
+    check_integer,
+    check_number,
+    check_seconds,
+)
 from smartcam.exceptions import (
     CommandRejectedError,
     ConfigurationError,
@@ -20,9 +27,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Backoff"]
 
+MAX_FACTOR = sys.float_info.max
+"""Largest factor between two delays: the longest delay follows the first at once."""
+
 
 def is_transient(error: BaseException) -> bool:
-    """Return whether trying again may help.
+    """Return True if another try may succeed.
 
     What happens to links does pass: nothing listens, no way to the host, a name that does not
     resolve while the name server is away, silence, a peer that breaks the protocol. An error in
@@ -60,16 +70,21 @@ class Backoff:
     transient: Callable[[BaseException], bool] = field(default=is_transient, repr=False)
 
     def __post_init__(self) -> None:
-        checks = {
-            "initial: 0 or more seconds": 0 <= self.initial < math.inf,
-            "factor: 1 or more": 1 <= self.factor < math.inf,
-            "maximum: seconds, not below initial": self.initial <= self.maximum < math.inf,
-            "jitter: 0 to 1": 0 <= self.jitter <= 1,
-            "attempts: 1 or more, or None": self.attempts is None or self.attempts >= 1,
+        who = "Backoff"
+        initial = check_seconds(self.initial, "initial", who)
+        checked: dict[str, object] = {
+            "initial": initial,
+            "factor": check_number(self.factor, "factor", 1, MAX_FACTOR, who),
+            "maximum": check_number(
+                self.maximum, "maximum", initial, MAX_SECONDS, who, unit="seconds"
+            ),
+            "jitter": check_number(self.jitter, "jitter", 0, 1, who),
+            "transient": check_callable(self.transient, "transient", who),
         }
-        wrong = [what for what, fits in checks.items() if not fits]
-        if wrong:
-            raise ConfigurationError(f"Backoff: expected {'; '.join(wrong)}; got {self}")
+        if self.attempts is not None:
+            checked["attempts"] = check_integer(self.attempts, "attempts", 1, who=who)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)  # the plain value, of a class that is frozen
 
     def delays(
         self, *, short_lived: int = 0, chance: random.Random | None = None
@@ -81,6 +96,7 @@ class Backoff:
                 later, or a link that breaks as soon as it is made would be made without a pause.
             chance: where the jitter comes from; seed it for the same delays again.
         """
+        check_integer(short_lived, "short_lived", 0, who="Backoff")
         if chance is None:
             from random import Random  # which takes longer than all of this module
 

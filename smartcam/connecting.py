@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
+from smartcam._extras import from_part
 from smartcam.client import SmartCamera
-from smartcam.settings import CameraSettings, is_fleet
+from smartcam.settings import CameraSettings, is_fleet, is_software
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from typing import Literal, Unpack
 
     from smartcam.camera import Camera
-    from smartcam.interpreters._base import AnySpec, TypedSpec
+    from smartcam.interpreters._inside import AnySpec, TypedSpec
     from smartcam.models import Localization
     from smartcam.observers import Observer
     from smartcam.settings import CameraOptions, OtherOptions
@@ -28,9 +29,9 @@ def connect(
     *,
     model: str | None = None,
     observers: Iterable[Observer] = (),
-    interpret_as: None = None,
+    interpret_as: Literal["localizations"],
     **options: Unpack[OtherOptions],
-) -> Camera[bytes]: ...
+) -> Camera[list[Localization]]: ...
 
 
 @overload
@@ -39,9 +40,9 @@ def connect(
     *,
     model: str | None = None,
     observers: Iterable[Observer] = (),
-    interpret_as: Literal["localizations"],
+    interpret_as: Literal["raw"],
     **options: Unpack[OtherOptions],
-) -> Camera[list[Localization]]: ...
+) -> Camera[bytes]: ...
 
 
 @overload
@@ -89,14 +90,20 @@ def connect(
         url: ``bvs://HOST[:PORT]`` over TCP, ``bvs+udp://HOST[:PORT]`` over UDP, ``?dialect=NAME``
             pins the dialect; or a bare ``HOST[:PORT]``, which is BVS over TCP.
             ``fleet://HOST[:PORT]/CAMERA`` is a camera that an agent shares
-            (:mod:`smartcam.fleet`).
+            (:mod:`smartcam.fleet`). ``software:FILE#CAMERA`` is a plain camera whose pictures
+            are inspected in this process, as a cell file says (:mod:`smartcam.inspection`).
         model: camera model, such as ``"BVS002C"``; picks the protocol of a bare host.
         observers: see frames, events, results and errors:
             :class:`~smartcam.Observer`.
-        **options: ``name``, ``application``, ``interpret_as``, ``calibration``, ``y_down``,
+        **options: ``name``, ``application``, ``application_names``,
+            ``interpret_as``, ``calibration``, ``y_down``,
             ``lenient``, ``connect_timeout``, ``connect_attempts``, ``switch_timeout``,
             ``request_timeout``, ``close_timeout``, ``liveness_timeout``, ``reconnect``,
             ``restore``, ``max_length``: see :class:`~smartcam.settings.CameraSettings`.
+
+    The type of the camera's values is that which ``interpret_as`` names: of ``"localizations"``,
+    ``"raw"``, a class, a function. Without one it is ``Any``, since a URL does not say it: bytes at
+    the wire, and of a camera of a fleet what its agent knows.
 
     With ``calibration`` the value of every result is a list of localizations in the robot's frame,
     as :meth:`~smartcam.models.Calibration.to_robot` returns them: of a trigger, in a stream and for
@@ -105,15 +112,21 @@ def connect(
     No value passes without it. One that is no list of localizations, or that the calibration
     refuses, is an :exc:`~smartcam.InterpretationError` with the cause chained; an
     interpreter whose values never are localizations (raw, record, table, strings50) is a
-    ConfigurationError at once. A mapping from application id takes another calibration for each,
-    and None for those whose values are to stay as they are; an application that it lacks is an
-    error, too.
+    ConfigurationError at once; where a single trigger names such a one, its value stays as it is. A
+    mapping from application id takes another calibration for each, and None for those whose values
+    are to stay as they are; an application that it lacks is an error, too.
 
     Raises:
         ConfigurationError: an address or option cannot work; nothing was tried.
     """
     if is_fleet(url):
-        from smartcam.fleet._opening import fleet_camera
+        with from_part("fleet", "a camera of a fleet needs"):
+            from smartcam.fleet._inside import fleet_camera
 
         return fleet_camera(url, dict(options), observers)
+    if is_software(url):
+        with from_part("inspection", "a software camera needs"):
+            from smartcam.inspection import SoftwareCamera
+
+        return SoftwareCamera(url, dict(options), observers)
     return SmartCamera(CameraSettings.make(url, model, options), observers=observers)

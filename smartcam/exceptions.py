@@ -16,11 +16,14 @@
     ├── CommandRejectedError                   the camera said no; what is active now
     ├── UnsupportedError                       this dialect or device cannot do it
     ├── NotAllowedError (PermissionError)      the role of this program's certificate forbids it
+    ├── ReservationLostError               the camera was not this program's alone all the time
     ├── CameraFaultError                       the camera reports System Error
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
     ├── FrameSourceError (OSError)             a source of pictures: gone, in use, stuck
+    │   ├── FrameFeatureError                  no such feature, or not settable so now
     │   ├── FrameFormatError                   pixels that it has not, or that are none
     │   └── FrameTimeoutError (TimeoutError)   no picture in time
+    ├── InspectionError                        a tool failed: the picture has no verdict
     ├── RecordingError (OSError)               a recording that could not be written, or read
     ├── RosError                               what another ROS node, or we to one, said
     │   ├── RosMessageError                    bytes or fields that are no message of their type
@@ -32,6 +35,7 @@
     │   ├── NotRunningError
     │   ├── CameraBusyError
     │   ├── InputContainerError
+    │   ├── FrameLostError                     a triggered picture that was lost on its way
     │   └── TriggerTimeoutError (TimeoutError)
     ├── ProtocolError
     │   ├── LocalProtocolError                 we asked for what this state forbids
@@ -58,10 +62,13 @@ __all__ = [
     "ConnectionLostError",
     "ConnectionTakenError",
     "FrameError",
+    "FrameFeatureError",
     "FrameFormatError",
+    "FrameLostError",
     "FrameSourceError",
     "FrameTimeoutError",
     "InputContainerError",
+    "InspectionError",
     "InterpretationError",
     "LayoutError",
     "LinkError",
@@ -75,6 +82,7 @@ __all__ = [
     "ProtocolError",
     "RecordingError",
     "RemoteProtocolError",
+    "ReservationLostError",
     "ResponseTimeoutError",
     "RosError",
     "RosMessageError",
@@ -92,10 +100,25 @@ MAX_EXCERPT = 64
 """Bytes of a peer's data that an error text or a log line shows at most."""
 
 
+MAX_TEXT = 10_000
+"""Characters of an error's text: a net under texts that quote what somebody gave, each of which
+shows a part of it only."""
+
+_LEFT_OUT = " ... "
+
+
 def hex_excerpt(data: bytes | bytearray | memoryview) -> str:
     """Return ``data`` as hex, cut after 64 bytes."""
     shown = bytes(data[:MAX_EXCERPT]).hex(" ")
     return f"{shown} ... ({len(data)} bytes)" if len(data) > MAX_EXCERPT else shown
+
+
+def _cut(text: object) -> object:
+    if not isinstance(text, str) or str.__len__(text) <= MAX_TEXT:
+        return text
+    half = MAX_TEXT // 2 - len(_LEFT_OUT) // 2 - 1
+    plain = str.__str__(text)
+    return f"{plain[:half]}{_LEFT_OUT}{plain[-half:]}"
 
 
 class SmartCamError(Exception):
@@ -103,11 +126,16 @@ class SmartCamError(Exception):
 
     Attributes of the subclasses are keyword arguments with defaults, which is what lets
     ``pickle`` rebuild them from the text and then restore the attributes.
+
+    A text has :data:`MAX_TEXT` characters at most; what is longer is cut in its middle.
     """
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*map(_cut, args))
 
 
 class ConfigurationError(SmartCamError, ValueError):
-    """What the user gave (an address, an option, a scenario) cannot work."""
+    """A value from the user (an address, an option, a scenario) that cannot work."""
 
 
 class LayoutError(ConfigurationError):
@@ -153,7 +181,7 @@ class LinkError(SmartCamError, ConnectionError):
 
     Attributes:
         host: address of the camera.
-        port: its port.
+        port: port of the camera.
     """
 
     def __init__(self, message: str, *, host: str = "", port: int = 0) -> None:
@@ -233,14 +261,21 @@ class NotAllowedError(SmartCamError, PermissionError):
     """The role of this program's certificate forbids it; nothing was sent.
 
     Attributes:
-        role: of the certificate, such as ``viewer``.
-        certificate: whose it is, such as ``dashboard``.
+        role: role that the certificate gives, such as ``viewer``.
+        certificate: name in the certificate, such as ``dashboard``.
     """
 
     def __init__(self, message: str, *, role: str = "", certificate: str = "") -> None:
         super().__init__(message)
         self.role = role
         self.certificate = certificate
+
+
+class ReservationLostError(SmartCamError):
+    """A reservation ended before its block, or nobody knows: others may have come between.
+
+    A command that raises it was not done.
+    """
 
 
 class CameraFaultError(SmartCamError):
@@ -269,8 +304,8 @@ class FrameSourceError(SmartCamError, OSError):
     """A source of pictures cannot be opened, is in use, is stuck, or is gone.
 
     Attributes:
-        source: its name.
-        available: what it has instead, in words: formats, devices, controls.
+        source: name of the source.
+        available: formats, devices or controls that the source has instead, as a text.
     """
 
     def __init__(self, message: str, *, source: str = "", available: tuple[str, ...] = ()) -> None:
@@ -283,8 +318,26 @@ class FrameFormatError(FrameSourceError):
     """A source has no such pixels, or bytes are no picture of the format they are said to have."""
 
 
+class FrameFeatureError(FrameSourceError):
+    """A device has no such feature, or it cannot be read or set now, or not to that value."""
+
+
 class FrameTimeoutError(FrameSourceError, TimeoutError):
     """No picture came in time."""
+
+
+class InspectionError(SmartCamError):
+    """A tool of a program failed, so that the picture has no verdict.
+
+    Attributes:
+        application: number of the application.
+        tool: name of the tool in its program.
+    """
+
+    def __init__(self, message: str, *, application: int | None = None, tool: str = "") -> None:
+        super().__init__(message)
+        self.application = application
+        self.tool = tool
 
 
 class RecordingError(SmartCamError, OSError):
@@ -307,7 +360,7 @@ class ServiceCallError(RosError):
     """A call of a ROS service had no reply: nobody serves it, or who does refused or failed.
 
     Attributes:
-        service: its name.
+        service: name of the service.
     """
 
     def __init__(self, message: str, *, service: str = "") -> None:
@@ -341,6 +394,10 @@ class CameraBusyError(TriggerError):
 
 class InputContainerError(TriggerError):
     """Input data and inspections are out of step (Input Container bit)."""
+
+
+class FrameLostError(TriggerError):
+    """The picture that a trigger caused, or may have caused, was lost on its way here."""
 
 
 class TriggerTimeoutError(TriggerError, TimeoutError):

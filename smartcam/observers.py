@@ -1,10 +1,12 @@
-"""What a monitoring tool hooks into: one interface, no dependencies."""
+"""The interface for monitoring tools: one class, no dependencies."""
 
 from __future__ import annotations
 
 import logging
-from asyncio import CancelledError
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._arguments import check_all, wrong_argument
+from smartcam._user_code import ENDS_PROGRAM
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
 __all__ = ["Observer", "TraceEntry"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
+
+_HOOKS = ("on_frame", "on_state", "on_result", "on_error")
 
 
 class TraceEntry(NamedTuple):
@@ -73,9 +77,9 @@ class Observer:
         """See an error.
 
         Args:
-            camera: its name.
+            camera: name of the camera.
             error: a trigger without a result, a container that does not fit its layout, a lost
-                link, a reconnect that failed.
+               link, a reconnect that failed.
             triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
         """
 
@@ -92,7 +96,10 @@ class Observers:
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
-        self._all = tuple(observers)
+        self._all = check_all(observers, "observers", "a list of observers")
+        for one in self._all:
+            if not all(callable(getattr(one, hook, None)) for hook in _HOOKS):
+                raise wrong_argument("observers", "objects of classes of Observer", one)
         self._on_state = self._overriding("on_state")
         self._on_result = self._overriding("on_result")
         self.see_states: bool = bool(self._on_state)
@@ -103,7 +110,7 @@ class Observers:
 
     @property
     def trace(self) -> Callable[[TraceEntry], None] | None:
-        """What is to be called with every frame; None where no observer looks at frames."""
+        """Function to call with every frame; None where no observer looks at frames."""
         hooks = self._overriding("on_frame")
         if not hooks:
             return None
@@ -140,5 +147,7 @@ class Observers:
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
         try:
             hook(*arguments)
-        except (Exception, CancelledError):  # neither is to end the receive task
+        except ENDS_PROGRAM:
+            raise
+        except BaseException:  # it is not to end the receive task
             logger.exception("! an observer failed: %r", hook)

@@ -30,25 +30,25 @@ if TYPE_CHECKING:
 
     from smartcam.camera import Camera
     from smartcam.emulator import Scenario
-    from smartcam.testing._threads import ThreadedCamera, ThreadedFleet
+    from smartcam.testing import ThreadedCamera, ThreadedFleet
 
 T = TypeVar("T")
 
 __all__ = ["camera", "emulated_camera", "emulated_fleet"]
 
 PROTOCOL = "bvs"
-"""What is spoken where nothing else is said."""
+"""The default protocol of the emulated camera."""
 
 TO_CAMERA = frozenset({"protocol", "manual_clock"})
 
 OWN = TO_CAMERA | frozenset({"application", "interpret_as", "connect", "cameras"})
 """Options of the marker that are its own; the others are the emulated camera's."""
 
-FLEET = frozenset({"scenario", "quirks", "dialect", "transport"})
-"""Those that an emulated fleet takes, beside ``cameras``."""
+FLEET_OPTIONS = frozenset({"scenario", "quirks", "dialect", "transport"})
+"""Options of the marker that an emulated fleet takes, beside ``cameras``."""
 
 CAMERAS = 2
-"""Cameras of a fleet where nothing else is said."""
+"""Number of cameras of an emulated fleet by default."""
 
 MARKER = (
     "smartcam(application=None, interpret_as=None, connect={}, cameras=2, protocol='bvs', "
@@ -64,14 +64,14 @@ _CLIENT: pytest.StashKey[Camera] = pytest.StashKey()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Pytest: the options of the suites that judge cameras and clients."""
-    from smartcam.conformance._pytest_options import add_options
+    from smartcam.conformance._inside import add_options
 
     add_options(parser)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Pytest: what was found of clients; what was found of a camera, its judge tells itself."""
-    from smartcam.conformance._pytest_options import terminal_summary
+    from smartcam.conformance._inside import terminal_summary
 
     terminal_summary(terminalreporter)
 
@@ -92,8 +92,8 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
     It lives in a thread with an event loop of its own, so it serves synchronous and asynchronous
     tests, and programs that a test starts. The marker ``smartcam`` says what it is.
     """
-    from smartcam.emulator._makes import emulated_class
-    from smartcam.testing._threads import ThreadedCamera
+    from smartcam.emulator._inside import emulated_class
+    from smartcam.testing import ThreadedCamera
 
     said = _said(request)
     protocol = said.get("protocol", PROTOCOL)
@@ -108,10 +108,10 @@ def emulated_camera(request: pytest.FixtureRequest) -> Iterator[ThreadedCamera]:
 @pytest.fixture
 def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
     """Emulated cameras by name: two, or those of a scenario; otherwise as emulated_camera."""
-    from smartcam.testing._threads import ThreadedFleet
+    from smartcam.testing import ThreadedFleet
 
     said = _said(request)
-    options = {key: value for key, value in said.items() if key in FLEET}
+    options = {key: value for key, value in said.items() if key in FLEET_OPTIONS}
     scenarios = options.pop("scenario", None)
     if scenarios is None:
         application = said.get("application")
@@ -126,7 +126,7 @@ def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
 def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
     """Return a camera of a fleet, with an application that runs where the camera can be so."""
     from smartcam.emulator import Scenario
-    from smartcam.emulator._makes import emulated_class
+    from smartcam.emulator._inside import emulated_class
 
     able = emulated_class(protocol).state_options(application, running=True)
     return Scenario(
@@ -161,7 +161,7 @@ def camera(request: pytest.FixtureRequest, emulated_camera: ThreadedCamera) -> C
 
 
 def _made(make: Callable[[], T]) -> T:
-    """Return what is made; a marker that says what cannot be fails the test by its text."""
+    """Return the object made; a marker with an impossible option fails the test with its text."""
     from smartcam.exceptions import SmartCamError
 
     try:
@@ -195,7 +195,7 @@ def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
 
 def _options(said: dict[str, Any]) -> frozenset[str]:
     """Return the options of the marker that an emulated camera takes."""
-    from smartcam.emulator._makes import emulated_class, options_of
+    from smartcam.emulator._inside import emulated_class, options_of
     from smartcam.exceptions import SmartCamError
 
     try:

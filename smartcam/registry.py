@@ -12,19 +12,21 @@ import logging
 from importlib.metadata import distributions
 from typing import TYPE_CHECKING, NamedTuple
 
+from smartcam._arguments import shown
+from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import PluginError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from importlib.metadata import Distribution, EntryPoint
 
-__all__ = ["FRAMES", "GENERATORS", "INTERPRETERS", "PROTOCOLS"]
+__all__ = ["FRAMES", "GENERATORS", "INTERPRETERS", "OUTLETS", "PROTOCOLS", "TOOLS"]
 
 _log = logging.getLogger(__name__)
 
 
 class PluginInfo(NamedTuple):
-    """Where a plug-in comes from.
+    """The origin of a plug-in.
 
     Attributes:
         name: name it is asked for by.
@@ -67,7 +69,7 @@ class Registry:
         return sorted(infos)
 
     def __contains__(self, name: object) -> bool:
-        """Return whether ``name`` is known, as a name or an alias."""
+        """Return True if ``name`` is known, as a name or an alias."""
         own = (self._builtins, self._aliases, self._registered)
         return any(name in one for one in own) or name in self._entry_points()
 
@@ -80,7 +82,7 @@ class Registry:
         if self._registered.get(name) is plugin:
             return
         if name in self and self.load(name) is not plugin:
-            raise PluginError(f"{self.group}: {name!r} is there already", name=name)
+            raise PluginError(f"{self.group}: {shown(name)} is there already", name=name)
         self._registered[name] = plugin
 
     def load(self, name: str) -> object:
@@ -114,25 +116,29 @@ class Registry:
         if name in self._builtins:
             if points:
                 raise PluginError(
-                    f"{self.group}: the name {name!r} is smartcam's own, "
+                    f"{self.group}: the name {shown(name)} is smartcam's own, "
                     f"but {' and '.join(providers)} also provides it",
                     name=name,
                 )
             module, _, attribute = self._builtins[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
         if not points:
-            known = ", ".join(info.name for info in self.available())
-            raise PluginError(f"{self.group}: {name!r} is unknown; known are {known}", name=name)
+            known = [info.name for info in self.available()]
+            raise PluginError(
+                f"{self.group}: {shown(name)} is unknown; known are {', '.join(known)}"
+                f"{did_you_mean(name, known)}",
+                name=name,
+            )
         if len(points) > 1:
             raise PluginError(
-                f"{self.group}: the name {name!r} is provided by {' and '.join(providers)}",
+                f"{self.group}: the name {shown(name)} is provided by {' and '.join(providers)}",
                 name=name,
             )
         try:
             loaded: object = points[0].load()
         except (Exception, SystemExit) as exc:  # which ends programs, and is not theirs to end
             raise PluginError(
-                f"{self.group}: {name!r} of {providers[0]} failed to load: {exc!r}", name=name
+                f"{self.group}: {shown(name)} of {providers[0]} failed to load: {exc!r}", name=name
             ) from exc
         return loaded
 
@@ -212,6 +218,9 @@ PROTOCOLS = Registry(
     {
         "bvs": "smartcam.protocols._bvs:BVS",
         "insight": "smartcam.protocols._insight.dialect:INSIGHT",
+        "iv3": "smartcam.makes._keyence.iv3:IV3",
+        "pcic": "smartcam.makes._ifm.dialect:PCIC",
+        "sr": "smartcam.makes._keyence.sr:SR",
     },
 )
 
@@ -228,15 +237,34 @@ GENERATORS = Registry(
 FRAMES = Registry(
     "smartcam.frames",
     {
-        "file": "smartcam.frames._video:VideoDriver",
-        "fleet": "smartcam.fleet._frame_driver:FleetFrameDriver",
+        "file": "smartcam.frames._video.driver:VideoDriver",
+        "fleet": "smartcam.fleet._frames.driver:FleetFrameDriver",
         "gige": "smartcam.frames._gige.driver:GigEDriver",
-        "http": "smartcam.frames._video:VideoDriver",
+        "http": "smartcam.frames._video.web_camera:WebDriver",
         "insight": "smartcam.frames._insight:InSightDriver",
-        "rtp": "smartcam.frames._rtp.driver:RtpDriver",
-        "rtsp": "smartcam.frames._video:VideoDriver",
+        "mcap": "smartcam.recording._pictures.driver:RecordedDriver",
+        "rtp": "smartcam.frames._streaming.rtp.driver:RtpDriver",
+        "rtsp": "smartcam.frames._streaming.rtsp_client.driver:RtspDriver",
         "synthetic": "smartcam.frames._synthetic:SyntheticDriver",
         "v4l2": "smartcam.frames._v4l2.driver:V4L2Driver",
     },
     aliases={"fleet+tls": "fleet", "https": "http", "rtsps": "rtsp"},
+)
+
+TOOLS = Registry(
+    "smartcam.tools",
+    {
+        "compare": "smartcam.inspection._compare:Compare",
+        "measure": "smartcam.inspection._measure.tool:Measure",
+        "present": "smartcam.inspection._present:Present",
+        "read": "smartcam.inspection._read.tool:ReadTool",
+    },
+)
+
+OUTLETS = Registry(
+    "smartcam.outlets",
+    {
+        "mqtt": "smartcam.outlets._mqtt:MqttOutlet",
+        "sqlite": "smartcam.outlets._store:ResultStore",
+    },
 )

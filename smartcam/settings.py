@@ -1,4 +1,4 @@
-"""What a connection is told: the camera's address and the client's options.
+"""The settings of a connection: the camera's address and the client's options.
 
 A wrong option is a :exc:`~smartcam.ConfigurationError` that names it.
 """
@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypedDict, TypeVar, cast
 from urllib.parse import parse_qsl, quote, unquote, urlencode, urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, InstanceOf, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, InstanceOf, ValidationError
 
-from smartcam._suggestions import did_you_mean
+from smartcam._arguments import check_text, plain, shown
+from smartcam._suggestions import did_you_mean, hint
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, PluginError, UnsupportedError
 from smartcam.registry import PROTOCOLS
@@ -22,33 +23,40 @@ if TYPE_CHECKING:
 
     from pydantic_core import ErrorDetails
 
-    from smartcam.interpreters._base import Spec
+    from smartcam.interpreters import Spec
     from smartcam.models import Calibration
-    from smartcam.protocols._base import Protocol
+    from smartcam.protocols import Protocol
 
 __all__ = ["Address", "CameraOptions", "CameraSettings", "parse_address"]
 
 FLEET_SCHEMES = ("fleet", "fleet+tls")
-"""Of the addresses of cameras that an agent shares."""
+"""URL schemes of cameras that an agent shares."""
 
 M = TypeVar("M", bound=BaseModel)
 
-Seconds = Annotated[float, Field(gt=0, le=86_400, allow_inf_nan=False)]
+PLAIN = BeforeValidator(plain)
+"""Lets a strict type take numbers and texts of any class, such as numpy's."""
+
+Seconds = Annotated[float, Field(strict=True, gt=0, le=86_400, allow_inf_nan=False), PLAIN]
+Integer = Annotated[int, Field(strict=True), PLAIN]
+ApplicationId = Annotated[int, Field(strict=True, ge=0, le=0xFFFFFFFF), PLAIN]
+Text = Annotated[str, Field(strict=True), PLAIN]
+Flag = Annotated[bool, Field(strict=True), PLAIN]
 
 
 class Address(NamedTuple):
-    """Where a camera is and what is known of how it speaks.
+    """The address of a camera, and what is known of its protocol.
 
     Attributes:
         protocol: name of the protocol.
-        scheme: of the URL; it decides the transport.
-        host: name or address.
-        port: its port.
+        scheme: scheme of the URL, which decides the transport.
+        host: name or address of the camera.
+        port: port of the camera.
         dialect: pinned dialect, None to find it out.
         quirks: pinned deviations from the dialect.
         parameters: what else the URL says, as the protocol understands it: names and values. They
             include ``user`` and ``password`` where the protocol has a login.
-        path: what stands behind the host: a camera's name in a fleet.
+        path: part of the URL behind the host: a camera's name in a fleet.
     """
 
     protocol: str
@@ -75,15 +83,25 @@ class Address(NamedTuple):
         return f"{self.scheme}://{place}{path}{'?' if query else ''}{query}"
 
     def __repr__(self) -> str:
-        """Return all of it but the password, which is not for logs."""
+        """Return the address as a text without the password, which is not for logs."""
         shown = tuple((key, "***" if key == PASSWORD else value) for key, value in self.parameters)
         fields = zip(self._fields, self._replace(parameters=shown), strict=True)
         return f"Address({', '.join(f'{name}={value!r}' for name, value in fields)})"
 
 
 def is_fleet(url: str) -> bool:
-    """Return whether a URL is that of a fleet, or of a camera of one."""
-    return url.strip().partition("://")[0].lower() in FLEET_SCHEMES
+    """Return True if a URL is the URL of a fleet, or of a camera in a fleet."""
+    scheme = check_text(url, "url").strip().partition("://")[0]
+    return scheme.lower() in FLEET_SCHEMES
+
+
+SOFTWARE_SCHEME = "software:"
+"""The beginning of addresses of cameras whose pictures are inspected in this process."""
+
+
+def is_software(url: str) -> bool:
+    """Return True if pictures of the camera are inspected in this process."""
+    return check_text(url, "url").strip().lower().startswith(SOFTWARE_SCHEME)
 
 
 def parse_address(url: str, *, model: str | None = None) -> Address:
@@ -96,6 +114,9 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
     Raises:
         ConfigurationError: says which part is wrong and what is accepted.
     """
+    url = check_text(url, "camera address")
+    if model is not None:
+        model = check_text(model, "camera model", least=1, most=200)
     protocol, full = _pick_protocol(url.strip(), model)
     shown = masked(url)
     try:
@@ -127,7 +148,10 @@ def parse_address(url: str, *, model: str | None = None) -> Address:
         if value
     ]
     if surplus:
-        raise ConfigurationError(f"camera address {shown!r} has {surplus[0]}, which means nothing")
+        raise ConfigurationError(
+            f"camera address {shown!r} has {surplus[0]}, which means nothing: expected "
+            f"{parts.scheme}://HOST[:PORT]"
+        )
     said = _query(shown, parts.query, protocol)
     if has_login and parts.username is not None:
         said[USER], said[PASSWORD] = unquote(parts.username), unquote(parts.password or "")
@@ -191,12 +215,17 @@ _PASSWORD_SAID = re.compile(rf"(\b{PASSWORD}=)[^&#]*", re.IGNORECASE)
 
 
 def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
+    if is_software(url):
+        raise UnsupportedError(
+            f"{url} is inspected in this process, by smartcam.connect: this wants a camera on the "
+            "wire; smartcam-emulator --program FILE makes one of it, and prints its address"
+        )
     if "://" in url:
         scheme = url.partition("://")[0].lower()
-        for protocol in _protocols():
+        for protocol in known_protocols():
             if scheme in protocol.schemes:
                 return protocol, url
-        schemes = [one for protocol in _protocols() for one in protocol.schemes]
+        schemes = [one for protocol in known_protocols() for one in protocol.schemes]
         if is_fleet(url):
             own = " or ".join(f"{one}://" for one in schemes)
             raise UnsupportedError(
@@ -211,17 +240,18 @@ def _pick_protocol(url: str, model: str | None) -> tuple[Protocol, str]:
         )
     if model is None:
         return cast("Protocol", PROTOCOLS.load("bvs")), f"bvs://{url}"
-    for protocol in _protocols():
+    for protocol in known_protocols():
         if model.upper() in protocol.models:
             return protocol, f"{next(iter(protocol.schemes))}://{url}"
-    models = [name for protocol in _protocols() for name in protocol.models]
+    models = [name for protocol in known_protocols() for name in protocol.models]
     raise ConfigurationError(
         f"unknown camera model {model!r}; known are {', '.join(models)}"
         f"{did_you_mean(model, models)}"
     )
 
 
-def _protocols() -> Iterator[Protocol]:
+def known_protocols() -> Iterator[Protocol]:
+    """Yield the registered protocols that can be loaded."""
     for info in PROTOCOLS.available():
         try:
             protocol: Any = PROTOCOLS.load(info.name)
@@ -237,7 +267,8 @@ class OtherOptions(TypedDict, total=False):
     """The options that ``connect()`` takes, but for what says how to read results."""
 
     name: str
-    application: int | None
+    application: int | str | None
+    application_names: Mapping[str, int]
     calibration: Calibration | Mapping[int, Calibration | None] | None
     y_down: bool
     lenient: bool
@@ -266,9 +297,16 @@ class CameraSettings(BaseModel):
     )
 
     address: Address = Field(description="where the camera is")
-    name: str = Field("", max_length=200, description="name in logs and results; default HOST:PORT")
-    application: int | None = Field(
+    name: Text = Field(
+        "", max_length=200, description="name in logs and results; default HOST:PORT"
+    )
+    application: Integer | None = Field(
         None, ge=0, le=0xFFFFFFFF, description="application to have running and ready"
+    )
+    application_names: dict[Text, ApplicationId] = Field(
+        {},
+        max_length=1000,
+        description="names of applications and their ids; a name stands wherever an id may",
     )
     interpret_as: Any = Field(None, description="what result containers hold")
     calibration: Any = Field(
@@ -276,27 +314,27 @@ class CameraSettings(BaseModel):
         description="what brings localizations into the robot's frame: one for all applications, "
         "or a mapping from application id to one, or to None to leave its values as they are",
     )
-    y_down: bool = Field(
+    y_down: Flag = Field(
         False, description="the camera's y axis points down; turned to y up on the way in"
     )
-    lenient: bool = Field(False, description="any non-zero byte is a true bool")
+    lenient: Flag = Field(False, description="any non-zero byte is a true bool")
     connect_timeout: Seconds = Field(10.0, description="for a session, all attempts together")
-    connect_attempts: int = Field(3, ge=1, le=100, description="fresh links tried per dialect")
+    connect_attempts: Integer = Field(3, ge=1, le=100, description="fresh links tried per dialect")
     switch_timeout: Seconds = Field(10.0, description="for a switch until the camera is ready")
     request_timeout: Seconds = Field(5.0, description="for the answer to a request")
     close_timeout: Seconds = Field(1.0, description="for an orderly end of the link")
     liveness_timeout: Seconds | None = Field(
-        5.0, description="until a camera that gives no sign of life counts as gone; None: never"
+        5.0, description="for a sign of life of a camera that is asked for one; None: no end"
     )
     reconnect: InstanceOf[Backoff] | None = Field(
         Backoff(), description="when a lost camera is tried again; None: never"
     )
-    restore: bool = Field(
+    restore: Flag = Field(
         False,
         description="after a reconnect have the named application and the run state back that "
         "were wanted; else they are left as the camera has them",
     )
-    max_length: int = Field(
+    max_length: Integer = Field(
         1 << 20, ge=16, le=1 << 30, description="largest payload accepted, bytes"
     )
 
@@ -319,16 +357,52 @@ class CameraSettings(BaseModel):
             ConfigurationError: names the option, what came and what was expected.
         """
         try:
-            settings = cls(address=address, **cast("dict[str, Any]", options))
+            settings = cls(address=address, **with_ids(cast("dict[str, Any]", options)))
         except ValidationError as exc:
             known = [*CameraOptions.__annotations__, *OtherOptions.__annotations__]
             raise ConfigurationError(f"connect: {validation_text(exc, known)}") from exc
         except TypeError as exc:
-            raise ConfigurationError(f"connect: {exc}") from exc
+            raise ConfigurationError(f"connect: {exc!s:.200}") from exc
         if settings.name:
             return settings
         name = address.path or f"{address.host}:{address.port}"
         return settings.model_copy(update={"name": name})
+
+
+def with_ids(options: dict[str, Any]) -> dict[str, Any]:
+    """Return options in which ids stand for the names of applications.
+
+    Raises:
+        ConfigurationError: a name is not known.
+    """
+    names = options.get("application_names")
+    if not isinstance(names, Mapping) or not names:
+        return options
+    found = dict(options)
+    if isinstance(found.get("application"), str):
+        found["application"] = id_of(found["application"], names)
+    for option in ("interpret_as", "calibration"):
+        given: Any = found.get(option)
+        if isinstance(given, Mapping):
+            each: Mapping[Any, Any] = given
+            found[option] = {
+                id_of(key, names) if isinstance(key, str) else key: one for key, one in each.items()
+            }
+    return found
+
+
+def id_of(application: str, names: Mapping[str, int]) -> int:
+    """Return the id of an application's name.
+
+    Raises:
+        ConfigurationError: there is no such name.
+    """
+    if application in names:
+        return names[application]
+    raise ConfigurationError(
+        f"application {shown(application)} is none of {', '.join(names)}"
+        f"{did_you_mean(application, names)}"
+    )
 
 
 def validated(kind: type[M], given: M | Mapping[str, Any], what: str) -> M:
@@ -350,21 +424,11 @@ def validation_text(error: ValidationError, known: Iterable[str] = ()) -> str:
     ``known``: names that may stand at the top, one of which may have been meant.
     """
     return "; ".join(
-        f"{'.'.join(str(part) for part in item['loc']) or 'value'}: {item['msg']}"
-        f"{_meant(item, known)} (got {_shown(item['input'])})"
+        f"{'.'.join(f'{part!s:.80}' for part in item['loc']) or 'value'}: {item['msg']}"
+        f"{_meant(item, known)} (got {shown(item['input'])})"
         for item in error.errors()
     )
 
 
 def _meant(item: ErrorDetails, known: Iterable[str]) -> str:
-    if item["type"] != "extra_forbidden" or len(item["loc"]) != 1:
-        return ""
-    return did_you_mean(str(item["loc"][0]), known)
-
-
-def _shown(value: object) -> str:
-    """Return a value as an error shows it; an integer may have more digits than can be written."""
-    try:
-        return f"{value!r:.80}"
-    except ValueError:
-        return f"{type(value).__name__} that is too long to be shown"
+    return hint(item, known if len(item["loc"]) == 1 else ())

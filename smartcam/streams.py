@@ -11,7 +11,8 @@ import sys
 import weakref
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
-from smartcam.exceptions import ConfigurationError, SmartCamError, SubscriberOverflowError
+from smartcam._arguments import check_choice, check_integer, check_seconds
+from smartcam.exceptions import SmartCamError, SubscriberOverflowError
 from smartcam.models import SubscriberStatistics
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ T = TypeVar("T")
 
 
 class Overflow(enum.Enum):
-    """What happens when a subscriber's queue is full."""
+    """The treatment of a new item when a subscriber's queue is full."""
 
     DROP_OLDEST = "drop_oldest"
     """The oldest item makes room; it is counted."""
@@ -34,21 +35,24 @@ class Overflow(enum.Enum):
     queued."""
 
 
+_OVERFLOWS = [one.value for one in Overflow]
+
+
 def _weightless(_item: object) -> int:
     return 0
 
 
 class Queue(Generic[T]):
-    """What both kinds of subscription are: a bounded queue with an account.
+    """Base of both kinds of subscription: a bounded queue that counts what it drops.
 
     Args:
-        name: what is subscribed to.
-        max_queue: items kept for a slow reader.
-        overflow: what happens beyond that: a value of :class:`Overflow`.
-        min_interval: seconds; an item that comes sooner after the last one kept is dropped.
-        max_queue_bytes: bytes that they may have together. An item that has more alone is kept
-            where no other is: it could never be delivered otherwise.
-        size_of: bytes of an item that is no error.
+        name: name of what is subscribed to.
+        max_queue: number of items kept for a slow reader.
+        overflow: value of :class:`Overflow` that says what happens beyond ``max_queue``.
+        min_interval: seconds after an item was kept in which the next ones are dropped.
+        max_queue_bytes: bytes of all items kept together. An item that has more alone is kept
+            where no other is: otherwise it could never be delivered.
+        size_of: function that returns the bytes of an item that is no error.
 
     Raises:
         ConfigurationError: an argument cannot work.
@@ -64,29 +68,18 @@ class Queue(Generic[T]):
         max_queue_bytes: int = sys.maxsize,
         size_of: Callable[[T], int] = _weightless,
     ) -> None:
-        if max_queue < 1 or not 0 <= min_interval < float("inf"):
-            raise ConfigurationError(
-                f"{name}(): max_queue must be 1 or more (got {max_queue}), "
-                f"min_interval 0 or more seconds (got {min_interval})"
-            )
-        if max_queue_bytes < 1:
-            raise ConfigurationError(
-                f"{name}(): max_queue_bytes must be 1 or more (got {max_queue_bytes})"
-            )
-        try:
-            self._overflow = Overflow(overflow)
-        except ValueError as exc:
-            known = " or ".join(repr(one.value) for one in Overflow)
-            raise ConfigurationError(f"{name}(): overflow is {known}, not {overflow!r}") from exc
+        who = f"{name}()"
         self._name = name
-        self._max_queue = max_queue
-        self._max_queue_bytes = max_queue_bytes
+        self._max_queue = check_integer(max_queue, "max_queue", 1, who=who)
+        self._max_queue_bytes = check_integer(max_queue_bytes, "max_queue_bytes", 1, who=who)
+        self._overflow = Overflow(check_choice(overflow, "overflow", _OVERFLOWS, who))
+        self._min_interval = check_seconds(min_interval, "min_interval", who)
         self._size_of = size_of
-        self._min_interval = min_interval
         self._items: collections.deque[T | SmartCamError] = collections.deque()
         self._ready = asyncio.Event()
         self._ended = False
         self._end_error: SmartCamError | None = None
+        self._kept: object = None
         self._last = float("-inf")
         self._offered = self._taken = self._dropped = 0
         self._errors = 0  # among the items
@@ -100,12 +93,12 @@ class Queue(Generic[T]):
 
     @property
     def ended(self) -> bool:
-        """Whether nothing more will come."""
+        """True once nothing more will come."""
         return self._ended
 
     @property
     def waiting(self) -> bool:
-        """Whether something is there to be taken."""
+        """True if something is there to be taken."""
         return bool(self._items)
 
     def share(self, ready: asyncio.Event) -> None:
@@ -113,6 +106,11 @@ class Queue(Generic[T]):
         self._ready = ready
         if self._items or self._ended:
             ready.set()
+
+    def keep(self, source: object) -> None:
+        """Refer to where the items come from until the end: who has the stream alone needs it."""
+        if not self._ended:
+            self._kept = source
 
     def statistics(self) -> SubscriberStatistics:
         """Return the account as it is now."""
@@ -220,6 +218,7 @@ class Queue(Generic[T]):
         if not self._ended:
             self._ended = True
             self._end_error = error
+            self._kept = None
         self._ready.set()
 
     # ------------------------------------------------------------------ inside
@@ -243,7 +242,7 @@ class Queue(Generic[T]):
         return True
 
     def _exceeded_by(self, size: int) -> bool:
-        """Return whether ``size`` bytes more are too many."""
+        """Return True if ``size`` bytes more are too many for the queue."""
         if self._bytes + size <= self._max_queue_bytes:
             return False
         self._weigh()
@@ -320,7 +319,7 @@ class BatchSubscription(Queue[T]):
         return self
 
     async def __anext__(self) -> list[T]:
-        """Return all items that are there, one at least; those before an error, if one is there.
+        """Return all items that wait, at least one; only those before an error, if there is one.
 
         Raises:
             StopAsyncIteration: closed.
@@ -349,30 +348,37 @@ class BatchSubscription(Queue[T]):
 
 
 class Subscribers(Generic[T]):
-    """The queues that are offered something; one that nobody refers to any more is gone."""
+    """The queues that are offered something; one that nobody refers to any more is gone.
 
-    __slots__ = ("horizon", "references")
+    To subscribe and to leave takes the same work, however many there are.
+    """
+
+    __slots__ = ("_in_order", "horizon", "references")
 
     def __init__(self) -> None:
         # what is offered now is as old as this; who subscribed later is passed over
         self.horizon: float = math.inf
         # empty where nobody is subscribed: looked at for every message
-        self.references: tuple[weakref.ref[Queue[T]], ...] = ()
+        self.references: dict[weakref.ref[Queue[T]], None] = {}
+        # the same to go through while some leave; None where it has to be made anew
+        self._in_order: list[weakref.ref[Queue[T]]] | None = None
 
     def add(self, queue: Queue[T]) -> None:
         """Offer it what comes from now on."""
-        self.references = (*self.references, weakref.ref(queue, self._discard))
+        self.references[weakref.ref(queue, self._discard)] = None
+        self._in_order = None
 
     def _discard(self, reference: weakref.ref[Queue[T]]) -> None:
-        self.references = tuple(one for one in self.references if one is not reference)
+        self.references.pop(reference, None)
+        self._in_order = None
 
     def __bool__(self) -> bool:
         return bool(self.references)
 
     @property
     def any_open(self) -> bool:
-        """Whether something that is offered now would be queued."""
-        for reference in self.references:
+        """True if something that is offered now would be queued."""
+        for reference in self._in_order or self._ordered():
             queue = reference()
             if queue is not None and not queue.ended and queue.since <= self.horizon:
                 return True
@@ -380,13 +386,18 @@ class Subscribers(Generic[T]):
 
     def offer(self, item: T | SmartCamError, now: float, size: int = 0) -> None:
         """Hand an item of ``size`` bytes to each queue."""
-        for reference in self.references:
+        for reference in self._in_order or self._ordered():
             queue = reference()
             if queue is not None and queue.since <= self.horizon:
                 queue.offer(item, now, size)
 
     def __iter__(self) -> Iterator[Queue[T]]:
-        for reference in self.references:
+        for reference in self._in_order or self._ordered():
             queue = reference()
             if queue is not None and queue.since <= self.horizon:
                 yield queue
+
+    def _ordered(self) -> list[weakref.ref[Queue[T]]]:
+        """Return the references, in a list that stays as it is while some leave."""
+        self._in_order = references = list(self.references)
+        return references

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from hypothesis import settings
 
-from tests.timed_loop import TimedLoop
+from tests import loops
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -46,13 +46,17 @@ def pytest_asyncio_loop_factories(
 ) -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
     """Give asynchronous tests a loop on a time of its own, those marked ``real_time`` the usual.
 
-    Those marked ``both_buses`` run on each: with the bus inside the process, and over Zenoh.
+    Those marked ``both_buses`` run on each: with the bus inside the process, and over Zenoh. Those
+    marked ``through_rclpy`` do, too: with a node on paper, and with one of rclpy.
     """
     if item.get_closest_marker("both_buses"):
-        return {"timed": TimedLoop, "real": asyncio.SelectorEventLoop}
+        return {"timed": loops.timed, "real": loops.real}
     if item.get_closest_marker("real_time"):
-        return {"real": asyncio.SelectorEventLoop}
-    return {"timed": TimedLoop}
+        return {"real": loops.real}
+    marker = item.get_closest_marker("through_rclpy")
+    if marker is not None and marker.args != (False,):
+        return {"paper": loops.timed, "rclpy": loops.real}
+    return {"timed": loops.timed}
 
 
 def pytest_configure() -> None:

@@ -39,9 +39,9 @@ THESIS_QUERY = bytes.fromhex("42565350 04000000 30000000")
 THESIS_QUERY_ANSWER = bytes.fromhex("42565350 08000000 30000000 03000000")
 
 
-async def until(condition: Callable[[], object]) -> None:
+async def until(condition: Callable[[], object], seconds: float = PATIENCE) -> None:
     """Let the loop run until ``condition`` holds."""
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(seconds):
         while not condition():  # noqa: ASYNC110 - what is waited for has no event of its own
             await asyncio.sleep(0)
 

@@ -6,11 +6,11 @@ import dataclasses
 from typing import Any
 
 from smartcam.models import Status
+from smartcam.protocols import BVS, FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.machine import TRANSITIONS, Event, Machine, ResultBurst, State
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._framed.machine import TRANSITIONS
+from smartcam.protocols._inside import HANDBOOK, Event, ResultBurst
 
 CODE, NO_ID, BIG_ENDIAN_NUMBER = (
     B16.with_quirks([name]) for name in ("code", "no_id", "big_endian_number")

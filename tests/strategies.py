@@ -14,7 +14,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
 
 
 def message_types(dialect: FramedDialect, sender: m.Sender) -> list[type[m.Message]]:

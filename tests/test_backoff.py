@@ -126,7 +126,7 @@ WRONG: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(("name", "options"), WRONG.items())
 def test_value_that_cannot_work_is_named_and_shown(name: str, options: dict[str, Any]) -> None:
-    with pytest.raises(ConfigurationError, match=rf"Backoff: expected {name}: .*{name}=") as caught:
+    with pytest.raises(ConfigurationError, match=rf"Backoff: {name}: expected ") as caught:
         Backoff(**options)
     assert str(caught.value).count("expected") == 1
 
@@ -136,11 +136,6 @@ def test_value_that_cannot_work_is_named_and_shown(name: str, options: dict[str,
 def test_value_that_is_no_number_is_refused(name: str, value: float) -> None:
     with pytest.raises(ConfigurationError, match=f"{name}: "):
         Backoff(**{name: value})  # type: ignore[arg-type]
-
-
-def test_everything_that_is_wrong_is_told_at_once() -> None:
-    with pytest.raises(ConfigurationError, match=r"factor: 1 or more; jitter: 0 to 1; got"):
-        Backoff(factor=0, jitter=2)
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,10 @@ import pytest
 import smartcam
 from smartcam._dissector import lua_source, lua_tables
 from smartcam.emulator import EmulatedCamera
+from smartcam.protocols import BVS, FramedDialect
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, BVS, HANDBOOK, THESIS
-from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols._bvs import B16, BID, THESIS
+from smartcam.protocols._inside import HANDBOOK
 from smartcam.protocols.messages import Sender
 from tests import ROOT
 from tests.protocols.test_vectors import VECTORS

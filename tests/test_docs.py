@@ -25,12 +25,13 @@ import pytest
 
 from smartcam import exceptions
 from smartcam.camera import Camera
-from smartcam.emulator import Quirks
+from smartcam.emulator import InSightQuirks, Quirks, faults
 from smartcam.models import Status
-from smartcam.protocols._bvs import B16, BID, BVS, CODES, HANDBOOK
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.machine import TRANSITIONS, State
-from smartcam.settings import CameraSettings
+from smartcam.protocols import BVS, FramedDialect, State
+from smartcam.protocols._bvs import B16, BID, CODES
+from smartcam.protocols._framed.machine import TRANSITIONS
+from smartcam.protocols._inside import HANDBOOK
+from smartcam.settings import CameraSettings, known_protocols
 from tests import ROOT
 from tests.processes import MAINS, Process
 
@@ -260,7 +261,7 @@ def test_file_that_a_page_shows_is_run_by_a_command_of_it() -> None:
 
 
 def test_every_page_is_in_the_contents() -> None:
-    pages = {page for page in DOCS.rglob("*.md") if "benchmarks" not in page.parent.name}
+    pages = set(DOCS.rglob("*.md"))
     named = {DOCS / "index.md"}
     for page in pages:
         text = page.read_text(encoding="utf-8")
@@ -303,7 +304,7 @@ def test_troubleshooting_has_every_error() -> None:
 
 
 def test_promises_name_tests_that_are_there() -> None:
-    page = (DOCS / "promises.md").read_text(encoding="utf-8")
+    page = (ROOT / "results" / "promises.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`(tests/[\w/.]*)`", page))
     assert len(named) > 20
     assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
@@ -314,7 +315,8 @@ def test_promises_have_every_wait_with_its_default() -> None:
     table = page.partition("\n(waits)=\n")[2].partition("\nWaiting for one's turn")[0]
     waits = [row for row in rows(table[table.index("\n|") + 1 :]) if len(row) == 3]
     named: set[str] = set()
-    for call, bound, default in waits:
+    calls = [(call, *row) for calls, *row in waits for call in re.findall(r"\w+\([\w=]*\)", calls)]
+    for call, bound, default in calls:
         name = call.partition("(")[0]
         method = inspect.signature(getattr(Camera, name))
         options = re.findall(r"\b(\w*timeout)\b(?!=)", bound)
@@ -331,7 +333,7 @@ def test_promises_have_every_wait_with_its_default() -> None:
         for name, member in vars(Camera).items()
         if inspect.iscoroutinefunction(member) and not name.startswith("_")
     }
-    assert named == waiting | {"application", "next_result"}  # these two are no coroutine functions
+    assert named == waiting | {"application", "next_result", "reserve"}  # no coroutine functions
 
 
 # ---------------------------------------------------------------------- tables
@@ -388,7 +390,9 @@ def test_body_table_has_every_field_at_its_offset(
 
 def test_tables_of_the_dialects_have_all_of_them(tables: dict[str, str]) -> None:
     shown = [(row[0], row[1]) for row in rows(tables["dialects"])]
-    assert shown == [*(("bvs", name) for name in BVS.dialects), ("insight", "native")]
+    known = [(one.name, name) for one in known_protocols() for name in one.dialects]
+    assert sorted(shown) == sorted(known)
+    assert [name for make, name in shown if make == "bvs"] == list(BVS.dialects)
     yes = {row[0] for row in rows(tables["abilities"]) if row[4] == "yes"}
     assert yes == set(BID.capabilities.names)
     assert [int(row[0], 16) for row in rows(tables["result_codes"])] == list(CODES)
@@ -398,6 +402,22 @@ def test_tables_of_the_dialects_have_all_of_them(tables: dict[str, str]) -> None
 def test_quirk_table_has_every_quirk(tables: dict[str, str]) -> None:
     shown = {row[0]: row[3] for row in rows(tables["quirks"])}
     assert shown == {name: field.description for name, field in Quirks.model_fields.items()}
+    assert [row[0] for row in rows(tables["quirks_insight"])] == list(InSightQuirks.model_fields)
+
+
+def test_fault_tables_have_every_fault_with_its_fields(tables: dict[str, str]) -> None:
+    shown = [*rows(tables["faults_wire"]), *rows(tables["faults_device"])]
+    assert [row[0].removesuffix("` *") for row in shown] == list(faults.FAULTS)
+    assert [row for row in shown if not row[1]] == []
+    shared = {row[0] for row in rows(tables["faults_which"])} | {"kind", "when"}
+    for row, made in zip(shown, faults.FAULTS.values(), strict=True):
+        own = set(made.model_fields) - shared
+        assert set(re.findall(r"(?:^|>)`?(\w+)`:", row[2])) == own
+
+
+def test_tables_of_scenarios_say_what_each_field_is(tables: dict[str, str]) -> None:
+    for name in ("application", "scenario", "cue"):
+        assert [row[0] for row in rows(tables[name]) if not row[1]] == []
 
 
 def test_session_diagram_has_every_transition(tables: dict[str, str]) -> None:

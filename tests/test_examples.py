@@ -1,4 +1,4 @@
-"""The examples: the tutorial's package, word by word as in the docs, and the thesis' sorting."""
+"""The examples: the tutorial's package, word by word as in the docs, monitoring, the sorting."""
 
 from __future__ import annotations
 
@@ -62,6 +62,24 @@ def test_interpreter_has_fewer_than_fifteen_lines() -> None:
     lines = [line for line in source.splitlines() if line.strip()]
     assert ast.parse(source)
     assert len(lines) < 15
+
+
+# ---------------------------------------------------------------------- monitoring
+
+
+@pytest.mark.long
+@pytest.mark.real_time
+@pytest.mark.parametrize(
+    ("name", "needs"),
+    [
+        ("spans", "opentelemetry.sdk"),
+        ("outcomes", "prometheus_client"),
+        ("account", "prometheus_client"),
+    ],
+)
+def test_monitoring_example_finds_what_it_looks_for(name: str, needs: str) -> None:
+    pytest.importorskip(needs, reason=f"needs {needs}, of the extra dev")
+    runpy.run_path(str(ROOT / "examples" / "monitoring" / f"{name}.py"), run_name="__main__")
 
 
 # ---------------------------------------------------------------------- sorting

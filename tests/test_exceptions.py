@@ -29,11 +29,14 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
     e.CommandRejectedError: (ROOT,),
     e.UnsupportedError: (ROOT,),
     e.NotAllowedError: (ROOT, PermissionError),
+    e.ReservationLostError: (ROOT,),
     e.CameraFaultError: (ROOT,),
     e.CalibrationError: (ROOT, ValueError),
     e.FrameSourceError: (ROOT, OSError),
     e.FrameFormatError: (e.FrameSourceError,),
+    e.FrameFeatureError: (e.FrameSourceError,),
     e.FrameTimeoutError: (e.FrameSourceError, TimeoutError),
+    e.InspectionError: (ROOT,),
     e.RecordingError: (ROOT, OSError),
     e.RosError: (ROOT,),
     e.RosMessageError: (e.RosError,),
@@ -45,6 +48,7 @@ TREE: dict[type[Exception], tuple[type[Exception], ...]] = {
     e.NotRunningError: (e.TriggerError,),
     e.CameraBusyError: (e.TriggerError,),
     e.InputContainerError: (e.TriggerError,),
+    e.FrameLostError: (e.TriggerError,),
     e.TriggerTimeoutError: (e.TriggerError, TimeoutError),
     e.ProtocolError: (ROOT,),
     e.LocalProtocolError: (e.ProtocolError,),
@@ -75,7 +79,9 @@ ATTRIBUTES: dict[type[Exception], dict[str, Any]] = {
     e.TriggerTimeoutError: {"waited": 5.0},
     e.CalibrationError: {"code": "TOO_FEW", "expected": 3, "got": 2},
     e.FrameSourceError: SOURCE,
+    e.InspectionError: {"application": 7, "tool": "read"},
     e.FrameFormatError: SOURCE,
+    e.FrameFeatureError: SOURCE,
     e.FrameTimeoutError: SOURCE,
     e.RemoteProtocolError: FRAME,
     e.FrameError: FRAME,
@@ -88,7 +94,7 @@ DEFAULTS: dict[str, Any] = {
     "text": "", "position": 0, "name": "", "extra": "", "host": "", "port": 0, "attempts": (),
     "message_id": None, "waited": 0.0, "code": 0, "active_application": None, "offset": 0,
     "data": b"", "field": "", "expected": None, "got": None, "source": "", "available": (),
-    "role": "", "certificate": "",
+    "role": "", "certificate": "", "application": None, "tool": "",
 }  # fmt: skip
 
 SPECIAL: dict[tuple[type[Exception], str], Any] = {
@@ -125,6 +131,18 @@ def test_error_with_a_text_only_has_default_attributes(kind: type[Exception]) ->
     assert str(error) == "what happened"
     for name in ATTRIBUTES.get(kind, {}):
         assert getattr(error, name) == SPECIAL.get((kind, name), DEFAULTS[name])
+
+
+def test_text_of_an_error_has_a_bound() -> None:
+    error = e.ConfigurationError("begin " + "x" * 1_000_000 + " end")
+    text = str(error)
+    assert len(text) <= e.MAX_TEXT
+    assert text.startswith("begin x")
+    assert " ... " in text
+    assert text.endswith("x end")
+    assert str(pickle.loads(pickle.dumps(error))) == text  # noqa: S301 - ours
+    short = "x" * e.MAX_TEXT
+    assert str(e.SmartCamError(short)) == short
 
 
 @each_error

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from smartcam import models
+from smartcam.layout import Layout
 from smartcam.models import (
     ApplicationChanged,
     CameraEvent,
@@ -316,6 +317,10 @@ def test_result_in_a_notebook_is_a_table_of_parts() -> None:
     assert html.endswith("<p>and 2 more</p>")
     x = f"<td>{1e3 * POSE.position.x:.3f}</td>"
     assert x in parts[0]._repr_html_()
+    record = Layout("x: real32 mm, ok: bool").parse(bytes.fromhex("00004841ff"))
+    table = "<tr><th>x [m]</th><th>ok</th></tr><tr><td>0.0125</td><td>True</td></tr>"
+    assert table in record._repr_html_()
+    assert table in Result("c", 7, None, 4, None, AT, None, b"", [record])._repr_html_()
     plain = Result("cell 1", 7, None, 4, None, AT, None, b"", {"a": "<b>"})._repr_html_()
     assert "<td>{&#x27;a&#x27;: &#x27;&lt;b&gt;&#x27;}</td>" in plain
     assert "latency" not in plain

@@ -17,7 +17,7 @@ import pytest
 import smartcam
 import smartcam.sync
 from smartcam import _loop_thread
-from smartcam._client.attempts import Try
+from smartcam._client._inside import Try
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from tests.processes import PATIENCE, Process
 

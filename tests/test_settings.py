@@ -151,7 +151,10 @@ def test_parse_address_bare_host_with_model_is_its_protocols(
     ("url", "text"),
     [
         ("", "'' has no host"),
-        ("bvs://h?dialekt=handbook", "unknown 'dialekt'; known are 'dialect', 'quirks'; did you"),
+        (
+            "bvs://h?dialekt=handbook",
+            "unknown 'dialekt'; known are 'dialect', 'quirks', 'shows_triggers'; did",
+        ),
         ("bsv://h", "did you mean 'bvs'?"),
         ("bvs://h?dialect=hand", "thesis, b16, bid; did you mean 'handbook'?"),
         ("bvs://h?dialect=handbook&dialect=thesis", "names two dialect"),
@@ -359,7 +362,11 @@ def test_settings_are_frozen() -> None:
         ("max_length", (1 << 30) + 1, "less than or equal to 1073741824"),
         ("name", "n" * 201, "at most 200 characters"),
         ("y_down", "down", "valid boolean"),
-        ("colour", "red", "Extra inputs are not permitted (got 'red')"),
+        (
+            "colour",
+            "red",
+            "Extra inputs are not permitted; known are application, application_names, calibration",
+        ),
     ],
 )
 def test_settings_wrong_option_is_named_with_what_came(

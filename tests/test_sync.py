@@ -19,6 +19,7 @@ from typing import Any, assert_type
 import pytest
 
 import smartcam.sync
+from scripts import write_sync
 from smartcam import (
     Camera,
     CameraEvent,
@@ -63,8 +64,18 @@ def camera(emulator: ThreadedCamera) -> Iterator[SyncCamera[Any]]:
 
 
 def faces(kind: type) -> dict[str, Any]:
-    """Return what a class has for its users, by name."""
-    return {name: value for name, value in vars(kind).items() if not name.startswith("_")}
+    """Return what a class and those that it extends have for their users, by name."""
+    return {
+        name: value
+        for one in reversed(kind.mro())
+        for name, value in vars(one).items()
+        if not name.startswith("_")
+    }
+
+
+def test_module_is_what_the_script_writes() -> None:
+    found = write_sync.WRITTEN.read_text(encoding="utf-8")
+    assert found == write_sync.written(), "python -m scripts.write_sync writes it anew"
 
 
 def test_camera_has_everything_that_the_async_one_has() -> None:
@@ -82,8 +93,7 @@ def test_method_takes_what_the_async_one_takes(name: str) -> None:
     assert [*found.parameters] == [*wanted.parameters]
     for parameter, other in zip(found.parameters.values(), wanted.parameters.values(), strict=True):
         assert (parameter.kind, parameter.default) == (other.kind, other.default)
-        if name != "trigger":  # which says in its overloads what it takes
-            assert parameter.annotation == other.annotation
+        assert parameter.annotation == other.annotation
     assert ours.__doc__
 
 

@@ -28,7 +28,10 @@ def reading(reader: Reader) -> tuple[int, str]:
 
 
 def test_camera_knows_the_type_of_its_values() -> None:
-    assert_type(smartcam.connect(URL), Camera[bytes])
+    assert_type(smartcam.connect(URL), Camera[Any])  # a fleet's file may say how to read them
+    assert_type(smartcam.connect("fleet://127.0.0.1/line1/cam3"), Camera[Any])
+    assert_type(smartcam.connect(URL, interpret_as="raw"), Camera[bytes])
+    assert_type(smartcam.connect(URL, interpret_as=None), Camera[Any])
     assert_type(
         smartcam.connect(URL, interpret_as="localizations", name="a"),
         Camera[list[Localization]],

@@ -14,8 +14,8 @@ import pytest
 
 from smartcam._dissector import lua_source
 from smartcam.models import Status
+from smartcam.protocols import FramedDialect
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.dialect import FramedDialect
 from smartcam.protocols.messages import Sender, UnknownMessage, wire_fields
 
 PORT = 36701

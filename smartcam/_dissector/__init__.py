@@ -11,16 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam import __version__
 from smartcam.models import Status
-from smartcam.protocols._base import Transport
-from smartcam.protocols._bvs import BVS, DEFAULT_PORT
-from smartcam.protocols._framed.framing import DEFAULT_MAX_LENGTH
+from smartcam.protocols import BVS, Transport
+from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, DEFAULT_PORT
 from smartcam.protocols.messages import Request, Sender
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from smartcam.protocols._base import CodeMeaning
-    from smartcam.protocols._framed.dialect import FramedDialect, MessageRow, StatusBits
+    from smartcam.protocols import CodeMeaning, FramedDialect, MessageRow, StatusBits
 
 Rows = dict[str, dict[int, dict[str, Any]]]
 """Messages of a dialect: by sender, then by message id."""

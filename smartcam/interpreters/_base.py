@@ -1,4 +1,4 @@
-"""What an interpreter is: a result container's bytes in, a value out.
+"""The base of interpreters: a result container's bytes in, a value out.
 
 An interpreter keeps nothing between results and guesses nothing. The shortest one is a function
 over a :class:`Reader`; one that takes a layout is a subclass of :class:`Interpreter`.
@@ -8,17 +8,18 @@ the only places that call it.
 
 from __future__ import annotations
 
-import difflib
 import functools
 import re
 import struct
 from abc import ABC, abstractmethod
-from asyncio import CancelledError
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn, TypeAlias, TypeVar
 
+from smartcam._arguments import check_flag, shown
+from smartcam._suggestions import closest, did_you_mean
+from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import (
     ConfigurationError,
     InterpretationError,
@@ -27,8 +28,7 @@ from smartcam.exceptions import (
     SmartCamError,
 )
 from smartcam.layout import Layout
-from smartcam.layout._classes import describes_layout, read_class
-from smartcam.layout._text import TYPES
+from smartcam.layout._inside import TYPES, describes_layout, read_class
 from smartcam.registry import INTERPRETERS
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(slots=True)
 class Context:
-    """What an interpreter may know about a container beside its bytes.
+    """The facts that an interpreter may know about a container beside its bytes.
 
     Attributes:
         camera: name of the camera.
@@ -209,7 +209,7 @@ class Interpreter(ABC):
     """Turns a container's bytes into a value; keeps nothing between two of them.
 
     Args:
-        layout: which fields the container holds; without one, :attr:`default_layout`.
+        layout: layout of the container's fields; default :attr:`default_layout`.
 
     Raises:
         ConfigurationError: a layout that this interpreter does not take, or none where it needs
@@ -220,7 +220,7 @@ class Interpreter(ABC):
     """Text of the layout that is used where the user gives none."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
-    """Whether a layout may or must be given."""
+    """Use of a layout: none, one that may be given, or one that must be given."""
 
     def __init__(self, layout: Layout | None = None) -> None:
         name = type(self).__name__.removesuffix("Interpreter").lower()
@@ -298,13 +298,13 @@ Function: TypeAlias = Callable[[Reader], object]
 """The shortest interpreter: a function of a reader; ``reader.layout`` is the user's layout."""
 
 Spec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | type[Any] | Function | None
-"""What ``interpret_as`` takes for one application."""
+"""Values that ``interpret_as`` takes for one application."""
 
 AnySpec: TypeAlias = str | Layout | Interpreter | type[Interpreter] | Mapping[int, Any] | None
-"""Of what ``interpret_as`` takes, that whose values a type checker cannot know."""
+"""The kinds of ``interpret_as`` of which a type checker cannot know the type of the values."""
 
 TypedSpec: TypeAlias = Callable[[Reader], T] | type[T]
-"""Of what ``interpret_as`` takes, that which says what its values are."""
+"""The kinds of ``interpret_as`` that name the type of their values."""
 
 
 class _FunctionInterpreter(Interpreter):
@@ -356,7 +356,9 @@ def run(interpreter: Interpreter, reader: Reader) -> object:
         return interpreter.interpret(reader)
     except InterpretationError:
         raise
-    except (Exception, CancelledError) as exc:
+    except ENDS_PROGRAM:
+        raise
+    except BaseException as exc:
         raise _failed(exc, reader.data) from exc
 
 
@@ -366,7 +368,9 @@ def run_sequence(interpreter: Interpreter, reader: Reader) -> int | None:
         return interpreter.sequence(reader)
     except InterpretationError:
         raise
-    except (Exception, CancelledError) as exc:
+    except ENDS_PROGRAM:
+        raise
+    except BaseException as exc:
         raise _failed(exc, reader.data) from exc
 
 
@@ -384,15 +388,16 @@ def run_plain(interpreter: PlainInterpreter, data: bytes, context: Context) -> o
         return interpreter.read(data, context)
     except InterpretationError:
         raise
-    except (Exception, CancelledError) as exc:
+    except ENDS_PROGRAM:
+        raise
+    except BaseException as exc:
         raise _failed(exc, data) from exc
 
 
 def _failed(exc: BaseException, data: bytes) -> InterpretationError:
     return InterpretationError(
-        f"the interpreter failed with {type(exc).__name__}: {exc} "
-        f"(the container has {len(data)} bytes)",
-        got=repr(exc),
+        f"the interpreter failed with {text_of(exc)} (the container has {len(data)} bytes)",
+        got=text_of(exc),
     )
 
 
@@ -411,6 +416,7 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
         LayoutError: a mistake in the layout text; the position counts from the start of ``spec``.
         ConfigurationError: the interpreter needs a layout, or takes none.
     """
+    lenient = check_flag(lenient, "lenient")
     if spec is None:
         name, layout = "raw", None
     elif isinstance(spec, str):
@@ -421,7 +427,7 @@ def resolve(spec: Spec, *, lenient: bool = False) -> Interpreter:
     elif describes_layout(spec):
         return _ClassInterpreter(spec, lenient=lenient)
     else:
-        return _make(getattr(spec, "__name__", repr(spec)), spec, None, lenient=lenient)
+        return _make(getattr(spec, "__name__", None) or shown(spec), spec, None, lenient=lenient)
     return _make(name, INTERPRETERS.load(name), layout, lenient=lenient)
 
 
@@ -437,11 +443,14 @@ def _split_text(spec: str, *, lenient: bool) -> tuple[str, Layout | None]:
     return "record", Layout(spec, lenient=lenient)
 
 
+SURE_SLIP = 0.8
+"""Score of a group's name, from which it is a slip of an interpreter's name."""
+
 _FIRST_WORD = re.compile(r"\s*([^\W\d]\w*)\s*(:?)")
 
 
 def _is_type(rest: str) -> bool:
-    """Return whether a field's type comes: ``table: int32`` is a field that is named ``table``."""
+    """Return True if a field's type follows: ``table: int32`` is a field named ``table``."""
     word = _FIRST_WORD.match(rest)
     return word is not None and word[1] in TYPES and not word[2]
 
@@ -455,11 +464,12 @@ def _check_name(spec: str, name: str, rest: str) -> None:
     # "localization: (...)*" is a layout text whose group has a name, and surely a slip
     if rest.lstrip().startswith("(") and name != "records":
         known = [info.name for info in INTERPRETERS.available()]
-        close = difflib.get_close_matches(name.lower(), known, n=1, cutoff=0.8)
+        close = closest(name, known, least=SURE_SLIP)
         if close:
             raise PluginError(
-                f"interpreter {name!r} is unknown, did you mean {close[0]!r}? "
-                f"known are {', '.join(known)} (a group may have that name in a Layout({spec!r}))",
+                f"interpreter {shown(name)} is unknown, did you mean {close!r}? "
+                f"known are {', '.join(known)} (a group may have that name in a "
+                f"Layout({shown(spec)}))",
                 name=name,
             )
 
@@ -471,8 +481,12 @@ def _fail_name(spec: str, name: str) -> NoReturn:
         Layout(spec)
     except LayoutError as exc:
         nor = f"; nor is it a layout text: {exc}"
-    known = ", ".join(info.name for info in INTERPRETERS.available())
-    raise PluginError(f"interpreter {name!r} is unknown; known are {known}{nor}", name=name)
+    known = [info.name for info in INTERPRETERS.available()]
+    raise PluginError(
+        f"interpreter {shown(name)} is unknown; known are {', '.join(known)}"
+        f"{did_you_mean(name, known)}{nor}",
+        name=name,
+    )
 
 
 def _make(name: str, loaded: object, layout: Layout | None, *, lenient: bool) -> Interpreter:
@@ -494,6 +508,6 @@ def _make(name: str, loaded: object, layout: Layout | None, *, lenient: bool) ->
     raise PluginError(
         f"interpreter {name}: expected a function of a Reader, a subclass of Interpreter, "
         "or a dataclass, model or NamedTuple whose fields are annotated with their layout, "
-        f"got {loaded!r:.200}",
+        f"got {shown(loaded)}",
         name=name,
     )

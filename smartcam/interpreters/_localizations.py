@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.interpreters._base import PlainInterpreter
-from smartcam.layout._text import UNITS, misfit
+from smartcam.layout._inside import UNITS, misfit
 from smartcam.models import Header, Localization, Pose, Position, Quaternion
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ _QUANTITIES = {
     "z": ("length", "pixels"),
     "theta": ("angle",),
 }
-"""What a unit of a real field may measure."""
+"""Quantities that a unit may measure, by real field."""
 
 _POSE = ("x", "y", "z", "theta")
 
@@ -180,7 +180,7 @@ def _wrong(field: Field, value: float) -> str:
 
 
 class _Use(NamedTuple):
-    """How the fields of a record are used.
+    """The use of each field of a record.
 
     Attributes:
         missing: what stands for those that it has not; goes behind the others.
@@ -199,7 +199,7 @@ class _Use(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def _use_of(layout: tuple[Field, ...]) -> _Use:
-    """Return how the fields of a layout's record are used.
+    """Return the use of each field of a layout's record.
 
     Raises:
         ConfigurationError: a field has a type or a unit that its name cannot have.
@@ -220,14 +220,14 @@ def _use_of(layout: tuple[Field, ...]) -> _Use:
 
 
 class _Scales(NamedTuple):
-    """What turns quality, x, y, theta and z into SI: ``value * multiply / divide``, for each."""
+    """Factors and divisors for SI: ``value * multiply / divide`` for quality, x, y, theta and z."""
 
     multiply: tuple[float, ...]
     divide: tuple[float, ...]
 
 
 def _scales(fields: dict[str, Field]) -> _Scales | None:
-    """Return them, None where the values on the wire are floats in SI already."""
+    """Return the scales, None where the values on the wire are floats in SI already."""
     used = [fields.get(name) for name in ("quality", "x", "y", "theta", "z")]
     units = [UNITS[field.unit] if field and field.unit else None for field in used]
     multiply = tuple(unit.multiply if unit else 1.0 for unit in units)

@@ -20,6 +20,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import check_flag, check_integer, wrong_argument
 from smartcam.exceptions import ConfigurationError, InterpretationError
 from smartcam.layout._classes import read_class
 from smartcam.layout._codec import Payload, Record, RecordCodec, check_names, named, record_class
@@ -58,6 +59,9 @@ class Layout:
     )
 
     def __init__(self, text: str, *, lenient: bool = False, start: int = 0) -> None:
+        if not isinstance(text, str):  # what is wrong in it is told with its place
+            raise wrong_argument("layout", "a text", text)
+        lenient, start = check_flag(lenient, "lenient"), check_integer(start, "start", 0, len(text))
         made = compile_text(text, start, lenient=lenient)
         self._compiled = made  # others find it as long as this one lives
         self._spec = made.spec
@@ -104,7 +108,7 @@ class Layout:
 
     @property
     def lenient(self) -> bool:
-        """Whether any byte but zero is a true bool."""
+        """True if any byte but zero is a true bool."""
         return self._lenient
 
     @property
@@ -119,7 +123,7 @@ class Layout:
 
     @property
     def repeat(self) -> str | int | None:
-        """How often the record stands there.
+        """Number of times that the record stands there.
 
         None: exactly once. ``"*"``: to the end. A number: that often. A name: as often as this
         field of the head says.
@@ -133,7 +137,7 @@ class Layout:
 
     @property
     def is_list(self) -> bool:
-        """Whether :meth:`parse` gives a plain list of records."""
+        """True if :meth:`parse` gives a plain list of records."""
         return self._is_list
 
     @property
@@ -196,8 +200,9 @@ class Layout:
         if self._is_list:
             return values
         names = (*(field.name for field in self.head), self._spec.group_field)
+        units = (*(field.symbol for field in self.head), "")
         front = head.read_one(payload) if self.head else ()
-        result: Record = Record.__new__(record_class(names), (*front, values))
+        result: Record = Record.__new__(record_class(names, units), (*front, values))
         return result
 
     def parse_records(self, payload: Payload, byte_order: ByteOrder = "little") -> list[Record]:
@@ -439,7 +444,7 @@ class Layout:
     def _misfit(
         self, codec: RecordCodec, got: int, start: int, count: int | None
     ) -> InterpretationError:
-        """Say which field is cut, or from where on there is too much.
+        """Return the error for a payload of the wrong length: its cut field or surplus bytes.
 
         ``codec``: of the record (or the head) that does not fit. ``got``: bytes of the payload.
         ``start``: where the first record begins. ``count``: of records that must be there, None for

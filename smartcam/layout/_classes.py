@@ -42,7 +42,7 @@ Make: TypeAlias = Callable[[Any], Any]
 
 
 class ClassLayout(NamedTuple):
-    """What a class says of a container.
+    """The layout of a container that a class describes.
 
     Attributes:
         text: the layout text.
@@ -60,13 +60,13 @@ class _Member(NamedTuple):
 
 
 def describes_layout(kind: object) -> bool:
-    """Return whether ``kind`` is a class whose fields can say a layout, or a list of one."""
+    """Return True if ``kind`` is a class whose fields can describe a layout, or a list of one."""
     return _is_record(kind) or _list_item(kind) is not None
 
 
 @functools.lru_cache(maxsize=128)
 def read_class(kind: Any) -> ClassLayout:
-    """Return what a class, or a list of one, says of a container.
+    """Return the layout that a class, or a list of one, describes.
 
     Raises:
         LayoutError: a field has no layout text, one that is wrong, or one that does not go with
@@ -167,7 +167,7 @@ def _list_item(hint: Any) -> type | None:
 
 
 def _is_record(kind: Any) -> bool:
-    """Return whether ``kind`` is a class whose fields can say a layout."""
+    """Return True if ``kind`` is a class whose fields can describe a layout."""
     if not isinstance(kind, type):
         return False
     is_named_tuple = issubclass(kind, tuple) and hasattr(kind, "_fields")
@@ -179,7 +179,7 @@ def _metadata(hint: Any) -> tuple[Any, ...]:
 
 
 def _is_model(kind: type) -> TypeIs[type[BaseModel]]:
-    """Return whether it is a pydantic model; whoever has one has imported pydantic."""
+    """Return True if a class is a pydantic model; pydantic is not imported to find out."""
     pydantic = sys.modules.get("pydantic")
     return pydantic is not None and issubclass(kind, pydantic.BaseModel)
 
@@ -214,7 +214,7 @@ def _make_list(make: Make) -> Make:
 
 
 def _maker(kind: type, names: list[str], make_list: Make | None) -> Make:
-    """Return what makes an object of ``kind`` from a record; ``make_list``: its last field."""
+    """Return the maker of ``kind`` from a record, whose last field ``make_list`` makes a list."""
     build = _model_maker(kind, names) if _is_model(kind) else _plain_maker(kind, names)
     if make_list is None:
         return build

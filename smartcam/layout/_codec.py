@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     Rows: TypeAlias = Iterator[tuple[Any, ...]]
 
 Payload = bytes | bytearray | memoryview
-"""What a container's data comes as."""
+"""Types in which a container's data may come."""
 
 _BOOLS = {0x00: False, 0xFF: True}
 
@@ -48,6 +48,7 @@ class Record(tuple[Any, ...]):
 
     __slots__ = ()
     _fields: ClassVar[tuple[str, ...]] = ()
+    _units: ClassVar[Mapping[str, str]] = {}  # SI units of the fields that have one
 
     if TYPE_CHECKING:
 
@@ -81,13 +82,19 @@ class Record(tuple[Any, ...]):
         values = ", ".join(f"{name}={value!r}" for name, value in self._asdict().items())
         return f"Record({values})"
 
+    def _repr_html_(self) -> str:
+        from smartcam._html import records_html
+
+        return records_html(self)
+
     def __reduce__(self) -> tuple[Any, ...]:
-        return _make_record, (self._fields, tuple(self))
+        units = tuple(self._units.get(name, "") for name in self._fields)
+        return _make_record, (self._fields, units, tuple(self))
 
 
 @functools.lru_cache(maxsize=256)  # a class per layout; evicting one costs only its making
-def record_class(names: tuple[str, ...]) -> type[Record]:
-    """Return the record class with these field names."""
+def record_class(names: tuple[str, ...], units: tuple[str, ...]) -> type[Record]:
+    """Return the record class with these field names and SI units, "" for none."""
     # getters written in C; the class that brings them must live until they are taken from it
     make: Any = namedtuple  # noqa: PYI024  names known at run time, so no checker can follow
     maker = make("Fields", names)
@@ -101,12 +108,13 @@ def record_class(names: tuple[str, ...]) -> type[Record]:
             "__module__": __name__,
             "__match_args__": names,
             "_fields": names,
+            "_units": {name: unit for name, unit in zip(names, units, strict=True) if unit},
         },
     )
 
 
-def _make_record(names: tuple[str, ...], values: tuple[Any, ...]) -> Record:
-    return Record.__new__(record_class(names), values)
+def _make_record(names: tuple[str, ...], units: tuple[str, ...], values: tuple[Any, ...]) -> Record:
+    return Record.__new__(record_class(names, units), values)
 
 
 class RecordCodec:
@@ -128,7 +136,8 @@ class RecordCodec:
         self.lenient = lenient
         self.offsets: list[int] = _offsets(fields)
         self.make: functools.partial[Any] = functools.partial(
-            Record.__new__, record_class(tuple(field.name for field in fields))
+            Record.__new__,
+            record_class(tuple(f.name for f in fields), tuple(f.symbol for f in fields)),
         )
         order = "<" if byte_order == "little" else ">"
         codes = (f"{field.length or ''}{field.wire.code}" for field in fields)

@@ -1,4 +1,4 @@
-"""What a layout text is worked out to: once for all equal layouts that somebody has."""
+"""Work a layout's text out, once for all equal layouts that are in use."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class CompiledLayout:
-    """What follows from the text alone, and not from a container; never changed.
+    """The parts of a layout that follow from its text alone, not from a container; never changed.
 
     Args:
         spec: what the text says.
@@ -67,12 +67,12 @@ one that it was first made of. So there are two for each at most."""
 
 
 def compile_text(text: str, start: int, *, lenient: bool) -> CompiledLayout:
-    """Return what a layout text is worked out to; keep it, as long as others shall find it.
+    """Return the compiled form of a layout text; keep it in a cache for the next caller.
 
     Args:
         text: the layout text.
-        start: where it begins.
-        lenient: take any byte but zero for a true bool.
+        start: index of the character at which the layout begins.
+        lenient: True if any byte but zero is a true bool.
 
     Raises:
         LayoutError: a mistake in the text, with its position.

@@ -13,7 +13,6 @@ over a list of tokens; every token knows its place, so every mistake can be show
 
 from __future__ import annotations
 
-import difflib
 import keyword
 import math
 import re
@@ -21,6 +20,7 @@ import unicodedata
 from dataclasses import dataclass
 from typing import NamedTuple, NoReturn
 
+from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import InterpretationError, LayoutError
 
 MAX_TEXT = 20_000
@@ -34,11 +34,11 @@ SEQUENCE = "sequence"
 
 
 class WireType(NamedTuple):
-    """How a type stands on the wire.
+    """The form of a type on the wire.
 
     Attributes:
-        code: its letter in ``struct``.
-        numpy: its numpy type without a byte order.
+        code: letter of the type in ``struct``.
+        numpy: numpy type without a byte order.
         size: bytes; 0 for a string, whose length the field says.
         low: smallest value of an integer, None for the rest.
         high: largest value of an integer, None for the rest.
@@ -52,12 +52,12 @@ class WireType(NamedTuple):
 
     @property
     def is_integer(self) -> bool:
-        """Whether it is one of the integers; a bool is none."""
+        """True if the type is one of the integers; a bool is none."""
         return self.low is not None
 
     @property
     def is_number(self) -> bool:
-        """Whether it is an integer or a real."""
+        """True if the type is an integer or a real."""
         return self.is_integer or self.numpy[0] == "f"
 
 
@@ -109,6 +109,9 @@ UNITS: dict[str, Unit] = {
 }
 """Every unit of the language."""
 
+SI_SYMBOLS: dict[str, str] = {"length": "m", "angle": "rad", "time": "s", "pixels": "px"}
+"""The symbols of the SI units that values have, by their quantity; a ratio has none."""
+
 # what people write for a type, where the spelling alone does not lead there
 _MEANT = {
     "float": "real32",
@@ -146,8 +149,13 @@ class Field:
 
     @property
     def wire(self) -> WireType:
-        """How its type stands on the wire."""
+        """Form of the field's type on the wire."""
         return TYPES[self.type]
+
+    @property
+    def symbol(self) -> str:
+        """The symbol of the value's unit; empty where it has none."""
+        return "" if self.unit is None else SI_SYMBOLS.get(UNITS[self.unit].quantity, "")
 
     @property
     def type_text(self) -> str:
@@ -156,7 +164,7 @@ class Field:
 
     @property
     def label(self) -> str:
-        """What an error calls it: ``field 'x' (real32 mm)``."""
+        """Name of the field in errors: ``field 'x' (real32 mm)``."""
         return f"field {self.name!r} ({str(self).partition(': ')[2]})"
 
     def __str__(self) -> str:
@@ -167,7 +175,7 @@ class Field:
 
 
 class LayoutSpec(NamedTuple):
-    """What a layout text says.
+    """The parsed form of a layout text.
 
     Attributes:
         head: fields in front of the group; empty without one.
@@ -183,7 +191,7 @@ class LayoutSpec(NamedTuple):
 
     @property
     def is_list(self) -> bool:
-        """Whether the value is a plain list: a group without a name, nothing else to tell."""
+        """True if the value is a plain list: a group without a name, nothing else to tell."""
         told = (field.sequence or field.name == self.repeat for field in self.head)
         return self.repeat is not None and self.group is None and all(told)
 
@@ -285,7 +293,7 @@ class _Parser:
     # -- rules -------------------------------------------------------------------------------
 
     def _at_group(self) -> bool:
-        """Return whether ``(`` or ``name : (`` comes."""
+        """Return True if the next tokens are ``(`` or ``name : (``."""
         ahead = [token.text for token in self._tokens[self._next : self._next + 3]]
         return ahead[:1] == ["("] or ahead[1:] == [":", "("]
 
@@ -366,7 +374,8 @@ class _Parser:
         token = self._take()
         if token.text not in TYPES:
             self._fail(
-                f"expected a type ({', '.join(TYPES)}), got {token}{_suggest(token.text)}",
+                f"expected a type ({', '.join(TYPES)}), got {token}"
+                f"{did_you_mean(token.text, TYPES, _MEANT)}",
                 token,
             )
         if token.text != "string":
@@ -473,12 +482,6 @@ class _Parser:
         raise LayoutError(
             f"layout: {message} {_show(self._text, at)}", text=self._text, position=at
         )
-
-
-def _suggest(word: str) -> str:
-    meant = _MEANT.get(word)
-    close = [meant] if meant else difflib.get_close_matches(word.lower(), TYPES, n=1)
-    return f"; did you mean {close[0]}?" if close else ""
 
 
 def _show(text: str, position: int) -> str:

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from pathlib import Path
+import os
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from pydantic import BaseModel, ValidationError
 
-from smartcam._suggestions import did_you_mean
+from smartcam._arguments import check_path, shown
+from smartcam._suggestions import did_you_mean, hint
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout._yamls import MAX_YAML_TEXT, BadYamlError, compose, construct
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from pydantic_core import ErrorDetails
 
 M = TypeVar("M", bound=BaseModel)
 
 _SHOWN = 20  # mistakes that are told at once
+
+MAX_FILES_BESIDE = 1000
+"""Files of a folder among which one is looked for whose name was meant."""
 
 
 def read_model(
@@ -32,23 +38,28 @@ def read_model(
     """Read a file.
 
     Args:
-        path: of the file.
-        what: it is, for errors: ``scenario``.
-        kind: its form.
-        such_as: a field of it.
-        mistake: returns the place in it of what cannot work, and why; None where all is well.
+        path: path of the file.
+        what: kind of the file for errors: ``scenario``.
+        kind: model of the file's fields.
+        such_as: name of a field, as an example for errors.
+        mistake: function that returns the place of a value that cannot work, and the reason; None
+            where all is well.
 
     Raises:
         ConfigurationError: the file cannot be read or a field of it is wrong; the text names file,
             line and field.
         MissingExtraError: PyYAML is not installed.
     """
+    path = check_path(path, "path", what)
     named = f"{what} {path}"
     try:
-        with Path(path).open(encoding="utf-8") as stream:
+        with path.open(encoding="utf-8") as stream:
             text = stream.read(MAX_YAML_TEXT + 1)
-    except (OSError, UnicodeDecodeError) as exc:
+    except UnicodeDecodeError as exc:
         raise ConfigurationError(f"{named}: {exc}") from exc
+    except OSError as exc:
+        meant = did_you_mean(path.name, _beside(path)) if isinstance(exc, FileNotFoundError) else ""
+        raise ConfigurationError(f"{named}: {exc.strerror or exc}{meant}") from exc
     try:
         root = compose(text, what=f"a {what} file")
         if root is not None:
@@ -62,10 +73,13 @@ def read_model(
     try:
         model = kind.model_validate(data)
     except ValidationError as exc:
-        findings = [
-            (item["loc"], item["msg"].removeprefix("Value error, ") + _meant(kind, item))
-            for item in exc.errors()
-        ]
+        findings = (
+            (
+                item["loc"],
+                item["msg"].removeprefix("Value error, ") + _got(item) + _meant(kind, item),
+            )
+            for item in exc.errors(include_url=False)
+        )
         raise ConfigurationError(_texts(named, root, findings)) from exc
     found = mistake(model)
     if found is not None:
@@ -73,17 +87,41 @@ def read_model(
     return model
 
 
-def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
-    """Return which field may have been meant by one that there is not; empty for any other item."""
-    if item["type"] != "extra_forbidden":
+def _beside(path: Path) -> list[str]:
+    """Return the names of some files in the folder where a file should be."""
+    try:
+        with os.scandir(path.parent) as entries:
+            return [entry.name for entry in itertools.islice(entries, MAX_FILES_BESIDE)]
+    except OSError:
+        return []
+
+
+def _got(item: ErrorDetails) -> str:
+    """Return an end for pydantic's error that says what came, where its text does not."""
+    if item["type"] in {"missing", "extra_forbidden", "value_error", "union_tag_invalid"}:
         return ""
-    *place, field = item["loc"]
-    schema = kind.model_json_schema()
+    came: object = item["input"]
+    if isinstance(came, dict):
+        return " (got fields)"
+    return " (got a list)" if isinstance(came, list) else f" (got {shown(came)})"
+
+
+def _meant(kind: type[BaseModel], item: ErrorDetails) -> str:
+    """Return a hint at the field or word that was meant."""
+    if item["type"] != "extra_forbidden":
+        return hint(item, ())
+    *place, _ = item["loc"]
+    schema = _schema(kind)
     found = [*_branches(schema, schema)]
     for part in place:
         children = [child for one in found for child in _children(schema, one, part)]
         found = children or found  # pydantic's way has the kinds of a union in it, too
-    return did_you_mean(str(field), {name for one in found for name in one.get("properties", {})})
+    return hint(item, dict.fromkeys(name for one in found for name in one.get("properties", {})))
+
+
+@functools.cache
+def _schema(kind: type[BaseModel]) -> dict[str, Any]:
+    return kind.model_json_schema()
 
 
 def _children(schema: Any, one: Any, part: int | str) -> list[Any]:
@@ -108,7 +146,8 @@ def _branches(schema: Any, node: Any) -> Iterator[Any]:
 
 def _texts(named: str, root: Any, findings: Iterable[tuple[Sequence[int | str], str]]) -> str:
     texts = [
-        ": ".join([f"line {_line(root, place)}", *_field(place), text])
+        # the text of a layout has a mark below it; its first line tells the position
+        ": ".join([f"line {_line(root, place)}", *_field(place), text.partition("\n")[0]])
         for place, text in itertools.islice(findings, _SHOWN)
     ]
     return f"{named}, {'; '.join(texts)}"
@@ -148,6 +187,11 @@ def _refuse_twice(root: Any, named: str) -> None:
             continue
         keys: set[str] = set()
         for key, value in cast("list[tuple[Any, Any]]", node.value):
+            if key.id != "scalar":  # whose text is as long as all that its aliases stand for
+                raise ConfigurationError(
+                    f"{named}, line {key.start_mark.line + 1}: expected a text as a key, got a "
+                    f"{key.id}"
+                )
             if str(key.value) in keys:
                 raise ConfigurationError(
                     f"{named}, line {key.start_mark.line + 1}: {key.value!r} stands there twice"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import functools
-import importlib
 from typing import Any
 
-from smartcam.exceptions import ConfigurationError, MissingExtraError
+from smartcam import _extras
+from smartcam.exceptions import ConfigurationError
 
 MAX_YAML_TEXT = 1 << 23
 """Characters of a YAML document: a container of 1 MiB as hex takes a quarter."""
@@ -15,12 +15,18 @@ MAX_NODES = 500_000
 """Values of a YAML document, each alias and each merged mapping counted with all that it stands
 for: 50,000 applications of a scenario. PyYAML reads this many in about 15 seconds."""
 
+MAX_DEPTH = 50
+"""Values of a YAML document that stand one in the other: ours have ten. PyYAML looks at all open
+brackets for each token, and calls itself for each of them."""
+
 MAX_BITS = 64
-"""Of a number without a point: the largest that a container can hold; Python takes seconds for the
-digits of much larger ones, or refuses."""
+"""Bits of an integer at most: the largest that a container can hold.
+
+Python takes seconds for the digits of much larger ones, or refuses.
+"""
 
 YAML_ALSO_RAISES = (ValueError, LookupError, AttributeError, OverflowError, RecursionError)
-"""What PyYAML lets through beside its own errors, for a tag such as ``!!int`` without a value."""
+"""Exceptions that PyYAML raises beside its own, for a tag such as ``!!int`` without a value."""
 
 
 class BadYamlError(ConfigurationError):
@@ -79,13 +85,7 @@ def construct(root: Any) -> Any:
 
 def yaml_module(what: str) -> Any:
     """Return PyYAML; MissingExtraError: it is not installed."""
-    try:
-        return importlib.import_module("yaml")
-    except ImportError as exc:
-        raise MissingExtraError(
-            f'{what} needs PyYAML, which is not installed: pip install "smartcam[yaml]"',
-            extra="yaml",
-        ) from exc
+    return _extras.load("yaml", f"{what} needs")
 
 
 def _told(exc: Exception) -> BadYamlError:
@@ -131,14 +131,34 @@ def _loader(yaml: Any) -> Any:
     """Return PyYAML's safe loader with bounds."""
 
     class Loader(yaml.SafeLoader):  # type: ignore[misc]
-        nodes = 0
+        nodes = depth = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             self.nodes += 1
             if self.nodes > MAX_NODES:
                 mark = self.peek_event().start_mark
                 raise BadYamlError(f"expected {MAX_NODES} values at most", line=mark.line + 1)
-            return super().compose_node(parent, index)
+            self.depth += 1
+            if self.depth > MAX_DEPTH:
+                raise self.too_deep()
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
+
+        def fetch_flow_collection_start(self, token_class: Any) -> None:
+            if self.flow_level >= MAX_DEPTH:
+                raise self.too_deep()
+            super().fetch_flow_collection_start(token_class)
+
+        def add_indent(self, column: int) -> bool:
+            if len(self.indents) > MAX_DEPTH:
+                raise self.too_deep()
+            added: bool = super().add_indent(column)
+            return added
+
+        def too_deep(self) -> BadYamlError:
+            text = f"nested too deep: expected {MAX_DEPTH} values in each other at most"
+            return BadYamlError(text, line=self.get_mark().line + 1)
 
         def construct_yaml_int(self, node: Any) -> int:
             text = self.construct_scalar(node)

@@ -16,11 +16,10 @@ from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.emulator._bvs.device import Mode
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
+from smartcam.protocols import FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import POLICIES, Policy, Role, Transport
-from smartcam.protocols._bvs import B16, BID, CODES, HANDBOOK, THESIS, ResultCode
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.machine import Machine, State
+from smartcam.protocols._bvs import B16, BID, CODES, THESIS
+from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy, ResultCode
 from tests.fuzz.fuzz_input import Choices
 
 DIALECTS = (HANDBOOK, THESIS, B16, BID, B16.with_quirks(["code"]))

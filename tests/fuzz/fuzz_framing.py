@@ -11,9 +11,9 @@ from collections.abc import Iterator, Sequence
 from unittest import mock
 
 from smartcam.exceptions import FrameError
+from smartcam.protocols import Frame, HeaderLayout, Machine
 from smartcam.protocols._framed import framing
-from smartcam.protocols._framed.framing import Frame, Framer, HeaderLayout
-from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols._inside import Framer
 from tests.fuzz.fuzz_input import Choices
 from tests.machines import DIALECTS
 
@@ -23,12 +23,12 @@ HEADERS = (
     HeaderLayout(magic=b"\x50\x50\x53", code="H", order="id, length", length_includes=7),
 )
 KINDS = (bytes, bytearray, memoryview, None)
-MOST_READ = 128
+MAX_READ = 128
 
 
 def check(data: bytes) -> None:
     """Cut a stream into frames by chunks and compare with what :func:`expected` finds in it."""
-    with mock.patch.multiple(framing, LARGE=32, FIRST_READ=16, MOST_READ=MOST_READ):
+    with mock.patch.multiple(framing, LARGE=32, FIRST_READ=16, MAX_READ_BYTES=MAX_READ):
         check_framer(data)
 
 
@@ -49,7 +49,7 @@ def check_framer(data: bytes) -> None:
         count = len(chunk)
         if kind is None:
             count = write(framer, chunk)
-            assert len(framer.room()) <= max(MOST_READ, header.size + limit)
+            assert len(framer.room()) <= max(MAX_READ, header.size + limit)
         else:
             framer.feed(kind(chunk))
         fed += count

@@ -6,13 +6,13 @@ import functools
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from smartcam.exceptions import MessageError
+from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.framing import Frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ import math
 from datetime import UTC, datetime
 from typing import Any
 
-from smartcam._client.interpretation import Interpretation
+from smartcam._client._inside import Interpretation
 from smartcam.exceptions import InterpretationError
 from smartcam.interpreters import resolve
 from smartcam.models import Localization, jsonable

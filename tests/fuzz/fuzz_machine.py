@@ -21,19 +21,20 @@ from smartcam.exceptions import (
     RemoteProtocolError,
     UnsupportedError,
 )
-from smartcam.protocols import messages as m
-from smartcam.protocols._base import POLICIES, Policy, Role, Transport
-from smartcam.protocols._framed import framing
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Frame
-from smartcam.protocols._framed.machine import (
-    TRANSITIONS,
-    Event,
+from smartcam.protocols import (
+    Frame,
+    FramedDialect,
     LinkEnded,
     LinkFailed,
     Machine,
+    Role,
     State,
+    Transport,
 )
+from smartcam.protocols import messages as m
+from smartcam.protocols._framed import framing
+from smartcam.protocols._framed.machine import TRANSITIONS
+from smartcam.protocols._inside import POLICIES, Event, Policy
 from tests.fuzz.fuzz_framing import write
 from tests.fuzz.fuzz_input import Choices, check_decoding
 from tests.machines import DIALECTS, EXAMPLES, one_by_one

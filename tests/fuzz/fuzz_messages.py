@@ -9,14 +9,14 @@ import json
 from typing import TYPE_CHECKING
 
 from smartcam.models import jsonable
+from smartcam.protocols import Frame
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.constructs import view_fields
-from smartcam.protocols._framed.framing import Frame
+from smartcam.protocols._inside import view_fields
 from tests.fuzz.fuzz_input import Choices, check_decoding
 from tests.machines import DIALECTS
 
 if TYPE_CHECKING:
-    from smartcam.protocols._framed.dialect import FramedDialect
+    from smartcam.protocols import FramedDialect
 
 ANY_ID = 0xFF
 

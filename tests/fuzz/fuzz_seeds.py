@@ -12,9 +12,8 @@ from typing import Any
 from smartcam.emulator._application import BUILTIN_APPLICATIONS, LOCALIZATIONS
 from smartcam.exceptions import LayoutError
 from smartcam.layout import Layout
+from smartcam.protocols import Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import Role, Transport
-from smartcam.protocols._framed.machine import State
 from tests import ROOT
 from tests.fuzz.fuzz_interpreters import SPECS
 from tests.machines import DIALECTS
@@ -139,6 +138,29 @@ def _machine() -> Iterator[bytes]:
     yield bytes((0, 0, 0, 0, 0, 64)) + says[0] + hears + says[5] + hears + says[7] + says[9] + hears
 
 
+MAKES_SAY: tuple[tuple[int, int, bytes], ...] = (
+    (0, 0, b"1002L000000010\r\n1002star\r\n1003L000000020\r\n1003003\t07\t01\t07\r\n"),
+    (0, 0, b"0000L000000010\r\n0000star\r\n1002L000000007\r\n1002!\r\n"),
+    (1, 0, b"1002L000000007\r\n1002*\r\n0001L000000016\r\n0001110001006:\r\n"),
+    (0, 0, b"1002L000000005\r\n1002\r\n"),
+    (2, 1, b"L000000006\r\nstar\r\nL000000012\r\n001\t01\t01\r\n"),
+    (4, 2, b"0000old\r\n1002star\r\n1003001\t01\t01\r\n"),
+    (6, 3, b"star\r\n001\t01\t01\r\n"),
+    (8, 4, b"RT,00001,OK,01,NG,0000095\rPR,007\r"),
+    (8, 4, b"ER,T2,03\rPR,007\rPW\r"),
+    (9, 5, b"OK,NUM,1,0\r4006381333931\rERROR\rOK,BUSYSTAT,NONE\r"),
+    (9, 5, b"ER,LON,20\rER,LOFF,20\r4006381333931\r"),
+)
+"""By the places of dialect and greeting: what a device of another make says."""
+
+
+def _makes() -> Iterator[bytes]:
+    for dialect, greeting, stream in MAKES_SAY:
+        yield bytes((dialect, 3, 0, 1, 2, 3, 1, 4, 2, greeting)) + stream
+        yield bytes((dialect, 2, 0, 3, 5, *range(5), greeting)) + stream
+        yield bytes((dialect, 0, 0, greeting)) + stream
+
+
 def _layout() -> Iterator[bytes]:
     payload = bytes.fromhex("ff 02000000 0000cb42 000050c0 4142430000000000")
     for turn, text in enumerate(layouts()):
@@ -200,6 +222,7 @@ _MAKERS: dict[str, Callable[[], Iterator[bytes]]] = {
     "framing": _framing,
     "messages": _messages,
     "machine": _machine,
+    "makes": _makes,
     "layout": _layout,
     "interpreters": _interpreters,
     "scenario": _scenario,

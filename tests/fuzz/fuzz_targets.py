@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from smartcam.emulator._generators import generator_names
-from smartcam.interpreters._localizations import LocalizationsInterpreter
-from smartcam.layout._text import TYPES, UNITS
-from smartcam.protocols._bvs import B16, BVS, MESSAGES, MessageId
+from smartcam.interpreters._inside import LocalizationsInterpreter
+from smartcam.layout._inside import TYPES, UNITS
+from smartcam.protocols import BVS
+from smartcam.protocols._bvs import B16, MESSAGES
+from smartcam.protocols._inside import MessageId
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -86,6 +88,12 @@ _HEADERS = (
     *(bytes((int(number), 0, 2, 0)) for number in MessageId),
     *(bytes.fromhex(one) for one in ("00000000", "04000000", "08000000", "ffffffff", "0100")),
 )
+_MAKES = _words(
+    *("1000L000000008\r\n1000", "0000L000000008\r\n0000", "L000000005\r\n", "1002", "*\r\n", "!"),
+    *("IFM ELECTRONIC", "110001006:", "003\t07\t01\t07\t12", "smartcam;", "000000000", "?\r\n"),
+    *("RT,00001,OK", ",01,NG,0000095", "PR,007\r", "PW\r", "ER,T2,03\r", "ER,LON,20\r", "ERROR\r"),
+    *("OK,NUM,1,0\r", "OK,BUSYSTAT,NONE\r", "4006381333931\r"),
+)
 _LAYOUT = (
     *_words(*(f"{name}: {name}" for name in TYPES), *TYPES, "string[9]"),
     *(f" {unit}".encode() for unit in UNITS),
@@ -135,7 +143,7 @@ _LAYOUT_FILE = _words(
     *("group: ", "lenient: true\n", "repeat: 3", "repeat: n", "{name: x, type: int32}"),
 )
 _ADDRESS = _words(
-    *(f"{scheme}://" for scheme in (*BVS.schemes, "insight")),
+    *(f"{scheme}://" for scheme in (*BVS.schemes, "insight", "pcic", "iv3", "sr")),
     *("127.0.0.1", "[::1]", "[fe80::1%25eth0]", "localhost", ":36701", "?dialect=", "&", "#", "@"),
     *("&quirks=", *B16.wire_quirks, ",", "me:secret@", "?user=", "&timeout="),
     *(*BVS.dialects, "%5B", "xn--", "ⓑ", "[v1.a]", "/", "\\", "\u3002", "\uff0f", "\u200b"),
@@ -151,6 +159,7 @@ TARGETS = {
         Target("framing", 80, 22, _HEADERS),
         Target("messages", 64, 12, _HEADERS),
         Target("machine", 128, 8, _HEADERS),
+        Target("makes", 160, 6, _MAKES),
         Target("layout", 256, 3, _LAYOUT + _NUMBERS),
         Target("interpreters", 160, 6, _NUMBERS),
         Target("scenario", 1024, 2, _SCENARIO + _LAYOUT + _YAML),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from smartcam.exceptions import ConfigurationError, LayoutError
 from smartcam.interpreters import Interpreter, resolve
 from smartcam.layout import Layout
-from smartcam.protocols._base import Protocol
+from smartcam.protocols import Protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import Address, parse_address
 from tests.fuzz.fuzz_input import Choices, text_of

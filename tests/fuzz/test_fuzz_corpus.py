@@ -16,12 +16,11 @@ import pytest
 import smartcam.layout._compiled as compiled_module
 import smartcam.layout._yaml_files as scenario_module
 from smartcam.emulator import Device
-from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.layout._text import parse_text
-from smartcam.protocols._framed.dialect import FramedDialect
-from smartcam.protocols._framed.framing import Framer
-from smartcam.protocols._framed.machine import Machine
+from smartcam.protocols import FramedDialect, LineMachine, Machine
+from smartcam.protocols._inside import Framer
 from smartcam.settings import Address
 from tests.fuzz.fuzz_seeds import seeds
 from tests.fuzz.fuzz_targets import CORPUS, FINDINGS, KNOWN, TARGETS, Target, describe, known
@@ -141,6 +140,7 @@ MISTAKES: dict[str, tuple[object, str, Any]] = {
     "framing": (Framer, "resync", forget_everything),
     "messages": (FramedDialect, "surplus", lambda *_: 0),
     "machine": (Machine, "_wanted", lambda *_, **__: True),
+    "makes": (LineMachine, "_take", divide_by_zero),
     "layout": (Layout, "sequence", lambda *_: None),
     "interpreters": (LocalizationsInterpreter, "_check_numbers", lambda *_: None),
     "scenario": (scenario_module, "_line", divide_by_zero),

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import ConfigurationError, InterpretationError, WrongApplicationError
 from smartcam.interpreters import Context, Interpreter, PlainInterpreter, Reader, resolve, run
-from smartcam.interpreters._base import plain, run_plain
 from smartcam.interpreters._basic import TableInterpreter
+from smartcam.interpreters._inside import plain, run_plain
 from smartcam.layout import Layout
 from smartcam.models import ByteOrder
 

@@ -15,7 +15,7 @@ from smartcam.interpreters._basic import (
     Strings50Interpreter,
     TableInterpreter,
 )
-from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from smartcam.models import jsonable
 from smartcam.registry import INTERPRETERS

@@ -13,8 +13,8 @@ from pydantic import BaseModel, Field
 import smartcam
 from smartcam import ConfigurationError, InterpretationError, Layout, LayoutError
 from smartcam.emulator import Application, EmulatedCamera
-from smartcam.interpreters import Context, Reader
-from smartcam.interpreters._base import resolve, run, run_plain
+from smartcam.interpreters import Context, Reader, resolve, run
+from smartcam.interpreters._inside import run_plain
 
 
 @dataclass
@@ -152,7 +152,7 @@ class Empty:
 
 MISTAKES = {
     Bare: "class Bare, field 'x': expected a layout text",
-    Misspelt: "did you mean real32? at character 3\n  x: reel32 mm\n     ^",
+    Misspelt: "did you mean 'real32'? at character 3\n  x: reel32 mm\n     ^",
     WrongType: "class WrongType, field 'x': expected the type float for 'real32 mm', got int",
     TwoInOne: "expected the layout text of one field, got 'int8, y: int8'",
     ListFirst: "class ListFirst, field 'parts': expected no list here: a list comes last",

@@ -18,7 +18,7 @@ from smartcam.layout._codec import RecordCodec
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from smartcam.layout._text import Field
+    from smartcam.layout import Field
     from smartcam.models import ByteOrder
 
 TEXT = "n: int32, (x: real32 mm, y: real32 mm)[n]"

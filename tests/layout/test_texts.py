@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import InterpretationError
 from smartcam.layout import Layout
-from smartcam.layout._texts import pack_texts
+from smartcam.layout._inside import pack_texts
 
 
 def pack(layout: str, *texts: str | None) -> bytes:

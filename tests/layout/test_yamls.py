@@ -11,7 +11,7 @@ from smartcam.emulator import EmulatedCamera, load_scenarios
 from smartcam.exceptions import CalibrationError, ConfigurationError
 from smartcam.layout import Layout
 from smartcam.layout import _yamls as yamls
-from smartcam.layout._yamls import BadYamlError, load
+from smartcam.layout._inside import BadYamlError, load
 
 
 def laughs(levels: int) -> str:
@@ -114,7 +114,7 @@ def test_scenario_doubles_are_found_among_many(tmp_path: Path) -> None:
 
 
 def test_emulated_camera_giant_active_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="active: no application has such an id"):
+    with pytest.raises(ConfigurationError, match="emulator: active: expected an integer"):
         EmulatedCamera(active=10**5000)
 
 

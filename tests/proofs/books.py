@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from smartcam import exceptions
 from smartcam.emulator import Application, EmulatedCamera, Run
-from smartcam.emulator._client_link import ClientLink
+from smartcam.emulator._inside import ClientLink
 from smartcam.models import CameraEvent, Connected, Disconnected, Reconnected, Status
 from smartcam.observers import Observer, TraceEntry
 from smartcam.protocols import messages as m
@@ -138,9 +138,15 @@ class BookKeeper(EmulatedCamera):
     """
 
     def __init__(
-        self, applications: Mapping[int, Mapping[str, Any]], *, marked: bool, **options: Any
+        self,
+        applications: Mapping[int, Mapping[str, Any]],
+        *,
+        marked: bool,
+        kept_runs: int = MEMORY,
+        **options: Any,
     ) -> None:
         self.layout = layout_of(marked)
+        self.kept_runs = kept_runs
         self.runs: dict[int, KeptRun] = {}  # the last inspections, by index
         self.triggers = 0
         self.overtriggers = 0  # times it rose with one of these
@@ -213,7 +219,7 @@ class BookKeeper(EmulatedCamera):
     def _values(self, run: Run) -> dict[str, int]:
         self._count += 1
         self.runs[self._count] = KeptRun(self._count, run.time, *self._by)
-        self.runs.pop(self._count - MEMORY, None)
+        self.runs.pop(self._count - self.kept_runs, None)
         return {
             "number": run.number & 0x7FFFFFFF,
             "run": self._count,
@@ -234,9 +240,10 @@ class ClientEar(Observer):
         self.number: int | None = None  # the sequence number that was set last
         # that which was set before the last trigger, :data:`NOBODY` for none
         self.triggered_as = NOBODY
-        # containers of sessions, by run; of the session that is open, ``now``
+        # containers of sessions, by run, where all is kept; of the session that is open, ``now``
         self.got: Counter[int] = Counter()
         self.now: Counter[int] = Counter()
+        self._before = self._in_session = 0  # containers of sessions that ended, and of this one
         self.after = 0  # containers that came when the client had been told to close
         self.closing = False  # it was told to close
         self.at_frame: Callable[[TraceEntry], None] | None = None  # called with each frame
@@ -248,7 +255,7 @@ class ClientEar(Observer):
     @property
     def received(self) -> int:
         """Containers of sessions that came before the client was told to close."""
-        return self.got.total() + (self.now.total() if self._adopted else 0)
+        return self._before + (self._in_session if self._adopted else 0)
 
     def on_frame(self, entry: TraceEntry) -> None:
         if entry.direction == "!":
@@ -257,7 +264,7 @@ class ClientEar(Observer):
         self.frames.append(entry)
         match entry.message:
             case "Connect" if entry.direction == ">" and not self._adopted:
-                self.now = Counter()  # an attempt; in a session it asks for the status
+                self._forget_session()  # an attempt; in a session it asks for the status
             case "SetSequenceNumber":
                 self.number = self._told = entry.fields["number"]
             case "Trigger":
@@ -275,22 +282,32 @@ class ClientEar(Observer):
         if self.closing and self._adopted:
             self.after += 1
         else:
-            self.now[run] += 1
+            self._count(run, 1)
+
+    def _count(self, run: int, more: int) -> None:
+        self._in_session += more
+        if self.frames.maxlen is None:
+            self.now[run] += more
+
+    def _forget_session(self) -> None:
+        self.now, self._in_session = Counter(), 0
 
     def _take_back(self, payload: str) -> None:
         """A frame was refused: a container where there is no session is none."""
         last = self.frames[-1] if self.frames else None
         if last is None or last.message != "ResultContainer" or last.fields is None:
             return
-        if payload and last.hex.endswith(payload):
-            self.now[_run_told(last)] -= 1
+        if payload and payload.endswith(last.fields["data"]):
+            self._count(_run_told(last), -1)
 
     def on_state(self, event: CameraEvent) -> None:
         if isinstance(event, (Connected, Reconnected)):
             self._adopted = True
         elif isinstance(event, Disconnected):
             self.got += self.now
-            self.now, self._adopted = Counter(), self.closing
+            self._before += self._in_session
+            self._forget_session()
+            self._adopted = self.closing
 
 
 def _run_told(entry: TraceEntry) -> int:

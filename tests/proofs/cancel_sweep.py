@@ -25,9 +25,8 @@ from typing import Any, Literal, NamedTuple
 
 import smartcam
 from smartcam import Backoff, Camera, LinkError, ResponseTimeoutError, Status
-from smartcam.emulator import EmulatedCamera
+from smartcam.emulator import EmulatedCamera, Run
 from smartcam.emulator._bvs.device import Mode
-from smartcam.emulator._generators import Run
 from smartcam.protocols import messages as m
 from smartcam.streams import Subscription
 from tests.client.clientkit import balance
@@ -37,7 +36,7 @@ from tests.timed_loop import TimedLoop
 STEP = 0.001
 """Seconds that a step of the loop takes."""
 
-MOST_STEPS = 1500
+MAX_STEPS = 1500
 """Bound of a sweep: the longest call takes about a third of it."""
 
 BOUND = 5.0
@@ -290,6 +289,7 @@ CALLS: dict[str, Call] = {
     "reset_errors": Call(reset, ("reset_errors",), before=dropped, dialects=ID),
     "read_image": asked("read_image", raises=(smartcam.UnsupportedError,)),
     "newest_frame": asked("newest_frame", raises=(smartcam.UnsupportedError,)),
+    "take_back": asked("take_back", raises=(smartcam.UnsupportedError,)),
     "frame_after": asked("frame_after", raises=(smartcam.UnsupportedError,)),
     "get_clock": asked("get_clock"),
     "set_clock": Call(
@@ -390,7 +390,7 @@ def run_sweep(name: str, wire: Wire, every: int = 1) -> Sweep:
     """
     ends: Counter[str] = Counter()
     for steps, checks in itertools.product(
-        range(0, MOST_STEPS, every), (RESULTS_FIRST, STATE_FIRST)
+        range(0, MAX_STEPS, every), (RESULTS_FIRST, STATE_FIRST)
     ):
         try:
             with asyncio.Runner(loop_factory=lambda: TimedLoop(turn=STEP)) as runner:
@@ -402,7 +402,7 @@ def run_sweep(name: str, wire: Wire, every: int = 1) -> Sweep:
         ends[end] += 1
         if end == "over" and checks is STATE_FIRST:
             return Sweep(steps, ends)
-    raise AssertionError(f"{name} over {wire} is not over after {MOST_STEPS} steps")
+    raise AssertionError(f"{name} over {wire} is not over after {MAX_STEPS} steps")
 
 
 async def _cancelled_after(steps: int, call: Call, wire: Wire, checks: Checks) -> str:

@@ -45,6 +45,9 @@ TIMES = {"connect": 3.0, "switch": 1.5, "request": 0.5, "close": 0.3, "liveness"
 ALLOWANCE = 0.1
 """Seconds that a wait may take longer than its timeout beside the loop's own lag."""
 
+KEPT_RUNS = 512
+"""Runs that a camera's books keep: few, so that the books are full before memory is judged."""
+
 RECENT, RECENT_WIDTH = 40, 120
 """Frames that are shown beside a violation, and characters of each."""
 
@@ -91,6 +94,7 @@ class Station:
                 for number, seconds in times.items()
             },
             marked=self.numbered,
+            kept_runs=KEPT_RUNS,
             port=free_port(self.transport),
             transport=self.transport,
             dialect="thesis" if number % 4 == 1 else "handbook",

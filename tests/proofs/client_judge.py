@@ -26,13 +26,12 @@ from smartcam import (
     Status,
     StatusChanged,
 )
-from smartcam.emulator import EmulatedCamera
+from smartcam.emulator import EmulatedCamera, LogEntry, Run
 from smartcam.emulator._bvs.device import Mode
-from smartcam.emulator._generators import Run
-from smartcam.emulator._traffic import Log, LogEntry
+from smartcam.emulator._traffic import Log
 from smartcam.observers import TraceEntry
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import ResultCode
+from smartcam.protocols._inside import ResultCode
 from smartcam.settings import CameraOptions
 from smartcam.streams import Subscription
 from tests.client.clientkit import balance
@@ -154,7 +153,7 @@ class RecordedCamera(CameraModel):
 TAKEN_WITHIN = 10.0
 A_MOMENT = 1e-5
 """Seconds of the loop's time in which nothing happens but what can happen at once."""
-MOST_CALLS = 8
+MAX_CALLS = 8
 
 COMMAND_ERRORS = (smartcam.ResponseTimeoutError, smartcam.CommandRejectedError, *LINK_LOST)
 
@@ -313,7 +312,7 @@ class ClientJudge:
 
     @property
     def can_call(self) -> bool:
-        return self.is_alive and len(self.calls) < MOST_CALLS
+        return self.is_alive and len(self.calls) < MAX_CALLS
 
     # ------------------------------------------------------------------ the client's life
 
@@ -549,7 +548,7 @@ class ClientJudge:
         ended = isinstance(inside(self.camera)._waits.end, ConnectionTakenError)
         assert len(supervisors) == (0 if ended else 1)
         assert len(receivers) <= len(supervisors)
-        assert len(jobs) <= MOST_CALLS + 1
+        assert len(jobs) <= MAX_CALLS + 1
         rest = [n for n in names if not n.startswith(("smartcam[", "smartcam.emulator", "call "))]
         assert not rest
 

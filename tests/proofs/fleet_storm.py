@@ -28,7 +28,7 @@ from typing import Any, Self
 
 import smartcam
 from smartcam import Camera
-from smartcam._zenoh import LEASE
+from smartcam._zenoh import LEASE_TIME
 from smartcam.exceptions import SmartCamError
 from tests.fleet.fleetkit import FAST, LAYOUT, PATIENCE, NumberedCamera, Plant
 from tests.fleet.lossy_bus import LossyBus, chance_of
@@ -310,7 +310,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with asyncio.Runner(loop_factory=TimedLoop) as runner:
         done = [runner.run(storm_in_process(options.triggers, options.seed))]
     over_zenoh = storm_over_zenoh(
-        options.triggers, options.seed, programs=PROGRAMS, kills=10, stop=LEASE + 3.0
+        options.triggers, options.seed, programs=PROGRAMS, kills=10, stop=LEASE_TIME + 3.0
     )
     done.append(asyncio.run(over_zenoh))
     print(table(done))  # noqa: T201

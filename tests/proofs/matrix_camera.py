@@ -7,9 +7,9 @@ from typing import Any, Literal, NamedTuple
 
 from smartcam import exceptions as e
 from smartcam.emulator import faults as f
-from smartcam.emulator.faults._base import MESSAGE_NAMES
+from smartcam.emulator._inside import MESSAGE_NAMES
 from smartcam.models import Status
-from smartcam.protocols._bvs import ResultCode
+from smartcam.protocols._inside import ResultCode
 from tests.proofs.books import TRIGGER_OUTCOMES
 from tests.proofs.matrix_cells import (
     AT_ONCE,
@@ -116,6 +116,9 @@ WITHHELD = frozenset(
     | {f"{what} instead" for what in ANSWERS}
 )
 """What withholds a status if it is done to one."""
+
+EVIDENCE = frozenset({"QueryAnswer", "StatusReport"})
+"""What shows that the camera took a trigger, where its status has to be asked for."""
 
 
 class _Mangling(NamedTuple):
@@ -266,9 +269,12 @@ def frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cel
                 # a datagram is a frame or nothing: what is broken is lost
                 lost = world.transport == "udp" and family == "frame"
                 status = place.frame.message == "StatusReport"
+                allowed = (*SILENT, *one.allowed) if lost else one.allowed
+                if world.is_asked and place.frame.message in EVIDENCE and one.name in WITHHELD:
+                    allowed = (*allowed, e.OvertriggeredError)  # it cannot be told whose it is
                 fault = by_camera(
                     one.faults,
-                    (*SILENT, *one.allowed) if lost else one.allowed,
+                    allowed,
                     bounds=PATIENT if one.harmless and not lost else SHORT,
                     copies=one.copies,
                     strays=one.strays and not world.numbered,

@@ -22,8 +22,8 @@ import smartcam
 from smartcam.backoff import Backoff
 from smartcam.camera import Camera
 from smartcam.models import Result
-from smartcam.protocols._bvs import BVS, ResultCode
-from smartcam.protocols._framed.dialect import FramedDialect
+from smartcam.protocols import BVS, FramedDialect
+from smartcam.protocols._inside import ResultCode
 from smartcam.testing import LinkProxy
 from tests.client.clientkit import imbalances, loop_reports
 from tests.proofs.books import BookKeeper, ClientEar, layout_of

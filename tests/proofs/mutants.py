@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 from tests import ROOT
 
-TAKEN = ("smartcam", "tests", "examples", "docs", "pyproject.toml", "README.md")
+TAKEN = ("smartcam", "tests", "examples", "docs", "results", "pyproject.toml", "README.md")
 """What a copy of the tree has."""
 
 LONGEST = 200.0

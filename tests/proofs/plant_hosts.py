@@ -27,7 +27,7 @@ LINE = 5
 
 TUN = (0x400454CA, 0x1001)  # TUNSETIFF; IFF_TUN and IFF_NO_PI
 NETWORK = "10.79.0."
-MOST_PACKETS = 10_000
+MAX_PACKETS = 10_000
 LARGEST = 1 << 16
 SOURCE, TARGET = 15, 19
 """Where the last byte of an address is in a packet."""
@@ -103,7 +103,7 @@ class Switch:
                     cables = [one for one in way if one is not None]
                     lost = any(one.cut or chance.random() < one.loss for one in cables)
                     lost = lost or frozenset((packet[SOURCE], packet[TARGET])) in self.apart
-                    if lost or len(waiting) >= MOST_PACKETS:
+                    if lost or len(waiting) >= MAX_PACKETS:
                         self.lost += 1
                         continue
                     at = time.monotonic() + sum(one.delay for one in cables)

@@ -10,8 +10,11 @@ from tests.proofs.chaos_soak import GROWTH, quarters
 from tests.proofs.fleet_storm import Figures
 from tests.proofs.plant_pace import Pace
 
-LEAST_SAMPLES = 30
-"""Looks at the memory of a process before it is judged: at first it fills its caches."""
+WARM_UP = 30
+"""Looks at the memory of a process that do not count: it fills its caches."""
+
+MIN_SAMPLES = 30
+"""Looks behind those at the memory of a process before it is judged."""
 
 
 @dataclass
@@ -24,9 +27,10 @@ class Storm:
         done: faults.
         right: seconds until presence was right again after each.
         moves: how often a camera of the pair went from one agent to the other by each.
+        blocks: how blocks of reservations ended.
         taken_over: seconds until who stands by had what the other had, from each on.
         accounts: all programs', summed.
-        memory: of each process, MB.
+        memory: of each process that was last there under a name, MB.
         notes: what is to be known of the run.
     """
 
@@ -35,6 +39,7 @@ class Storm:
     done: Counter[str] = field(default_factory=Counter)
     right: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     moves: Counter[str] = field(default_factory=Counter)
+    blocks: Counter[str] = field(default_factory=Counter)
     taken_over: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     accounts: Counter[str] = field(default_factory=Counter)
     memory: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
@@ -56,6 +61,8 @@ class Storm:
             ),
             f"{figures.calls} calls, {figures.executed} executed: "
             + ", ".join(f"{name} {count}" for name, count in figures.outcomes.most_common()),
+            "reserved blocks: "
+            + ", ".join(f"{name} {count}" for name, count in self.blocks.most_common()),
             "accounts: " + ", ".join(f"{name} {count}" for name, count in self.accounts.items()),
         ]
         for name, values in sorted(self.memory.items()):
@@ -110,8 +117,9 @@ class Storm:
     def judge_memory(self) -> None:
         """Look whether a process grew."""
         for name, values in self.memory.items():
-            if len(values) < LEAST_SAMPLES:
+            warm = values[WARM_UP:]
+            if len(warm) < MIN_SAMPLES:
                 continue
-            first, last = quarters(values)
+            first, last = quarters(warm)
             if last > first + GROWTH:
                 self.complain(f"{name}: memory grew from {first:.1f} to {last:.1f} MB")

@@ -1,8 +1,9 @@
 """The processes of a plant: its cameras, its router, a program that uses all of it.
 
-``python -m tests.proofs.plant_process cameras COUNT [ADDRESS]``, ``... router PLACE CERTIFICATES``,
-``... program URL FIRST SEED``, ``... visitor URL SECONDS``: each says on stdout, as lines of JSON,
-what it sees, and goes on until a line comes on stdin.
+``python -m tests.proofs.plant_process`` with ``cameras COUNT [ADDRESS]``, ``router PLACE
+CERTIFICATES``, ``program URL FIRST SEED``, ``visitor URL SECONDS``, ``joiner URL SECONDS``,
+``holder URL CAMERA``, ``guest URL CAMERA TOKEN`` or ``strangers ADDRESS PORT COUNT``: each says on
+stdout, as lines of JSON, what it sees, and most go on until a line comes on stdin.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ import smartcam.fleet
 from smartcam import Disconnected, Reconnected, Result
 from smartcam._zenoh import BusLink
 from smartcam.exceptions import InputContainerError, SmartCamError
-from smartcam.fleet import Fleet
-from smartcam.fleet._access import access_control
-from smartcam.fleet._camera import FleetCamera
-from smartcam.fleet._zenoh import ZenohEnd
+from smartcam.fleet import Fleet, FleetCamera
+from smartcam.fleet._inside import ZenohEnd
+from smartcam.fleet._security.access import access_control
+from smartcam.fleet._security.door import Door
 from tests.fleet.fleetkit import FAST, LAYOUT, PATIENCE, NumberedCamera
 from tests.proofs.chaos_soak import resident
 from tests.proofs.fleet_storm import WITH_INPUT, call
@@ -51,6 +52,9 @@ GRACE = 2.0
 
 LATELY = 5.0
 """Seconds for which this computer's pace is asked."""
+
+RESERVING = 0.15
+"""How often a program reserves a camera, of all that it does."""
 
 LAST = 30.0
 """Seconds of a call at the end, when nothing is wrong any more."""
@@ -121,8 +125,11 @@ async def router(place: str, certificates: str) -> None:
     link = BusLink((place,), (), certificates)
     end = ZenohEnd(link, {"access_control": access_control()})
     await end.open(PATIENCE)
+    door = Door(frozenset({int(place.rpartition(":")[2])}), end.linked)
+    door.open()
     say(ready=True)
     await told_to_end()
+    door.close()
     await end.close()
 
 
@@ -196,6 +203,8 @@ class Program:
         self._shared: dict[str, Shared] = {}
         self._pace = Pace()
         self._ending = False
+        self._under_way: Counter[str] = Counter()
+        self._blocked: set[str] = set()  # cameras that a block of this program has
 
     async def run(self) -> None:
         """Be at work until it is told to end."""
@@ -270,15 +279,44 @@ class Program:
             if not there:
                 continue
             camera = self._chance.choice(there)
+            if camera.name in self._blocked:
+                continue
+            if self._chance.random() < RESERVING and not self._under_way[camera.name]:
+                self._blocked.add(camera.name)
+                try:
+                    say(block=[camera.name, await self._block(camera)])
+                finally:
+                    self._blocked.discard(camera.name)
+                continue
             token = next(self._tokens)
             grace = GRACE * self._pace.since(time.monotonic() - LATELY)
+            self._under_way[camera.name] += 1
             outcome, got = await call(camera, token, self._chance, grace=grace)
+            self._under_way[camera.name] -= 1
             say(call=[token, outcome, got])
             with contextlib.suppress(SmartCamError):
                 if outcome == "InputContainerError":
                     await camera.switch_application(WITH_INPUT)
                 elif outcome == "NotRunningError":
                     await camera.start()
+
+    async def _block(self, camera: FleetCamera[Any]) -> str:
+        """Trigger twice in a block of a reservation; return how it ended.
+
+        A block that ends without an error had the camera for itself: no run is between its two.
+        """
+        tokens = next(self._tokens), next(self._tokens)
+        try:
+            async with camera.reserve(timeout=LAST):
+                first = await camera.trigger(input=tokens[0].to_bytes(4, "little"))
+                await asyncio.sleep(self._chance.uniform(0, 4 * PAUSE))
+                second = await camera.trigger(input=tokens[1].to_bytes(4, "little"))
+        except SmartCamError as error:
+            return type(error).__name__
+        if (first.value.token, second.value.token) != tokens:
+            return f"! {tokens} got {first.value.token}, {second.value.token}"
+        between = second.value.run - first.value.run - 1
+        return f"! {between} runs of others came between" if between else "kept"
 
     def _number(self, camera: str) -> int:
         """Return that of the last result that was read."""
@@ -327,6 +365,82 @@ async def visitor(url: str, seconds: float) -> None:
     say(outcome=outcome, text=text, took=loop.time() - begun)
 
 
+async def joiner(url: str, seconds: float) -> None:
+    """Come as soon as it goes, trying again; say how many cameras are there."""
+    loop = asyncio.get_running_loop()
+    end = loop.time() + seconds
+    text = ""
+    while loop.time() < end:
+        try:
+            async with smartcam.fleet.open(url, connect_timeout=LATELY) as fleet:
+                say(outcome="here", text=str(len(fleet)))
+                return
+        except SmartCamError as error:
+            text = f"{type(error).__name__}: {error}"
+            await asyncio.sleep(LOOK)
+    say(outcome="not here", text=text)
+
+
+async def holder(url: str, camera: str) -> None:
+    """Reserve a camera, and never give it back."""
+    async with (
+        smartcam.fleet.open(url, connect_timeout=LAST, reconnect=FAST) as fleet,
+        fleet[camera].reserve(timeout=LAST),
+    ):
+        say(outcome="reserved")
+        await told_to_end()
+
+
+async def guest(url: str, camera: str, token: int) -> None:
+    """Trigger once; say what came of it."""
+    options: Any = {"interpret_as": LAYOUT, "reconnect": FAST}
+    end = asyncio.get_running_loop().time() + LAST
+    text = ""
+    async with smartcam.fleet.open(url, connect_timeout=LAST, **options) as fleet:
+        while asyncio.get_running_loop().time() < end:
+            try:
+                await fleet[camera].wait_connected(LATELY)
+                data = token.to_bytes(4, "little")
+                result = await fleet[camera].trigger(input=data, timeout=LATELY)
+            except InputContainerError:
+                with contextlib.suppress(SmartCamError):
+                    await fleet[camera].switch_application(WITH_INPUT)
+            except SmartCamError as error:
+                text = f"{type(error).__name__}: {error}"
+                break
+            else:
+                say(outcome="result" if result.value.token == token else "! a stranger's", text="")
+                return
+    say(outcome="none", text=text)
+
+
+async def strangers(address: str, port: int, count: int) -> None:
+    """Have so many connections that say nothing; a new one for each that ends."""
+    there = 0
+
+    async def one() -> None:
+        nonlocal there
+        while True:
+            with contextlib.suppress(OSError, TimeoutError):
+                async with asyncio.timeout(LAST):
+                    reader, writer = await asyncio.open_connection(address, port)
+                there += 1
+                with contextlib.suppress(OSError):
+                    await reader.read()
+                there -= 1
+                writer.close()
+            await asyncio.sleep(LOOK)
+
+    tasks = [asyncio.create_task(one()) for _ in range(count)]
+    while not there:  # noqa: ASYNC110 - each counts itself
+        await asyncio.sleep(LOOK)
+    say(outcome="there")
+    await told_to_end()
+    for task in tasks:
+        task.cancel()
+    await asyncio.wait(tasks)
+
+
 if __name__ == "__main__":
     kind, *given = sys.argv[1:]
     if kind == "cameras":
@@ -335,5 +449,13 @@ if __name__ == "__main__":
         asyncio.run(router(*given))
     elif kind == "program":
         asyncio.run(program(given[0], *map(int, given[1:])))
+    elif kind == "joiner":
+        asyncio.run(joiner(given[0], float(given[1])))
+    elif kind == "holder":
+        asyncio.run(holder(*given))
+    elif kind == "guest":
+        asyncio.run(guest(given[0], given[1], int(given[2])))
+    elif kind == "strangers":
+        asyncio.run(strangers(given[0], int(given[1]), int(given[2])))
     else:
         asyncio.run(visitor(given[0], float(given[1])))

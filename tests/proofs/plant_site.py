@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import signal
 import sys
 import time
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Self
 
-from smartcam.fleet._authority import make_certificates
+from smartcam.fleet._inside import make_certificates
 from tests import ROOT
 from tests.proofs.plant_hosts import HUB, LINE, SITES, Switch, address, run
 from tests.proofs.plant_judge import Storm
@@ -63,6 +64,8 @@ class Site:
         sessions: how many each camera has had, those of the pair apart.
         pair: who has the cameras of the pair.
         told: how often each program was told that one of these was lost.
+        renamed: cameras whose results have been told under another name for a while.
+        tokens: of guests.
     """
 
     def __init__(self, storm: Storm, switch: Switch, folder: Path, each: int, seed: int) -> None:
@@ -76,6 +79,8 @@ class Site:
         self.told: Told = {}
         self.accounts: dict[int, Any] = {}
         self.kills: Counter[int] = Counter()
+        self.renamed: set[str] = set()
+        self.tokens = itertools.count((HUB + LINE) * TOKENS)
         self.recording: dict[int, bool] = {}
         self.sessions: Counter[str] = Counter()
         self.clocks = FAKETIME.exists()
@@ -119,7 +124,7 @@ class Site:
     async def _open(self) -> None:
         names = {
             "agent": [f"host{site}" for site in SITES],
-            "operator": [*(f"robot{site}" for site in SITES), "visitor"],
+            "operator": [*(f"robot{site}" for site in SITES), "visitor", "guest"],
             "router": ["hub"],
         }
         await asyncio.to_thread(make_certificates, self.keys, names, hosts=[address(HUB)])
@@ -168,7 +173,10 @@ class Site:
         cameras = {f"host{site}/cam{at}": url for at, url in enumerate(self._urls[site], 1)}
         if site in PAIR:
             cameras |= dict(zip(PAIRED, self._urls[LINE], strict=True))
-        return said + "".join(f'  {name}: {{url: "{url}"}}\n' for name, url in cameras.items())
+        return said + "".join(
+            f'  {name}: {{url: "{url}", reconnect: {{maximum: 1}}}}\n'
+            for name, url in cameras.items()
+        )
 
     def part(
         self, host: int, name: str, kind: str, *given: str, hear: list[Any] | None = None
@@ -216,6 +224,11 @@ class Site:
                 self._changed.set()
         elif "call" in said:
             storm.figures.take(*said["call"])
+        elif "block" in said:
+            camera, outcome = said["block"]
+            storm.blocks[outcome if not outcome.startswith("!") else "!"] += 1
+            if outcome.startswith("!"):
+                storm.complain(f"reserved block of {camera} by program {host}: {outcome}")
         elif "memory" in said:
             storm.memory[f"program {host}"].append(said["memory"])
         elif "account" in said:
@@ -230,12 +243,16 @@ class Site:
                 storm.complain(f"call {token} was executed {count} times")
 
     async def _sample(self) -> None:
+        looked: dict[str, int] = {}
         while True:
             await asyncio.sleep(2.0)
             for part in (self.router, *self.agents.values()):
-                found = part.resident()
+                found, memory = part.resident(), self.storm.memory[part.name]
+                if looked.get(part.name) != part.process.pid:
+                    looked[part.name] = part.process.pid
+                    memory.clear()  # of the process that was killed
                 if found:
-                    self.storm.memory[part.name].append(found)
+                    memory.append(found)
 
     # ------------------------------------------------------------------ presence
 
@@ -303,6 +320,8 @@ class Site:
             await self._end(part, START)
         for site, accounts in self.accounts.items():
             for name in self.names:
+                if name in self.renamed:
+                    continue
                 # what a camera has sent into a session that ends may be lost with it
                 losses = self.told[site][name] if name in PAIRED else self.sessions[name] - 1
                 what = f"program {site}: {name}"

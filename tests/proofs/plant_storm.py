@@ -4,11 +4,14 @@ Three hosts are network namespaces with a switch between them, and a router on a
 a process with emulated cameras, an agent for them, and a program that reads the results of all
 cameras and triggers one after the other. On a fifth are cameras that the first two agents can
 reach: they stand by for each other. Faults come by a seeded plan, one or two at a time: an agent
-killed, the router killed, a cable cut, a host without the router, loss, delay, a program stopped, a
-disk filled, a certificate that has expired. Where faketime is installed, the clocks of two hosts
-are an hour off.
+killed, alone or with a program that has a camera reserved; the router killed; a cable cut, for a
+minute, too; a host without the router, and somebody who comes to it then; loss; delay; a program or
+the cameras stopped; a disk filled; a certificate that has expired or is renewed; a second agent of
+one name; a camera that a reload renames; strangers at the router's port. Where faketime is
+installed, the clocks of two hosts are an hour off.
 
-Each trigger brings a number of its own, which its result has; each run of a camera has one, too.
+Each trigger brings a number of its own, which its result has; each run of a camera has one, too. So
+a block of a reservation that ends without an error shows whether anybody came between.
 
 Who is there is ``plant_site.py`` with ``plant_hosts.py`` and ``plant_process.py``, what happens
 ``plant_faults.py``, and who judges ``plant_judge.py`` with ``plant_pair.py`` and ``plant_pace.py``.

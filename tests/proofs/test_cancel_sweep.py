@@ -15,8 +15,6 @@ from tests.proofs.cancel_sweep import (
     run_sweep,
 )
 
-pytestmark = pytest.mark.long
-
 STRIDE = 5
 """Steps between two cancellations; the long form has every one."""
 
@@ -34,6 +32,8 @@ def short_sweeps() -> list[tuple[str, Wire]]:
     ]
 
 
+@pytest.mark.long
+@pytest.mark.widest
 @pytest.mark.parametrize(("name", "wire"), short_sweeps(), ids=str)
 def test_call_cancelled_at_any_step_leaves_client_and_camera_as_they_were(
     name: str, wire: Wire
@@ -43,6 +43,8 @@ def test_call_cancelled_at_any_step_leaves_client_and_camera_as_they_were(
     assert sweep.ends["cancelled"] > 0
 
 
+@pytest.mark.long
+@pytest.mark.widest
 @pytest.mark.parametrize(
     ("name", "wire"),
     [(n, wire) for n in ("trigger", "reboot") for wire in WIRES if n in calls_over(wire)],

@@ -18,7 +18,8 @@ from smartcam.client import SmartCamera
 from smartcam.emulator import EmulatedCamera
 from smartcam.emulator import faults as f
 from smartcam.observers import TraceEntry
-from smartcam.protocols._bvs import BVS, ResultCode
+from smartcam.protocols import BVS
+from smartcam.protocols._inside import ResultCode
 from smartcam.testing.proxy import _rules as rules
 from tests.proofs import fault_matrix
 from tests.proofs.books import BookKeeper, ClientEar
@@ -157,7 +158,7 @@ async def test_container_that_the_client_counts_and_nobody_hears_is_wrong(
 
     monkeypatch.setattr(ClientEar, "on_frame", deaf)
     found = await judged(CUT)
-    assert "0 containers heard, 2 in account" in found
+    assert "0 containers heard, 3 in account" in found
     assert "lost without a loss of the link" in found
 
 

@@ -78,6 +78,21 @@ def test_account_is_judged(wrong: dict[str, int], kills: int, said: str) -> None
     assert (any(said in text for text in found)) if said else found == []
 
 
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ([60.0, *[90.0] * 100], []),  # at first it fills its caches
+        ([70.0] * 45 + [90.0] * 14, []),  # not there for long enough
+        ([70.0] * 45 + [90.0] * 15, ["agent: memory grew from 70.0 to 90.0 MB"]),
+    ],
+)
+def test_memory_is_judged_of_a_process_that_is_warm(values: list[float], said: list[str]) -> None:
+    storm = Storm()
+    storm.memory["agent"] = values
+    storm.judge_memory()
+    assert storm.figures.violations == said
+
+
 # ---------------------------------------------------------------------- the pair
 
 CAMERA = PAIRED[0]

@@ -28,7 +28,7 @@ from tests.proofs.storm import storms, table
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from smartcam.emulator.faults._base import BaseFault
+    from smartcam.emulator._inside import BaseFault
 
 pytestmark = pytest.mark.long
 

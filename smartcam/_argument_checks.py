@@ -1,0 +1,155 @@
+"""Name the argument of a function that is of a wrong kind.
+
+Only kinds are checked: which numbers, shapes or words can work says the function itself, by an
+error of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import math
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
+
+from smartcam._arguments import check_all, plain, wrong_argument
+from smartcam.exceptions import SmartCamError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Check = Callable[[Any, str, str], Any]
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a function to say which argument is of a wrong kind, where it does not itself.
+
+    The function is called first, and an error of the library comes out as it is. After any other
+    error the checks look at the arguments of these names. The first that finds one of a wrong kind
+    raises a ConfigurationError, whose text begins with the function's name, or with the class' for
+    an ``__init__``. If all are of the right kind, the function is called once more, with the plain
+    values that the checks return: a text or number of a class of somebody's own may have failed it.
+    So it must be a function that may be called twice.
+    """
+
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
+        signature = inspect.signature(function)
+        who = function.__qualname__.removesuffix(".__init__")
+
+        @functools.wraps(function)
+        def call(*args: P.args, **options: P.kwargs) -> R:
+            try:
+                return function(*args, **options)
+            except SmartCamError:
+                raise
+            except Exception:  # noqa: BLE001 - the checks say what it was, or the second call
+                given = signature.bind(*args, **options)
+                for name, check in checks.items():
+                    if name in given.arguments:
+                        given.arguments[name] = check(given.arguments[name], name, who)
+            return function(*given.args, **given.kwargs)
+
+        return call
+
+    return decorate
+
+
+def a_number(value: Any, what: str, who: str) -> Any:
+    """Return a plain number that a float has room for; ``bool`` is none."""
+    number = plain(value)
+    if isinstance(number, (int, float)) and not isinstance(number, bool):
+        try:
+            float(number)
+        except OverflowError:
+            pass
+        else:
+            return number
+    raise wrong_argument(what, "a number", value, who)
+
+
+def a_finite_number(value: Any, what: str, who: str) -> Any:
+    """Return a plain number that is neither infinite nor NaN."""
+    number = a_number(value, what, who)
+    if not math.isfinite(number):
+        raise wrong_argument(what, "a finite number", value, who)
+    return number
+
+
+def an_integer(value: Any, what: str, who: str) -> Any:
+    """Return a plain integer of at most 64 bits, whichever it is; ``bool`` is none."""
+    number = plain(value)
+    if type(number) is int and -(1 << 63) <= number < 1 << 63:
+        return number
+    raise wrong_argument(what, "a whole number", value, who)
+
+
+def a_list(value: Any, what: str, who: str) -> Any:
+    """Return the items of a sequence; a text is none."""
+    return check_all(value, what, "a list", who)
+
+
+def numbers(value: Any, what: str, who: str) -> Any:
+    """Return an array of numbers, of any shape."""
+    import numpy as np
+
+    with contextlib.suppress(Exception):  # whatever a class of somebody's raises there
+        found = np.asarray(value)
+        if found.dtype.kind in "fiubO":  # objects: fractions, and integers too large for numpy's
+            return found.astype(np.float64)
+    raise wrong_argument(what, "an array of numbers", value, who)
+
+
+def as_array(value: Any, what: str) -> Any:
+    """Return an array of whatever it is that came.
+
+    Raises:
+        ConfigurationError: it is no array.
+    """
+    import numpy as np
+
+    try:
+        return np.asarray(value)
+    except Exception as exc:  # whatever a class of somebody's raises there
+        raise wrong_argument(what, "an array", value) from exc
+
+
+def of_class(name: str) -> Check:
+    """Return a check for an object of a class of this name, which need not be imported for it."""
+
+    def check(value: Any, what: str, who: str) -> Any:
+        if any(one.__name__ == name for one in cast("Any", type(value)).__mro__):
+            return value
+        raise wrong_argument(what, f"a {name}", value, who)
+
+    return check
+
+
+def a_target(value: Any, what: str, who: str) -> Any:
+    """Return a target that is printed and found in images."""
+    if hasattr(type(value), "kind") and hasattr(type(value), "points"):
+        return value
+    raise wrong_argument(what, "a target, such as a Checkerboard", value, who)
+
+
+def each(check: Check, count: int | None = None) -> Check:
+    """Return a check for a list of what another check takes, with so many items if that is said."""
+
+    def check_each(value: Any, what: str, who: str) -> Any:
+        items = a_list(value, what, who)
+        if count is not None and len(items) != count:
+            raise wrong_argument(what, f"{count} of them", value, who)
+        return tuple(check(one, what, who) for one in items)
+
+    return check_each
+
+
+def or_none(check: Check) -> Check:
+    """Return a check that takes None, too."""
+
+    def check_unless_none(value: Any, what: str, who: str) -> Any:
+        return None if value is None else check(value, what, who)
+
+    return check_unless_none

@@ -1,0 +1,314 @@
+"""Checks of the values that users, and other people's programs, give.
+
+Each function returns the plain value, which only then is used: an ``int`` or ``str`` of a subclass
+may compare, hash and print as it likes. A value that cannot work is a
+:exc:`~smartcam.ConfigurationError` that says which argument it is, what was expected, and what
+came. Nothing is searched, sent or waited for.
+
+``who`` names whose argument it is, such as a camera; "" where the argument's name says it all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import numbers
+import os
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterable
+
+T = TypeVar("T")
+FunctionT = TypeVar("FunctionT", bound="Callable[..., Any]")
+
+MAX_SECONDS = 1e9
+"""Seconds that a time may have at most, about 31 years: more would overflow a loop's timer."""
+
+MAX_TEXT_LENGTH = 10_000
+"""Characters that a text may have at most, where nothing narrower is said."""
+
+MAX_DATA_BYTES = 1 << 30
+"""Bytes that a byte string may have at most; the largest payload that a client may accept."""
+
+MAX_SHOWN_LENGTH = 80
+"""Characters of a wrong value that an error's text shows at most."""
+
+MAX_APPLICATION_ID = 0xFFFFFFFF
+"""Largest application id that any dialect has a field for, 32 bits."""
+
+
+def shown(value: object) -> str:
+    """Return a value as an error's text shows it, whatever its ``repr`` does."""
+    try:
+        return f"{value!r:.{MAX_SHOWN_LENGTH}}"
+    except ValueError:
+        return f"{type(value).__name__} that is too long to be shown"
+    except Exception:  # noqa: BLE001 - whatever a class of somebody's raises there
+        return f"{type(value).__name__} that cannot be shown"
+
+
+def wrong_argument(what: str, expected: str, value: object, who: str = "") -> ConfigurationError:
+    """Return the error for an argument that cannot work."""
+    return ConfigurationError(
+        f"{who}{': ' if who else ''}{what}: expected {expected}, got {shown(value)}"
+    )
+
+
+def check_integer(
+    value: object, what: str, least: int, most: int | None = None, who: str = ""
+) -> int:
+    """Return an integer from ``least`` to ``most``; None: it may be as large as it likes.
+
+    Integers of numpy and others with ``__index__`` are integers, ``bool`` is none.
+    """
+    number = value if type(value) is int else _as_integer(value)
+    if number is None or number < least or (most is not None and number > most):
+        up_to = "or more" if most is None else f"to {most}"
+        raise wrong_argument(what, f"an integer, {least} {up_to}", value, who)
+    return number
+
+
+def _as_integer(value: Any) -> int | None:
+    if isinstance(value, bool):
+        return None
+    try:
+        return int.__index__(type(value).__index__(value))
+    except Exception:  # noqa: BLE001 - whatever a class of somebody's raises there
+        return None
+
+
+def plain(value: object) -> object:
+    """Return the plain value of a number, truth value or text of any class; others as they are.
+
+    It is what pydantic's strict types are given, which would refuse those of numpy.
+    """
+    kind = type(value)
+    if kind in {int, float, str, bool} or isinstance(value, bool):
+        return value
+    if isinstance(value, str):
+        return str.__str__(value)
+    if _is_numpy_bool(value):
+        return bool(value)
+    integer = _as_integer(value)
+    if integer is not None:
+        return integer
+    number = _as_float(value)
+    return value if number is None else number
+
+
+def check_number(
+    value: object,
+    what: str,
+    least: float,
+    most: float,
+    who: str = "",
+    *,
+    above: bool = False,
+    unit: str = "a number",
+) -> float:
+    """Return a finite number from ``least`` to ``most``; with ``above``, one above ``least``.
+
+    Numbers of numpy and fractions are numbers; ``bool``, texts and arrays are none.
+    """
+    number = value if type(value) is float else _as_float(value)
+    if number is None or not least <= number <= most or (above and number == least):
+        raise wrong_argument(
+            what, f"{unit}, {'above ' if above else ''}{least:g} to {most:g}", value, who
+        )
+    return number
+
+
+def _as_float(value: Any) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real):
+        return None
+    try:
+        return float.__float__(type(value).__float__(cast("Any", value)))
+    except Exception:  # noqa: BLE001 - 10**400, and whatever a class of somebody's raises there
+        return None
+
+
+def check_seconds(value: object, what: str, who: str = "", *, above: bool = False) -> float:
+    """Return a time in seconds, 0 or more; with ``above``, more than 0."""
+    if type(value) is float and 0.0 < value <= MAX_SECONDS:
+        return value
+    return check_number(value, what, 0.0, MAX_SECONDS, who, above=above, unit="seconds")
+
+
+def check_seconds_or_none(
+    value: object, what: str, who: str = "", *, above: bool = False
+) -> float | None:
+    """Return a time in seconds as :func:`check_seconds` does, or None."""
+    return None if value is None else check_seconds(value, what, who, above=above)
+
+
+def check_moment(value: object, what: str, who: str = "") -> float:
+    """Return a moment of a clock: any finite number of seconds."""
+    number = _as_float(value)
+    if number is None or not math.isfinite(number):
+        raise wrong_argument(what, "a finite number of seconds", value, who)
+    return number
+
+
+def check_age(value: object, what: str, who: str = "") -> float:
+    """Return an age in seconds, 0 or more; ``inf`` is any age."""
+    number = _as_float(value)
+    if number is None or not number >= 0:
+        raise wrong_argument(what, "0 or more seconds, or inf", value, who)
+    return number
+
+
+def check_flag(value: object, what: str, who: str = "") -> bool:
+    """Return True or False, which numpy has of its own, too."""
+    if isinstance(value, bool):
+        return value
+    if _is_numpy_bool(value):
+        return bool(value)
+    raise wrong_argument(what, "True or False", value, who)
+
+
+def _is_numpy_bool(value: object) -> bool:
+    kind = type(value)
+    return kind.__module__ == "numpy" and kind.__name__ in {"bool", "bool_"}
+
+
+def check_text(
+    value: object, what: str, who: str = "", *, least: int = 0, most: int = MAX_TEXT_LENGTH
+) -> str:
+    """Return a text of ``least`` to ``most`` characters, which UTF-8 has bytes for."""
+    if isinstance(value, str):
+        text = str.__str__(value)
+        if least <= len(text) <= most and (text.isascii() or not _has_surrogates(text)):
+            return text
+    raise wrong_argument(what, f"a text of {least} to {most} characters", value, who)
+
+
+def _has_surrogates(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return True
+    return False
+
+
+def check_choice(value: object, what: str, known: Collection[str], who: str = "") -> str:
+    """Return a word that is one of those known."""
+    if isinstance(value, str) and str.__str__(value) in known:
+        return str.__str__(value)
+    raise wrong_argument(what, " or ".join(map(repr, known)), value, who)
+
+
+def check_bytes(value: object, what: str, who: str = "") -> bytes:
+    """Return a byte string: bytes, or what lends its bytes, such as a ``bytearray``."""
+    if type(value) is bytes:
+        return value
+    with contextlib.suppress(Exception):  # it lends nothing, or is too odd for it
+        view = memoryview(cast("Any", value))
+        if view.ndim and view.nbytes <= MAX_DATA_BYTES:  # a number of numpy lends bytes, too
+            return view.tobytes()
+    raise wrong_argument(what, f"bytes, {MAX_DATA_BYTES} at most", value, who)
+
+
+def check_callable(value: FunctionT, what: str, who: str = "") -> FunctionT:
+    """Return the value if it can be called, else raise."""
+    if not callable(value):
+        raise wrong_argument(what, "a function", value, who)
+    return value
+
+
+def check_kind(value: T, kind: type[Any], what: str, expected: str, who: str = "") -> T:
+    """Return an object of a class; ``expected`` says in words what that is."""
+    if not isinstance(value, kind):
+        raise wrong_argument(what, expected, value, who)
+    return value
+
+
+def check_all(value: Iterable[T], what: str, expected: str, who: str = "") -> tuple[T, ...]:
+    """Return the items of what can be gone through; a text is none of these."""
+    with contextlib.suppress(Exception):  # whatever a class of somebody's raises there
+        if not isinstance(value, (str, bytes)):
+            return tuple(value)
+    raise wrong_argument(what, expected, value, who)
+
+
+def check_instant(value: datetime | None, what: str, who: str = "") -> datetime | None:
+    """Return a date and time with a time zone, or None."""
+    if value is not None and (not isinstance(value, datetime) or value.tzinfo is None):
+        raise wrong_argument(what, "a datetime with a time zone, or None", value, who)
+    return value
+
+
+def check_time(value: datetime, what: str, who: str = "") -> datetime:
+    """Return a date with a time."""
+    return check_kind(value, datetime, what, "a datetime", who)
+
+
+def check_application(value: object, what: str = "application", who: str = "") -> int:
+    """Return an application's id; 0, which no camera may have, is the camera's to refuse."""
+    return check_integer(value, what, 0, MAX_APPLICATION_ID, who)
+
+
+def check_application_or_name(value: object, what: str = "application", who: str = "") -> int | str:
+    """Return an application's id, or the name of its file."""
+    if not isinstance(value, str):
+        return check_application(value, what, who)
+    name = check_text(value, what, who, least=1, most=200)
+    if not name.isprintable():
+        raise wrong_argument(what, "a file's name that can be printed", value, who)
+    return name
+
+
+def check_message_id(value: object, what: str = "message_id", who: str = "") -> int | str:
+    """Return a message's id: a number of 32 bits, or a command's text."""
+    if isinstance(value, str):
+        return check_text(value, what, who, least=1, most=200)
+    return check_integer(value, what, 0, 0xFFFFFFFF, who)
+
+
+def check_path(value: object, what: str, who: str = "") -> Path:
+    """Return the path of a file or folder: a text, or what stands for one, such as a ``Path``."""
+    text: object = value
+    if isinstance(value, os.PathLike):
+        with contextlib.suppress(Exception):  # whatever a class of somebody's raises there
+            text = os.fspath(cast("os.PathLike[str]", value))
+    if isinstance(text, str):
+        path = str.__str__(text)
+        if 0 < len(path) <= MAX_TEXT_LENGTH and "\0" not in path and _is_name_of_file(path):
+            return Path(path)
+    raise wrong_argument(what, "the path of a file or folder", value, who)
+
+
+def _is_name_of_file(path: str) -> bool:
+    try:
+        os.fsencode(path)  # a name that is no UTF-8 has surrogates
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def fspath_of(value: object) -> object:
+    """Return the text of a path; anything else as it is."""
+    return str(value) if isinstance(value, PurePath) else value
+
+
+def check_seed(value: object, who: str = "") -> int:
+    """Return the seed of what is left to chance: any integer of 64 bits."""
+    return check_integer(value, "seed", -(1 << 63), (1 << 64) - 1, who)
+
+
+def check_port(value: object, who: str = "") -> int:
+    """Return the number of a port to listen on; 0 is any that is free."""
+    return check_integer(value, "port", 0, 0xFFFF, who)
+
+
+def check_texts(value: object, what: str, who: str = "") -> dict[str, str]:
+    """Return a mapping from texts to texts."""
+    if not isinstance(value, Mapping):
+        raise wrong_argument(what, "a mapping from texts to texts", value, who)
+    pairs = cast("Mapping[object, object]", value).items()
+    return {check_text(key, what, who): check_text(text, what, who) for key, text in pairs}

@@ -1,0 +1,121 @@
+"""Values in settings files of several rooms: sizes, times, and patterns of cameras' names."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+from pydantic import PlainValidator, WithJsonSchema
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    Fits = Callable[[str, str], bool]
+
+BYTES: Mapping[str, int] = {
+    "B": 1,
+    "kB": 10**3,
+    "MB": 10**6,
+    "GB": 10**9,
+    "TB": 10**12,
+    "KiB": 1 << 10,
+    "MiB": 1 << 20,
+    "GiB": 1 << 30,
+    "TiB": 1 << 40,
+}
+SECONDS: Mapping[str, int] = {"s": 1, "min": 60, "h": 3600, "d": 86400}
+
+MIN_FILE_BYTES = 10**5
+MAX_FOLDER_BYTES = 1 << 50
+MIN_AGE_SECONDS = 1.0
+MAX_AGE_SECONDS = 366 * 86400.0
+MAX_PATTERNS = 1000
+
+_NUMBER = r"(\d{1,12}(?:\.\d{1,6})?)"
+_PATTERN = re.compile(r"[a-z0-9_*-]+(?:/[a-z0-9_*-]+)*", re.ASCII)
+
+
+def _amount(units: Mapping[str, int], least: float, most: float, example: str) -> Any:
+    """Return the validator of a number with a unit, in any case of letters, or without a unit."""
+    known = {unit.lower(): factor for unit, factor in units.items()}
+    text = re.compile(rf"{_NUMBER} ?([a-z]+)", re.ASCII)
+
+    def read(given: object) -> float:
+        found: float | None = None
+        if isinstance(given, str):
+            parts = text.fullmatch(given.strip().lower())
+            if parts is not None and parts[2] in known:
+                found = float(parts[1]) * known[parts[2]]
+        elif isinstance(given, (int, float)) and not isinstance(given, bool):
+            found = float(given)
+        if found is None:
+            raise ValueError(
+                f"expected a number with a unit, such as {example!r}; units are "
+                f"{', '.join(units)}; got {given!r:.60}"
+            )
+        if not least <= found <= most:
+            raise ValueError(f"expected {least:g} to {most:g} {next(iter(units))}, got {found:g}")
+        return found
+
+    return PlainValidator(read)
+
+
+def _schema(units: Mapping[str, int]) -> WithJsonSchema:
+    pattern = f"^{_NUMBER} ?({'|'.join(units)})$"
+    return WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}]})
+
+
+Size = Annotated[float, _amount(BYTES, MIN_FILE_BYTES, MAX_FOLDER_BYTES, "100 MB"), _schema(BYTES)]
+Age = Annotated[float, _amount(SECONDS, MIN_AGE_SECONDS, MAX_AGE_SECONDS, "1 h"), _schema(SECONDS)]
+
+
+def _patterns(given: object) -> tuple[str, ...]:
+    found: list[str] = []
+    for one in cast("list[object]", given) if isinstance(given, (list, tuple)) else [given]:
+        if not isinstance(one, str) or _PATTERN.fullmatch(one) is None:
+            raise ValueError(
+                f"expected a camera's name, or a pattern such as line1/**; got {one!r:.80}"
+            )
+        found.append(one)
+    if not 1 <= len(found) <= MAX_PATTERNS:
+        raise ValueError(f"{len(found)} patterns, expected 1 to {MAX_PATTERNS}")
+    return tuple(found)
+
+
+_ONE = {"type": "string", "pattern": f"^{_PATTERN.pattern}$"}
+Patterns = Annotated[
+    tuple[str, ...],
+    PlainValidator(_patterns),
+    WithJsonSchema({"anyOf": [_ONE, {"type": "array", "items": _ONE, "minItems": 1}]}),
+]
+
+
+def chosen(patterns: Sequence[str], camera: str) -> bool:
+    """Return True if a camera of this name is meant by one of the patterns."""
+    return any(_matches(one.split("/"), camera.split("/"), "**", _part_fits) for one in patterns)
+
+
+def _matches(pattern: Sequence[str], items: Sequence[str], many: str, fits: Fits) -> bool:
+    """Return True if items fit a pattern, in which ``many`` means any number of items."""
+    places = _passed({0}, pattern, many)
+    for item in items:
+        stayed = {place for place in places if place < len(pattern) and pattern[place] == many}
+        gone = {
+            place + 1
+            for place in places - stayed
+            if place < len(pattern) and fits(pattern[place], item)
+        }
+        places = _passed(stayed | gone, pattern, many)
+    return len(pattern) in places
+
+
+def _passed(places: set[int], pattern: Sequence[str], many: str) -> set[int]:
+    """Return places in a pattern with those behind what may stand for nothing."""
+    for place, one in enumerate(pattern):
+        if place in places and one == many:
+            places = places | {place + 1}
+    return places
+
+
+def _part_fits(pattern: str, part: str) -> bool:
+    return _matches(pattern, part, "*", str.__eq__)

@@ -1,0 +1,62 @@
+"""Closing what is open to its end, whoever is cancelled meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable
+
+
+async def finish(close: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Close something to its end in a task of its own; it has to be bounded, and idempotent.
+
+    Where that task is cancelled, perhaps before its first step, the caller does what is left.
+
+    Raises:
+        Exception: what closing raises.
+
+    Cancellation: takes effect when it is closed.
+    """
+    closing = asyncio.ensure_future(close())
+    cancelled: asyncio.CancelledError | None = None
+    while not closing.done():
+        try:
+            await asyncio.wait({closing})
+        except asyncio.CancelledError as exc:
+            cancelled = exc
+    if closing.cancelled():
+        await close()
+    else:
+        closing.result()
+    if cancelled is not None:
+        raise cancelled
+
+
+async def close_all(closes: Iterable[Callable[[], Coroutine[Any, Any, None]]]) -> None:
+    """Close several things side by side; each closing has to be bounded, and idempotent.
+
+    Where the task of one is cancelled, perhaps before its first step, the caller closes it.
+
+    Raises:
+        Exception: what the first one raises, when all have ended.
+
+    Cancellation: passed on to each; takes effect when all have ended.
+    """
+    closing = {asyncio.ensure_future(close()): close for close in closes}
+    if not closing:
+        return
+    try:
+        await asyncio.wait(closing)
+    except asyncio.CancelledError:
+        for task in closing:
+            task.cancel()
+        await asyncio.wait(closing)
+        raise
+    for task, close in closing.items():
+        if task.cancelled():
+            await close()
+    for task in closing:
+        if not task.cancelled():
+            task.result()

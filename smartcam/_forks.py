@@ -1,0 +1,60 @@
+"""Forget, in a fork of this process, the locks that other threads held, and the threads.
+
+A fork has one thread, the one that called it, and a copy of all else. A lock that another thread
+held at that moment stays locked in the copy without end, and what another thread was to do is
+never done. So nothing here is a lock of a module, and objects that have one are told.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import weakref
+from typing import TYPE_CHECKING, Any, Protocol
+
+
+class KnowsForks(Protocol):
+    """An object that is told of forks."""
+
+    def forked(self) -> None:
+        """Be the copy in a fork: no other thread is there, and nothing may be waited for."""
+
+
+_told: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def tell_of_forks(one: KnowsForks) -> None:
+    """Have an object told, in each fork, that it is there; as long as it lives."""
+    _told.add(one)
+
+
+def _tell_all() -> None:
+    for one in tuple(_told):
+        one.forked()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_tell_all)
+
+
+if TYPE_CHECKING:
+    from functools import cached_property as cached_property  # for who imports it from here
+elif sys.version_info >= (3, 12):
+    from functools import cached_property
+else:
+
+    class cached_property(functools.cached_property):  # noqa: N801 - as functools has it
+        """A value that is made once for each object, as Python 3.12 has it.
+
+        Python 3.11 holds a lock of the class meanwhile, which a fork may inherit as locked.
+        """
+
+        def __get__(self, instance: Any, owner: Any = None) -> Any:
+            """Return the value; two threads may each make it, and the later one stays."""
+            if instance is None:
+                return self
+            values = instance.__dict__
+            if self.attrname not in values:
+                values[self.attrname] = self.func(instance)
+            return values[self.attrname]

@@ -1,0 +1,174 @@
+"""Values as JSON's text: that of ``json.dumps(jsonable(value))`` without white space, but faster.
+
+What is not of the types that a client makes goes through :func:`smartcam.models.jsonable` itself.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from datetime import UTC, datetime
+from json.encoder import encode_basestring_ascii
+from typing import TYPE_CHECKING, Any
+
+from smartcam.models import Header, Localization, Pose, Position, Quaternion, jsonable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+MIN_HEX_CHARACTERS = 1024
+"""Characters of a text from which on it pays to look whether it is nothing but hex, which needs no
+quoting: that takes most of the time of a large container."""
+
+NULL = "null"
+
+_HEX = b"0123456789abcdef"
+_EPOCH = datetime.fromtimestamp(0, UTC)
+_PLAIN = frozenset({str, int, float, bool, type(None)})
+_FLOAT = frozenset({float})
+_INTEGERS = frozenset({int})
+_COLUMNS = frozenset("iufbS")
+"""Kinds of a table's columns whose values numpy gives as Python's."""
+
+_quoted: Callable[[str], str] = encode_basestring_ascii
+_encode = json.JSONEncoder(separators=(",", ":")).encode
+_encode_finite = json.JSONEncoder(separators=(",", ":"), allow_nan=False).encode
+
+_HEADER = '{"seq":%s,"stamp":%s,"frame_id":%s}'
+_PART = (
+    '{"feature_id":%s,"quality":%r,"photo_index":%d,"pose":{"header":%s,'
+    '"position":{"x":%r,"y":%r,"z":%r},"orientation":{"x":%r,"y":%r,"z":%r,"w":%r}}}'
+)
+
+
+def object_text(fields: Mapping[str, object]) -> str:
+    """Return the text of an object."""
+    return f"{{{','.join([f'{_quoted(name)}:{text_of(one)}' for name, one in fields.items()])}}}"
+
+
+def bytes_text(data: bytes) -> str:
+    """Return the text of bytes: hex, which needs no quoting."""
+    return f'"{data.hex()}"'
+
+
+def text_of(value: object) -> str:
+    """Return the text of a value."""
+    if type(value) is str:
+        return _quoted(value)
+    if type(value) is int:
+        return repr(value)
+    if value is None:
+        return NULL
+    if type(value) is datetime:
+        return _time_text(value)
+    if type(value) is bytes:
+        return bytes_text(value)
+    return _container_text(value)
+
+
+_latest: list[tuple[datetime, str]] = [(_EPOCH, f'"{_EPOCH.isoformat()}"')]
+"""The time that was written last, and its text: a result and its parts have the same one."""
+
+
+def _time_text(at: datetime) -> str:
+    known, text = _latest[0]
+    if known is not at:
+        text = f'"{at.isoformat()}"'
+        _latest[0] = at, text
+    return text
+
+
+def hex_text(text: str) -> str:
+    """Return the text of a string that is hex, most likely."""
+    if (
+        len(text) > MIN_HEX_CHARACTERS
+        and text.isascii()
+        and not text.encode().translate(None, _HEX)
+    ):
+        return f'"{text}"'
+    return _quoted(text)
+
+
+def _container_text(value: object) -> str:
+    if type(value) is list:
+        text = _parts_text(value)
+        if text is not None:
+            return text
+    elif type(value) is dict and _INTEGERS.issuperset(map(type, value.values())):
+        return f"{{{','.join([f'{_quoted(str(name))}:{one}' for name, one in value.items()])}}}"
+    try:
+        return _encode_finite(plain(value))
+    except (TypeError, ValueError):  # NaN, infinity, or what numpy knows and Python does not
+        return _encode(jsonable(value))
+
+
+def _parts_text(value: list[object]) -> str | None:
+    """Return the text of localizations; None where it is to be made in another way."""
+    texts: list[str] = []
+    header: object = None
+    header_text = ""
+    for part in value:
+        if type(part) is not Localization:
+            return None
+        feature_id, quality, photo_index, pose = part
+        if type(pose) is not Pose or type(feature_id) is not str or type(photo_index) is not int:
+            return None
+        of, position, orientation = pose
+        if type(position) is not Position or type(orientation) is not Quaternion:
+            return None
+        numbers = quality, *position, *orientation
+        if not _FLOAT.issuperset(map(type, numbers)) or not math.isfinite(sum(numbers)):
+            return None  # a sum is not finite where one of them is not
+        if of is not header:  # they have the same one
+            if type(of) is not Header:
+                return None
+            header, header_text = of, _HEADER % (*map(text_of, of),)
+        front = _quoted(feature_id), quality, photo_index, header_text
+        texts.append(_PART % (*front, *numbers[1:]))
+    return f"[{','.join(texts)}]"
+
+
+def plain(value: Any) -> Any:
+    """Return a value as :func:`~smartcam.models.jsonable` does, but with NaN and infinity."""
+    kind = type(value)
+    if kind in _PLAIN:
+        return value
+    if kind is list or kind is tuple:
+        return value if _PLAIN.issuperset(map(type, value)) else [plain(one) for one in value]
+    if kind is dict:
+        return {str(name): plain(one) for name, one in value.items()}
+    if issubclass(kind, tuple) and hasattr(value, "_asdict"):
+        fields: dict[str, Any] = value._asdict()
+        if _PLAIN.issuperset(map(type, fields.values())):
+            return fields
+        return {name: plain(one) for name, one in fields.items()}
+    numpy = sys.modules.get("numpy")
+    if numpy is not None and kind is numpy.ndarray:
+        rows = _rows(value)
+        if rows is not None:
+            return rows
+    return jsonable(value)
+
+
+def _rows(table: Any) -> Any:
+    """Return a table's rows; None where they are not simple."""
+    names, fields = table.dtype.names, table.dtype.fields
+    kinds = [fields[name][0].kind for name in names or ()]
+    if table.ndim != 1 or not kinds or not _COLUMNS.issuperset(kinds):
+        return None
+    texts = [place for place, kind in enumerate(kinds) if kind == "S"]
+    rows: list[Any] = table.tolist()
+    if texts:
+        columns = [*zip(*rows, strict=True)]
+        for place in texts if columns else ():
+            columns[place] = tuple(map(_text_or_hex, columns[place]))
+        rows = [*zip(*columns, strict=True)]
+    return [dict(zip(names, row, strict=True)) for row in rows]
+
+
+def _text_or_hex(data: bytes) -> str:
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        return data.hex()

@@ -1,0 +1,376 @@
+"""The base of ``smartcam.sync``: the thread of all cameras, and calls into it.
+
+The methods that only call those of the camera with asyncio stand in ``sync.py``, which
+``python -m scripts.write_sync`` writes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import contextlib
+import functools
+import os
+import sys
+import warnings
+import weakref
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeVar, cast
+
+from smartcam._arguments import check_seconds, check_seconds_or_none
+from smartcam._loop_thread import LoopThread, start_task
+from smartcam.exceptions import ConnectionClosedError, LocalProtocolError, ResponseTimeoutError
+from smartcam.models import ValueT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Generator, Iterator
+    from types import TracebackType
+    from typing import NoReturn, Self
+
+    from smartcam.camera import Camera
+    from smartcam.frames import Frame, FrameReader
+    from smartcam.models import SubscriberStatistics
+    from smartcam.settings import CameraSettings
+    from smartcam.streams import BatchSubscription, Subscription
+
+T = TypeVar("T")
+P = ParamSpec("P")
+ItemT = TypeVar("ItemT")
+
+_cameras: weakref.WeakSet[SyncCameraBase[Any]] = weakref.WeakSet()  # that are open
+_threads: dict[str, LoopThread] = {}  # one, once a camera was made
+
+
+def _started_thread() -> LoopThread:
+    """Return the thread of all cameras, which is started where a camera is first made.
+
+    There is one in a process, and a fork has one of its own. No lock is held, which a fork might
+    inherit: of two that are started at once one is ended again.
+    """
+    known = _threads.get(_NAME)
+    if known is not None and known.running:
+        return known
+    made = LoopThread(_NAME)
+    made.start()
+    thread = _threads.setdefault(_NAME, made)
+    if thread is not made:
+        made.stop()
+    return thread
+
+
+_NAME = "smartcam.sync"
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_threads.clear)
+
+
+@atexit.register
+def _close_all() -> None:
+    for camera in tuple(_cameras):
+        with contextlib.suppress(Exception):
+            camera.close()
+    for thread in _threads.values():
+        thread.stop()
+    _threads.clear()
+
+
+def _in_event_loop() -> bool:
+    """Return True if waiting here would hold up an event loop that runs in this thread.
+
+    A notebook has an event loop, too, but that loop does nothing while a cell runs.
+    """
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    ipython = sys.modules.get("IPython")
+    return ipython is None or cast("Any", ipython).get_ipython() is None
+
+
+class SyncCameraBase(Generic[ValueT]):
+    """The base of a camera without asyncio: all but the methods written from signatures.
+
+    Args:
+        camera: asynchronous camera that this class wraps, not opened yet.
+    """
+
+    def __init__(self, camera: Camera[ValueT]) -> None:
+        self._camera = camera
+        self._thread = _started_thread()
+
+    # ------------------------------------------------------------------ life
+
+    def open(self) -> Self:
+        """Connect: :meth:`smartcam.Camera.open`."""
+        camera, opened = self._camera, False
+
+        async def opening() -> None:  # without this object, which may end before it lets go
+            nonlocal opened
+            await camera.open()
+            opened = True
+
+        try:
+            self._wait(opening)
+            _cameras.add(self)
+        except BaseException:
+            if opened:  # Ctrl-C came when it was done
+                self._thread.post(lambda: _keep(camera.close()))
+            raise
+        return self
+
+    def close(self) -> None:
+        """Disconnect; idempotent: :meth:`smartcam.Camera.close`."""
+        self._wait(self._camera.close)
+        _cameras.discard(self)
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __aenter__(self) -> NoReturn:
+        raise TypeError("smartcam.sync is without asyncio: async with smartcam.connect(...)")
+
+    async def __aexit__(self, *_: object) -> None: ...
+
+    def __del__(self) -> None:
+        if self in _cameras and self._thread.running:
+            warnings.warn(f"{self!r} was not closed", ResourceWarning, source=self, stacklevel=2)
+            camera = self._camera
+            self._thread.post(lambda: _keep(camera.close()))
+
+    def __repr__(self) -> str:
+        return f"<SyncCamera {self.name} {self.url}>"
+
+    @property
+    def settings(self) -> CameraSettings:
+        """The validated options."""
+        return self._camera.settings
+
+    @property
+    def name(self) -> str:
+        """The camera's name in logs and results."""
+        return self._camera.name
+
+    @property
+    def url(self) -> str:
+        """Its address, with the dialect pinned once it was found out."""
+        return self._camera.url
+
+    # ------------------------------------------------------------------ inside
+
+    def _wait(
+        self, function: Callable[P, Coroutine[Any, Any, T]], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """Do something in the event loop; it has deadlines of its own."""
+        if _in_event_loop() and not self._thread.inside:
+            raise LocalProtocolError(
+                f"{self.name}: smartcam.sync would hold up the event loop that runs here; "
+                f'in it: async with smartcam.connect("{self.url}") as camera'
+            )
+        return self._thread.call(lambda: function(*args, **kwargs))
+
+    def _do(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Do something in the event loop that does not wait."""
+        return self._thread.run(function, *args, **kwargs)
+
+    def _subscribed(
+        self, subscribe: Callable[P, Any], *args: P.args, **kwargs: P.kwargs
+    ) -> SyncSubscription[Any]:
+        # made in the loop's thread, so that one that nobody gets is closed there, too
+        return self._do(lambda: SyncSubscription(subscribe(*args, **kwargs), self._thread, self))
+
+    @contextlib.contextmanager
+    def _inside(
+        self,
+        function: Callable[P, contextlib.AbstractAsyncContextManager[T]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> Generator[T]:
+        """Be inside a context of the loop's thread; it is left whenever Ctrl-C comes."""
+        inside = _Inside(function(*args, **kwargs))
+        try:
+            yield self._wait(inside.enter)
+        except BaseException as exc:
+            if inside.entered:
+                self._wait(functools.partial(inside.leave, exc))
+            raise
+        else:
+            self._wait(functools.partial(inside.leave, None))
+        finally:
+            if inside.entered:  # Ctrl-C came before leaving had begun
+                self._thread.post(lambda: _keep(inside.leave(None)))
+
+
+class _Inside(Generic[T]):
+    """A context that is entered and left in the loop's thread.
+
+    Attributes:
+        entered: whether it was entered, and leaving it has not begun.
+    """
+
+    def __init__(self, context: contextlib.AbstractAsyncContextManager[T]) -> None:
+        self._context = context
+        self.entered: bool = False
+
+    async def enter(self) -> T:
+        """Enter it."""
+        value = await self._context.__aenter__()
+        self.entered = True
+        return value
+
+    async def leave(self, exc: BaseException | None) -> None:
+        """Leave it; what was raised inside is raised by who called."""
+        self.entered = False
+        kind, trace = (None, None) if exc is None else (type(exc), exc.__traceback__)
+        try:
+            await self._context.__aexit__(kind, exc, trace)
+        except BaseException as raised:
+            if raised is not exc:
+                raise
+
+
+_closing: set[asyncio.Future[None]] = set()
+
+
+def _keep(work: Coroutine[Any, Any, None]) -> None:
+    """Have something done in the loop's thread that nobody waits for."""
+    task = start_task(work)
+    _closing.add(task)
+    task.add_done_callback(_closing.discard)
+
+
+class SyncSubscription(Generic[ItemT]):
+    """A bounded stream of items: ``for item in subscription``, and ``with`` to close it.
+
+    As :class:`smartcam.streams.Subscription`: it subscribes when it is made, and its account always
+    balances. One thread takes each item.
+    """
+
+    def __init__(
+        self,
+        subscription: Subscription[ItemT] | BatchSubscription[Any],
+        thread: LoopThread,
+        camera: SyncCameraBase[Any],
+    ) -> None:
+        self._subscription = subscription
+        self._thread = thread
+        self._camera = camera  # lives as long as somebody listens
+
+    @property
+    def ended(self) -> bool:
+        """True once no more items will come."""
+        return self._subscription.ended
+
+    def statistics(self) -> SubscriberStatistics:
+        """Return the account as it is now."""
+        return self._thread.run(self._subscription.statistics)
+
+    def close(self) -> None:
+        """Unsubscribe; what is queued counts as dropped. Idempotent."""
+        self._thread.run(self._subscription.close)
+
+    def get(self, timeout: float) -> ItemT:
+        """Return the next item.
+
+        Args:
+            timeout: seconds.
+
+        Raises:
+            ResponseTimeoutError: none came in time.
+            ConnectionClosedError: the stream has ended in order.
+            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+        """
+        check_seconds(timeout, "timeout", self._camera.name)
+        try:
+            return self._next(timeout)
+        except StopIteration:
+            raise ConnectionClosedError(
+                f"{self._camera.name}: the subscription has ended, nothing more will come"
+            ) from None
+
+    def __iter__(self) -> Iterator[ItemT]:
+        return self
+
+    def __next__(self) -> ItemT:
+        """Return the next item; waits as long as the stream lives.
+
+        Raises:
+            StopIteration: closed.
+            SmartCamError: an item that is an error (the stream stays usable), or how it ended.
+        """
+        return self._next(None)
+
+    def _next(self, timeout: float | None) -> ItemT:
+        timeout = check_seconds_or_none(timeout, "timeout", self._camera.name)
+        if _in_event_loop() and not self._thread.inside:
+            raise LocalProtocolError(
+                f"{self._camera.name}: smartcam.sync would hold up the event loop that runs here; "
+                "in it: async for item in a stream of smartcam.connect(...)"
+            )
+        item = self._thread.call(lambda: self._take(timeout))
+        if item is _END:
+            raise StopIteration
+        return cast("ItemT", item)
+
+    async def _take(self, timeout: float | None) -> Any:
+        try:
+            async with asyncio.timeout(timeout):
+                return await anext(self._subscription)
+        except StopAsyncIteration:
+            return _END
+        except TimeoutError as exc:
+            raise ResponseTimeoutError(
+                f"{self._camera.name}: nothing came within {timeout:g} s",
+                message_id=None,
+                waited=timeout or 0.0,
+            ) from exc
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, exc: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        # in the loop's thread, which goes through the subscribers
+        self._thread.post(self._subscription.close)
+
+
+class SyncFrameReaderBase:
+    """The part of a synchronous frame reader that is not written from signatures.
+
+    Args:
+        reader: asynchronous reader that this class wraps.
+        camera: camera that the frames are of.
+    """
+
+    def __init__(self, reader: FrameReader, camera: SyncCameraBase[Any]) -> None:
+        self._reader = reader
+        self._wait, self._do = camera._wait, camera._do  # noqa: SLF001 - the two are one
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self
+
+    def __next__(self) -> Frame:
+        """Return the newest frame that was not returned yet.
+
+        Raises:
+            StopIteration: the source ended in order.
+            FrameTimeoutError: none came in time; it may be waited for again.
+            FrameSourceError: how the source ended.
+        """
+        frame = self._wait(self._take)
+        if frame is None:
+            raise StopIteration
+        return frame
+
+    async def _take(self) -> Frame | None:
+        return await anext(self._reader, None)
+
+
+_END: Any = object()

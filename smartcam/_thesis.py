@@ -1,0 +1,339 @@
+"""The thesis' six services: what a request may say, and what is done for it.
+
+Programs reach them as JSON on a fleet's bus, at a node of ROS 2, or at one of ROS 1. Each of these
+is a :class:`ThesisFace`: it turns what came into a request, and the answer into what goes back.
+A field that is 0 or an empty text counts as not said, since messages of ROS have no other way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, Protocol
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from smartcam._client._inside import in_pixels, localizations_of, without_poses
+from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+from smartcam.exceptions import ConfigurationError, InterpretationError, LocalProtocolError
+from smartcam.settings import FLEET_SCHEMES, parse_address
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from smartcam._client._inside import Interpretation
+    from smartcam.settings import Address
+
+DEFAULT_TIMEOUT: Final = 10.0
+"""Seconds for a service that does not trigger, where the request says none."""
+
+MAX_TIMEOUT: Final = 600.0
+"""Seconds that a request may give its service."""
+
+MAX_DELAY: Final = 3600.0
+"""Seconds that may lie between two published results."""
+
+MAX_QUEUED_RESULTS: Final = 10_000
+DEFAULT_QUEUED_RESULTS: Final = 100
+"""Results that may wait for a delay to pass, and those that do where the request says none."""
+
+_KEYWORDS: Final = {"localizations": "localizations", "50bytestrings": "strings50"}
+
+_Text = Annotated[str, Field(max_length=200)]
+_Application = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
+
+
+def said_spec(text: str) -> str | None:
+    """Return the specification that a text names; None for an empty text."""
+    said = text.strip()
+    return _KEYWORDS.get(said.lower(), said) or None
+
+
+class ThesisRequest(BaseModel):
+    """The fields that every request may have; SmartcameraStop has no others."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    camera_name: _Text = ""
+    timeout: Annotated[float, Field(ge=0, le=MAX_TIMEOUT, allow_inf_nan=False)] | None = None
+
+
+class SetupRequest(ThesisRequest):
+    """A camera's address, and what is to be had of the camera."""
+
+    camera_model_name: _Text = ""
+    port: Annotated[int, Field(ge=0, le=0xFFFF)] | _Text = 0
+    con_address: _Text = ""
+    application_id: _Application = 0
+    interpret_as: Annotated[str, Field(max_length=10_000)] = ""
+    topic_status: _Text = ""
+
+    def address(self) -> Address:
+        """Return the camera's address.
+
+        Raises:
+            ConfigurationError: no camera can be there.
+        """
+        place = self.con_address
+        if "://" not in place:
+            place = f"[{place}]" if place.count(":") > 1 and "[" not in place else place
+            if self.port not in {0, "", "0"} and ":" not in place.rpartition("]")[2]:
+                place = f"{place}:{self.port}"
+        return parse_address(place, model=self.camera_model_name or None)
+
+
+class PublishingRequest(ThesisRequest):
+    """A request that names the topic for results, and how often they are published at most."""
+
+    topic_for_outputs: _Text = ""
+    min_delay: Annotated[float, Field(ge=0, le=MAX_DELAY, allow_inf_nan=False)] = 0.0
+    queue_size: Annotated[int, Field(ge=0, le=MAX_QUEUED_RESULTS)] = 0
+
+
+class ApplicationRequest(ThesisRequest):
+    """The application to load."""
+
+    application_id: Annotated[int, Field(ge=1, le=0xFFFFFFFF)]
+
+
+class ThesisTriggerRequest(ThesisRequest):
+    """The application to trigger, before the camera goes back; 0 is the active one."""
+
+    application_id: _Application = 0
+
+
+class ThesisFace(Protocol):
+    """A camera as the six services see it, and what publishes its results and its status.
+
+    Attributes:
+        name: the camera's name.
+        address: where the camera itself is.
+        application: the id of the active application; None where that is not known.
+        reading: how its results are read; None where nobody knows what they hold.
+        stopped: whether SmartcameraStop has closed the camera for these services.
+    """
+
+    @property
+    def stopped(self) -> bool: ...
+
+    @stopped.setter
+    def stopped(self, stopped: bool) -> None: ...
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def address(self) -> Address: ...
+
+    @property
+    def application(self) -> int | None: ...
+
+    @property
+    def reading(self) -> Interpretation | None: ...
+
+    def check_reading(self, spec: str) -> None:
+        """Raise ConfigurationError where results cannot be read by ``spec``."""
+
+    def read_as(self, spec: str | None) -> None:
+        """Read results by ``spec`` from now on; None: as the settings say."""
+
+    def is_calibrated(self, application: int) -> bool:
+        """Return True if a calibration turns an application's localizations into a robot's."""
+        ...
+
+    def check_status_topic(self, topic: str) -> None:
+        """Raise ConfigurationError where there can be no such topic."""
+
+    def publish_status(self, topic: str) -> dict[str, Any]:
+        """Publish the status on this topic, and on none that was said before."""
+        ...
+
+    async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
+        """Publish results on this topic, and on none that was said before."""
+        ...
+
+    async def end_publishing(self) -> None:
+        """Publish neither on topics that a request has named."""
+
+    async def have_session(self) -> None:
+        """Have a session with the camera, or raise the error that says why there is none."""
+
+    async def ensure(self, application: int, timeout: float) -> None:
+        """Have an application running and ready."""
+
+    async def switch(self, application: int, timeout: float) -> None:
+        """Load an application."""
+
+    async def trigger(self, application: int | None, spec: Any, timeout: float) -> tuple[int, Any]:
+        """Trigger; return the result's application, and its value as ``spec`` reads it."""
+        ...
+
+
+class ThesisCall(NamedTuple):
+    """A service under way.
+
+    Attributes:
+        face: the camera.
+        request: what is asked for, of the service's own kind.
+        timeout: seconds.
+    """
+
+    face: ThesisFace
+    request: Any
+    timeout: float
+
+
+class ThesisService(NamedTuple):
+    """One of the six services.
+
+    Attributes:
+        request: what it takes.
+        do: does it, and returns what its answer has beside ``error``.
+        timeout: seconds, where the request says none.
+        settles: the service changes what is published, and waits for others that do.
+        after_stop: whether the service works after SmartcameraStop, before the next
+            SmartcameraSetup.
+        nothing: the field of its answer that is an empty list beside an error, where it has one.
+    """
+
+    request: type[ThesisRequest]
+    do: Callable[[ThesisCall], Awaitable[dict[str, Any]]]
+    timeout: float = DEFAULT_TIMEOUT
+    settles: bool = False
+    after_stop: bool = False
+    nothing: str | None = None
+
+    async def answer(self, call: ThesisCall) -> dict[str, Any]:
+        """Do what is asked for; return what the answer has beside ``error``.
+
+        Raises:
+            LocalProtocolError: the camera was stopped.
+            SmartCamError: as the service ends.
+        """
+        if call.face.stopped and not self.after_stop:
+            raise LocalProtocolError(
+                f"{call.face.name}: SmartcameraStop has closed it: expected SmartcameraSetup first"
+            )
+        return await self.do(call)
+
+
+async def _setup(call: ThesisCall) -> dict[str, Any]:
+    """Have a camera as a request describes it; nothing is done where it is another one."""
+    face, request = call.face, call.request
+    _check_place(face, request)
+    spec = said_spec(request.interpret_as)
+    if spec is not None:
+        face.check_reading(spec)
+    face.check_status_topic(request.topic_status)
+    await face.have_session()
+    if request.application_id:
+        await face.ensure(request.application_id, call.timeout)
+    if spec is not None:
+        face.read_as(spec)
+    face.stopped = False
+    return face.publish_status(request.topic_status)
+
+
+def _check_place(face: ThesisFace, request: SetupRequest) -> None:
+    """See that a request means the camera that the face has.
+
+    Raises:
+        ConfigurationError: it means another one.
+    """
+    name, has, model = face.name, face.address, request.camera_model_name
+    cure = "; Stop it first, or choose another camera_name"
+    if not (model or request.con_address):
+        return
+    if has.scheme in FLEET_SCHEMES:
+        raise ConfigurationError(
+            f"{name}: it is a fleet's, which knows where it is: expected con_address and "
+            "camera_model_name to be empty"
+        )
+    if model and (protocol := parse_address(has.host, model=model).protocol) != has.protocol:
+        raise ConfigurationError(
+            f"{name}: Setup says it is a {model}, which speaks {protocol}, but it speaks "
+            f"{has.protocol}{cure}"
+        )
+    if request.con_address:
+        wanted = request.address()
+        if (wanted.host, wanted.port, wanted.protocol) != (has.host, has.port, has.protocol):
+            raise ConfigurationError(
+                f"{name}: Setup says it is at {wanted.url}, but it is at {has.url}{cure}"
+            )
+
+
+async def _enable_publishing(call: ThesisCall) -> dict[str, Any]:
+    request: PublishingRequest = call.request
+    queue = request.queue_size or DEFAULT_QUEUED_RESULTS
+    return await call.face.publish_results(request.topic_for_outputs, request.min_delay, queue)
+
+
+async def _stop(call: ThesisCall) -> dict[str, Any]:
+    await call.face.end_publishing()
+    call.face.read_as(None)
+    call.face.stopped = True
+    return {}
+
+
+async def _change_application(call: ThesisCall) -> dict[str, Any]:
+    await call.face.switch(call.request.application_id, call.timeout)
+    return {}
+
+
+async def _trigger_strings(call: ThesisCall) -> dict[str, Any]:
+    application = call.request.application_id or None
+    _, strings = await call.face.trigger(application, "strings50", call.timeout)
+    return {"strings": strings}
+
+
+async def _trigger_localizations(call: ThesisCall) -> dict[str, Any]:
+    face, wanted = call.face, call.request.application_id or None
+    spec = _spec_of_localizations(face, wanted)
+    application, value = await face.trigger(wanted, spec, call.timeout)
+    found = localizations_of(value)
+    pixels = in_pixels(_interpreter_of(spec, application)) and not face.is_calibrated(application)
+    if found is None or pixels:
+        raise InterpretationError(
+            f"{face.name}: expected localizations in metres, got {value!r:.80}; "
+            "a trigger without these services gives what the layout says",
+            expected="localizations",
+        )
+    return {"localizations": found}
+
+
+def _spec_of_localizations(face: ThesisFace, application: int | None) -> Any:
+    """Return the specification of localizations: the camera's own, or the thesis'."""
+    reading = face.reading
+    if reading is None:
+        return "localizations"
+    if not reading.by_application:
+        return _with_poses(reading, None)
+    asked = {application, face.application} - {None}
+    return {one: _with_poses(reading, one) for one in {*reading.applications, *asked}}
+
+
+def _with_poses(reading: Interpretation, application: int | None) -> Any:
+    own = reading.interpreter(application)
+    return "localizations" if own is None or without_poses(own) is not None else own
+
+
+def _interpreter_of(spec: Any, application: int) -> Any:
+    """Return the interpreter of an application; None where the thesis' own fields are read."""
+    one = spec.get(application) if isinstance(spec, dict) else spec
+    return None if isinstance(one, str) else one
+
+
+THESIS: Final[dict[str, ThesisService]] = {
+    "SmartcameraSetup": ThesisService(SetupRequest, _setup, settles=True, after_stop=True),
+    "EnablePublishing": ThesisService(PublishingRequest, _enable_publishing, settles=True),
+    "SmartcameraStop": ThesisService(ThesisRequest, _stop, settles=True, after_stop=True),
+    "ChangeApplication": ThesisService(ApplicationRequest, _change_application),
+    "Trigger50ByteString": ThesisService(
+        ThesisTriggerRequest, _trigger_strings, DEFAULT_TRIGGER_TIMEOUT, nothing="strings"
+    ),
+    "TriggerLocalization": ThesisService(
+        ThesisTriggerRequest,
+        _trigger_localizations,
+        DEFAULT_TRIGGER_TIMEOUT,
+        nothing="localizations",
+    ),
+}
+"""The six services by name."""

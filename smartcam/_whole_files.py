@@ -1,0 +1,163 @@
+"""Files that are written whole or not at all.
+
+A temporary file in the same folder is written and synced, the present file is kept under ``NAME.1``
+where that is wanted (the one before as ``NAME.2``, ...), the new one takes its place in one step,
+the folder is synced. Whenever that is cut off, the name leads to the old file or the new one, and
+to all of it; the next writer clears away what was left. One process writes in a folder at a time:
+the one that has its lock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import filecmp
+import itertools
+import os
+import re
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from smartcam._locks import try_lock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+LOCK_TIMEOUT = 30.0
+"""Seconds that a writer waits for others in the same folder, each of which takes milliseconds."""
+
+_LOOK_AGAIN = 0.002
+_ATTEMPTS = 5
+
+
+class FolderInUseError(OSError):
+    """Another process writes in a file's folder, and does not end."""
+
+
+def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
+    """Put a file in the place of another, whole or not at all; a symbolic link is replaced.
+
+    Any number of processes and threads may do so at once; the last one's file stays. What a crash
+    left behind is cleared away.
+
+    Raises:
+        FolderInUseError: another process writes in the folder and does not end.
+        OSError: the file cannot be written. What was there is there.
+    """
+    with _writing(path) as alone:
+        if alone:
+            _clear(path)
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(FileNotFoundError, FileExistsError):
+                return _replace(path, body, backups)
+        return _replace(path, body, backups)
+
+
+def keep_backup(path: Path, count: int) -> None:
+    """Keep a file as ``NAME.1``, the one before as ``NAME.2``, up to ``count``; it stays there.
+
+    Nothing is done where it is not there.
+
+    Raises:
+        FolderInUseError, OSError: as :func:`replace_file`.
+    """
+    with _writing(path):
+        _rotate(path, count)
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the system write a folder's names to the disk, where it can."""
+    flags = getattr(os, "O_DIRECTORY", None)
+    if flags is None:  # Windows: folders cannot be opened
+        return
+    handle = os.open(folder, os.O_RDONLY | flags)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[bool]:
+    """Be the only one that writes in a file's folder.
+
+    Yields whether it is so: there are file systems without locks.
+    """
+    handle = _open_lock(path.parent)
+    try:
+        deadline = time.monotonic() + LOCK_TIMEOUT
+        while (alone := try_lock(handle)) is False:
+            if time.monotonic() > deadline:
+                raise FolderInUseError(
+                    f"another process has written in its folder for {LOCK_TIMEOUT:g} s; expected "
+                    "it to end"
+                )
+            time.sleep(_LOOK_AGAIN)
+        yield alone is True
+    finally:
+        os.close(handle)  # and with it the lock
+
+
+def _open_lock(folder: Path) -> int:
+    """Return the path to lock: the folder itself; on Windows, where it cannot be, a file in it."""
+    flags = getattr(os, "O_DIRECTORY", None)
+    if flags is None:
+        return os.open(folder / ".smartcam.lock", os.O_RDWR | os.O_CREAT)
+    return os.open(folder, os.O_RDONLY | flags)
+
+
+def _replace(path: Path, body: bytes, backups: int) -> None:
+    """Replace a file; where there are no locks, another one may be at the backups, too."""
+    temporary = _temporary(path, body)
+    try:
+        if backups > 0:
+            _rotate(path, backups)
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    sync_folder(path.parent)
+
+
+def _clear(path: Path) -> None:
+    """Take away what was to become this file when its writer was killed."""
+    stale = re.compile(re.escape(f".{path.name}.") + r"[a-z0-9_]{8}\.tmp")
+    with os.scandir(path.parent) as found:
+        names = [one.name for one in found if stale.fullmatch(one.name)]
+    for name in names:
+        path.with_name(name).unlink(missing_ok=True)
+
+
+def _temporary(path: Path, body: bytes) -> Path:
+    """Write a file beside another one, to take its place."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(body)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except BaseException:
+        with contextlib.suppress(OSError):
+            Path(name).unlink()
+        raise
+    return Path(name)
+
+
+def _rotate(path: Path, count: int) -> None:
+    if not path.is_file() or path.is_symlink():
+        return
+    rows = [path.with_name(f"{path.name}.{number}") for number in range(1, count + 1)]
+    if rows[0].is_file() and filecmp.cmp(path, rows[0], shallow=False):
+        return  # a crash came between backup and new file
+    filled = list(itertools.takewhile(Path.exists, rows[:-1]))  # a gap takes what comes before it
+    for newer, older in reversed(list(zip(filled, rows[1:], strict=False))):
+        if older.exists() and newer.samefile(older):
+            newer.unlink()  # to rename one name of a file to another does nothing
+        else:
+            newer.replace(older)
+    try:
+        os.link(path, rows[0])  # a second name: no moment without the file
+    except (OSError, NotImplementedError):
+        _temporary(path, path.read_bytes()).replace(rows[0])

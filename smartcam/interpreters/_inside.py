@@ -1,0 +1,29 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.interpreters._base import AnySpec, TypedSpec, plain, run_plain, run_sequence
+    from smartcam.interpreters._localizations import LocalizationsInterpreter
+
+__all__ = [
+    "AnySpec",
+    "LocalizationsInterpreter",
+    "TypedSpec",
+    "plain",
+    "run_plain",
+    "run_sequence",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_base": "AnySpec TypedSpec plain run_plain run_sequence",
+            "_localizations": "LocalizationsInterpreter",
+        },
+    )

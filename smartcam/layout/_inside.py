@@ -1,0 +1,44 @@
+"""Names that other rooms import from this one; users do not need them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from smartcam._lazy import lazy
+
+if TYPE_CHECKING:
+    from smartcam.layout._classes import describes_layout, read_class
+    from smartcam.layout._text import SI_SYMBOLS, TYPES, UNITS, misfit
+    from smartcam.layout._texts import pack_texts
+    from smartcam.layout._units import ShownUnits, units_of
+    from smartcam.layout._yaml_files import read_model
+    from smartcam.layout._yamls import BadYamlError, compose, load
+
+__all__ = [
+    "SI_SYMBOLS",
+    "TYPES",
+    "UNITS",
+    "BadYamlError",
+    "ShownUnits",
+    "compose",
+    "describes_layout",
+    "load",
+    "misfit",
+    "pack_texts",
+    "read_class",
+    "read_model",
+    "units_of",
+]
+
+if not TYPE_CHECKING:
+    __getattr__ = lazy(
+        __name__,
+        {
+            "_classes": "describes_layout read_class",
+            "_text": "SI_SYMBOLS TYPES UNITS misfit",
+            "_texts": "pack_texts",
+            "_units": "ShownUnits units_of",
+            "_yaml_files": "read_model",
+            "_yamls": "BadYamlError compose load",
+        },
+    )

@@ -1,0 +1,104 @@
+"""All parsers, and their budgets as ``docs/architecture/limits.md`` has them."""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+
+from tests import ROOT
+from tests.budgets.bus import BUS
+from tests.budgets.parser import Parser
+from tests.budgets.texts import TEXTS
+from tests.budgets.wire import WIRE
+
+PARSERS: dict[str, Parser] = {one.name: one for one in (*WIRE, *TEXTS, *BUS)}
+"""Every parser of foreign bytes by its name."""
+
+
+class _Text:
+    """A text that each piece is copied to: an attribute, which nobody makes longer in its place."""
+
+    def __init__(self) -> None:
+        self.text = ""
+
+    def add(self, piece: str) -> None:
+        self.text += piece
+
+
+def _copied(pieces: list[bytes]) -> None:
+    found = _Text()
+    for piece in pieces:
+        found.add(piece.decode())
+
+
+EXAMPLE = Parser(
+    "copies for each piece",
+    _copied,
+    {"pieces": lambda size: [b"a" * 36] * (size // 36)},
+    1 << 20,
+    "an example of what must not be",
+    size=1 << 18,
+)
+
+PAGE = ROOT / "docs" / "architecture" / "limits.md"
+
+SPEED = 2_000_000_000
+"""Instructions a second of a processor that is not new."""
+
+
+class Budget(NamedTuple):
+    """A row of the page's table.
+
+    Attributes:
+        largest: bytes of the largest input.
+        bound: what says so.
+        instructions: of the processor for each byte, at most.
+        memory: bytes for each byte, at most, beside :data:`FREE`.
+    """
+
+    largest: str
+    bound: str
+    instructions: int
+    memory: int
+
+
+FREE = 40 << 20
+"""Bytes of memory that every parser may take whatever it is given."""
+
+
+def budgets() -> dict[str, Budget]:
+    """Return the page's table, by parser."""
+    text = PAGE.read_text(encoding="utf-8")
+    found = re.findall(
+        r"^\| ([^|]+) \| ([^|]+) \| ([^|]+) \| ([\d,]+) \| ([\d,]+) \| [^|]+ \|$",
+        text,
+        re.MULTILINE,
+    )
+    return {
+        name: Budget(largest, bound, *(int(one.replace(",", "")) for one in numbers))
+        for name, largest, bound, *numbers in found
+    }
+
+
+def shown(size: int) -> str:
+    """Return a number of bytes as the page has it."""
+    for unit, name in ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")):
+        if size >= unit:
+            return f"{size / unit:.3g} {name}"
+    return f"{size} bytes"
+
+
+def seconds(parser: Parser, instructions: int) -> str:
+    """Return how long the largest input takes at most, as the page has it."""
+    if parser.largest >= 1 << 40:
+        return "-"
+    return f"{parser.largest * instructions / SPEED:.2g}"
+
+
+def row(parser: Parser, instructions: int, memory: int) -> str:
+    """Return a row of the page's table."""
+    largest = "any" if parser.largest >= 1 << 40 else shown(parser.largest)
+    return (
+        f"| {parser.name} | {largest} | `{parser.bound}` | {instructions:,} | {memory:,} | "
+        f"{seconds(parser, instructions)} |"
+    )

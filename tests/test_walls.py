@@ -1,0 +1,81 @@
+"""Rooms have walls: a room imports another one by its door, or by its module ``_inside``.
+
+The door is the package itself, or a public package in it. ``_inside`` lists what other rooms use
+and users do not. What stands beside the rooms, such as ``smartcam/_locks.py``, is for all of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from tests.imports import ROOMS, SOURCES, imports, room_of, sources
+
+if TYPE_CHECKING:
+    import ast
+    from collections.abc import Iterator, Mapping
+
+THROUGH_THE_WALL: dict[tuple[str, str], str] = {}
+"""The imports of another room's private module that stand, as (importer, module): the reason."""
+
+ROOMS_OF_TESTS = {"cli": "_cli", "client": "_client", "dissector": "_dissector"}
+"""Folders of tests whose room has another name."""
+
+MAX_OWN_PRIVATE, MAX_OTHERS_PRIVATE = 275, 82
+"""Test files that may import a private module of their own room, or of another one. These numbers
+fall, to 150 and 0."""
+
+
+def is_private(module: str) -> bool:
+    """Return whether a module stands behind the wall of its room."""
+    room = room_of(module)
+    inner = module.split(".")[2:]
+    if room is None or not inner or inner[-1] == "_inside":
+        return False
+    return room.startswith("smartcam._") or any(part.startswith("_") for part in inner)
+
+
+def room_of_test(module: str) -> str | None:
+    """Return the room that a module of tests is about; None for tests of the whole."""
+    parts = module.split(".")
+    room = f"smartcam.{ROOMS_OF_TESTS.get(parts[1], parts[1])}"
+    return room if room in ROOMS and len(parts) > 2 else None
+
+
+def private_imports(modules: Mapping[str, ast.Module]) -> Iterator[tuple[str, str]]:
+    """Yield (importer, module) for each private module that is imported."""
+    for importer, tree in modules.items():
+        for module in {one.module for one in imports(importer, tree)}:
+            if is_private(module):
+                yield importer, module
+
+
+def test_room_is_entered_by_its_door() -> None:
+    found = {
+        (importer, module)
+        for importer, module in private_imports(SOURCES)
+        if room_of(importer) != room_of(module)
+    }
+    assert found == set(THROUGH_THE_WALL)
+
+
+def test_inside_lists_what_other_rooms_use_and_nothing_else() -> None:
+    used: dict[str, set[str]] = {}
+    for importer, tree in SOURCES.items():
+        for one in imports(importer, tree):
+            if one.module.endswith("._inside") and one.name is not None:
+                assert room_of(importer) != room_of(one.module), f"{importer} goes round the house"
+                used.setdefault(one.module, set()).add(one.name)
+    listed = {name: importlib.import_module(name).__all__ for name in SOURCES if "._inside" in name}
+    assert {name: sorted(names) for name, names in used.items()} == {
+        name: sorted(names) for name, names in listed.items()
+    }
+
+
+def test_tests_import_ever_fewer_private_modules() -> None:
+    own: set[str] = set()
+    others: set[str] = set()
+    for importer, module in private_imports(sources("tests")):
+        (own if room_of(module) == room_of_test(importer) else others).add(importer)
+    assert len(own) <= MAX_OWN_PRIVATE
+    assert len(others) <= MAX_OTHERS_PRIVATE, sorted(others)

@@ -1,0 +1,179 @@
+"""The texts of the package: what can be checked of how they read.
+
+A text that begins in the middle of a sentence, or stands for its subject by a pronoun, makes a
+reader open the lines around it.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from tests.imports import SOURCES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class Text(NamedTuple):
+    """A text and where it stands."""
+
+    module: str
+    line: int
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.module}:{self.line}: {self.text.splitlines()[0]}"
+
+
+def constants() -> Iterator[Text]:
+    """Yield the text behind each assignment of a module or a class."""
+    for module, tree in SOURCES.items():
+        for owner in ast.walk(tree):
+            if not isinstance(owner, ast.Module | ast.ClassDef):
+                continue
+            for before, node in zip(owner.body, owner.body[1:], strict=False):
+                if isinstance(before, ast.Assign | ast.AnnAssign) and (text := text_of(node)):
+                    yield Text(module, node.lineno, text.strip())
+
+
+def text_of(node: ast.stmt) -> str:
+    """Return the text of a statement that is nothing but a text, else ''."""
+    value = node.value if isinstance(node, ast.Expr) else None
+    found = value.value if isinstance(value, ast.Constant) else None
+    return found if isinstance(found, str) else ""
+
+
+def docstrings() -> Iterator[Text]:
+    """Yield the docstring of each module, class and function."""
+    for module, tree in SOURCES.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                text = ast.get_docstring(node)
+                if text:
+                    yield Text(module, node.body[0].lineno, text)
+
+
+ENTRY = re.compile(r"^    (?:\*{0,2}[\w, ]+): (.+)$", re.MULTILINE)
+
+
+def entries() -> Iterator[Text]:
+    """Yield the first line of what is said of each attribute and argument."""
+    for module, line, text in docstrings():
+        for section in re.split(r"^(?=\w+:$)", text, flags=re.MULTILINE):
+            if section.startswith(("Args:", "Attributes:")):
+                for one in ENTRY.findall(section):
+                    yield Text(module, line, one)
+
+
+FRAGMENT = re.compile(r"(Of|The same|This|That|Those|These|In which|By which|At which|Of which)\b")
+PRONOUN = re.compile(r"(it|its|they|them|that|those|the same|which|whose|who)[.;,:]?(\s|$)")
+CLAUSE = re.compile(r"(Return|Yield|Say|Tell) (what|who|whose|whether|how|where|which)\b")
+
+
+def test_constants_are_explained_by_sentences() -> None:
+    found = [one for one in constants() if FRAGMENT.match(one.text)]
+    assert not found, "\n".join(map(str, found))
+
+
+def test_attributes_are_explained_by_nouns() -> None:
+    found = [one for one in entries() if PRONOUN.match(one.text)]
+    assert not found, "\n".join(map(str, found))
+
+
+def test_functions_say_what_they_return_by_a_noun() -> None:
+    found = [one for one in docstrings() if CLAUSE.match(one.text)]
+    assert not found, "\n".join(map(str, found))
+
+
+TIMES = {
+    *("AFTER", "AGE", "DEADLINE", "DELAY", "DELAYS", "DURATION", "GRACE", "INTERVAL", "LATENCY"),
+    *("LINGER", "PAUSE", "PERIOD", "PERIODS", "RESOLUTION", "SECONDS", "TIME", "TIMEOUT"),
+    *("TIMEOUTS", "WAIT", "WITHIN"),
+}
+"""Words of which one stands in the name of each constant that counts seconds."""
+
+UNITS = {"Milliseconds": "MS", "Microseconds": "US", "Nanoseconds": "NS"}
+"""Ends of the names of constants that count times in another unit, by the unit."""
+
+UNNAMED_TIMES = {
+    *("_cli", "calibration.wizards", "conformance", "doctor", "fleet", "ros1", "ros2", "web"),
+}
+"""Rooms in which some times still have names that do not say so; a room that is mended goes."""
+
+
+class Named(NamedTuple):
+    """A constant, and the text that explains it."""
+
+    module: str
+    name: str
+    text: str
+
+    @property
+    def room(self) -> str:
+        """The entry of :data:`UNNAMED_TIMES` for the constant's module, "" without one."""
+        inside = self.module.removeprefix("smartcam.")
+        found = [room for room in UNNAMED_TIMES if f"{inside}.".startswith(f"{room}.")]
+        return found[0] if found else ""
+
+    @property
+    def says_its_unit(self) -> bool:
+        """True if the name says that it is a time, where the text counts one."""
+        unit, parts = self.text.split()[0].rstrip(".:"), self.name.split("_")
+        if unit == "Seconds":
+            return not TIMES.isdisjoint(parts)
+        return unit not in UNITS or parts[-1] == UNITS[unit]
+
+
+def named_constants() -> Iterator[Named]:
+    """Yield each constant in capitals with its text."""
+    for module, tree in SOURCES.items():
+        for owner in ast.walk(tree):
+            if isinstance(owner, ast.Module | ast.ClassDef):
+                for before, node in zip(owner.body, owner.body[1:], strict=False):
+                    target = target_of(before)
+                    if target.isupper() and (text := text_of(node).strip()):
+                        yield Named(module, target, text)
+
+
+def target_of(node: ast.stmt) -> str:
+    """Return the name that a statement assigns to, else ''."""
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    return targets[0].id if isinstance(targets[0], ast.Name) else ""
+
+
+def test_names_of_times_say_that_they_are_times() -> None:
+    wrong = [one for one in named_constants() if not one.says_its_unit]
+    assert [f"{one.module}.{one.name}: {one.text}" for one in wrong if not one.room] == []
+    assert {one.room for one in wrong} - {""} == UNNAMED_TIMES
+
+
+OPENING = re.compile(r"(What|Who|Whose|Whether|Where|Which|How|When|Why|It)\b")
+
+
+def test_first_lines_name_what_they_are_about() -> None:
+    found = [one for one in (*docstrings(), *constants()) if OPENING.match(one.text)]
+    assert not found, "\n".join(map(str, found))
+
+
+HAPPENING = re.compile(r"(The|A|An|In here|No|Nothing|There|Each|All|From|These|Another) ")
+
+
+SHOWN = ("smartcam.conformance.", "smartcam.emulator._generators")
+"""Modules whose docstrings are shown to people: rules of the judges, names of generators."""
+
+
+def plain_functions() -> Iterator[Text]:
+    """Yield the first lines of functions without a decorator, by which others show docstrings."""
+    for module, tree in SOURCES.items():
+        for node in [] if module.startswith(SHOWN) else ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.decorator_list:
+                text = ast.get_docstring(node)
+                if text:
+                    yield Text(module, node.lineno, text)
+
+
+def test_functions_begin_with_a_verb() -> None:
+    found = [one for one in plain_functions() if HAPPENING.match(one.text)]
+    assert not found, "\n".join(map(str, found))
