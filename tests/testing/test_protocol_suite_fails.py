@@ -300,7 +300,7 @@ class Willing(Machine):
             row = self.dialect.row(m.Query)
             assert row is not None
             script = self.dialect.script(row, message)
-            self._asked.append(_OpenRequest(row, script, next(script), said=True))
+            self._asked.append(_OpenRequest(row, script, next(script), row.word, said=True))
         else:
             super().send(message, answered=answered)
 
