@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 
 import smartcam
-from smartcam import Camera
+from smartcam import Camera, Status
 from smartcam.emulator import LineCamera, load_scenario
 from smartcam.exceptions import ConfigurationError, ConnectionLostError, TriggerTimeoutError
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
@@ -140,3 +141,27 @@ async def test_recording_is_played_to_clients_that_ask_otherwise(make: str, tmp_
     ):
         await camera.query_application()  # which moves all the tickets
         assert [(await camera.trigger()).raw for _ in range(3)] == recorded
+
+
+@pytest.mark.asyncio
+@pytest.mark.real_time
+async def test_recorded_state_is_played_at_its_trigger_however_often_a_client_asks(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    async with MAKES["sr"](reading_time=0.3) as emulator:
+        with Recorder(path) as made:
+            async with smartcam.connect(emulator.url, name="left", observers=[made]) as camera:
+                triggered = asyncio.create_task(camera.trigger())
+                while Status.BUSY not in (last := await camera.query_status()):
+                    assert not triggered.done()
+                recorded = (await triggered).raw
+    assert Status.BUSY in last  # which nothing but the code follows
+    async with (
+        replay(load_recording(path)) as played,
+        smartcam.connect(played.url) as camera,
+    ):
+        for _ in range(5):
+            assert Status.BUSY not in await camera.query_status()
+        assert (await camera.trigger()).raw == recorded
+        assert Status.BUSY not in await camera.query_status()

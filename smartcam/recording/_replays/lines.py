@@ -1,12 +1,15 @@
 """A recorded camera that spoke in lines, emulated: each line gets what the recorded one got.
 
-The n-th time that a client says a line, it gets what the n-th one got, byte for byte and after the
-same time; behind the last of them the last one again. A trigger behind the last one gets nothing.
-A line that was never said ends the connection: nobody knows its answer.
+The n-th trigger gets what the n-th recorded one got, byte for byte and after the same time; a
+trigger behind the last one gets nothing. Every other line gets what the camera answered at the same
+moment of the recording: before the first trigger, during the n-th one, or after its answer. So a
+client that asks more or less often than the recorded one hears the state that belongs to the
+trigger. A line that was never said ends the connection: nobody knows its answer.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,20 +45,27 @@ class TimedLine(NamedTuple):
 
 @dataclass(slots=True)
 class LineAnswers:
-    """The answers to a line, for each time that it was said."""
+    """The answers to a line, for each time that it was said.
+
+    Attributes:
+        given: the answers.
+        moments: the moment of each: 0 before the first trigger, 2n - 1 during the n-th one, 2n
+            after its answer.
+        next: index of the answer that is played next, where order decides.
+        asked: number of times that the line was said since the moment began.
+        asked_at: that moment.
+    """
 
     given: list[list[TimedLine]] = field(default_factory=list[list[TimedLine]])
+    moments: list[int] = field(default_factory=list[int])
     next: int = 0
+    asked: int = 0
+    asked_at: int = -1
 
     @property
     def left(self) -> int:
         """Number of answers that were not played yet, in this round."""
         return max(0, len(self.given) - self.next)
-
-    def forget_silence(self) -> None:
-        """End the link: what a line under way would have got is not known."""
-        if self.given and not self.given[-1]:
-            self.given.pop()
 
     def take(self, *, loop: bool) -> list[TimedLine]:
         """Return the next ones; behind the last the last again, or the first."""
@@ -63,6 +73,22 @@ class LineAnswers:
             self.next = 0
         found = self.given[min(self.next, len(self.given) - 1)]
         self.next += 1
+        return found
+
+    def take_at(self, moment: int) -> list[TimedLine]:
+        """Return the next ones of a moment; behind its last the last again.
+
+        Where nothing was recorded then, the nearest moment of the same kind answers, an earlier one
+        first: before and after triggers are one kind, during triggers is the other.
+        """
+        if moment != self.asked_at:
+            self.asked, self.asked_at = 0, moment
+        nearest = min(
+            self.moments, key=lambda one: ((one - moment) % 2, one > moment, abs(one - moment))
+        )
+        of_moment = [at for at, one in enumerate(self.moments) if one == nearest]
+        found = self.given[of_moment[min(self.asked, len(of_moment) - 1)]]
+        self.asked += 1
         return found
 
 
@@ -74,11 +100,13 @@ class LinesPlan:
         greeting: bytes sent before any line came.
         answers: answers to each line, by the line without its end.
         secrets: answers to lines that were not recorded, such as passwords, by place in a session.
+        triggers: number of triggers that were recorded.
     """
 
     greeting: list[TimedLine] = field(default_factory=list[TimedLine])
     answers: dict[bytes, LineAnswers] = field(default_factory=dict[bytes, LineAnswers])
     secrets: dict[int, LineAnswers] = field(default_factory=dict[int, LineAnswers])
+    triggers: int = 0
 
 
 def eight_bits(picture: Frame) -> NDArray[np.uint8]:
@@ -89,6 +117,20 @@ def eight_bits(picture: Frame) -> NDArray[np.uint8]:
     return grey.astype("u1")
 
 
+@dataclass(slots=True)
+class _Asked:
+    """A line of the recorded client: what it got, and where in the recording that began and ended.
+
+    A line that was not recorded is known by its place in its session.
+    """
+
+    at: float
+    line: bytes | int = 0
+    begin: int = 0
+    end: int | None = None
+    pieces: list[TimedLine] = field(default_factory=list[TimedLine])
+
+
 def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
     """Work out what each line got: what came behind it, or what names it as its question.
 
@@ -96,13 +138,13 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
         RecordingError: it is more than :data:`MAX_REPLAY`.
     """
     plan = LinesPlan()
-    pieces, began, place, size = plan.greeting, None, 0, 0
-    last = LineAnswers()
-    known: dict[str, tuple[list[TimedLine], float]] = {}  # by what answers are known by
-    for item in items:
+    now, place, size = _Asked(0.0, pieces=plan.greeting), 0, 0
+    known: dict[str, _Asked] = {}  # by what answers are known by
+    lines: list[_Asked] = []
+    for number, item in enumerate(items):
         if isinstance(item, Disconnected):
-            last.forget_silence()
-            pieces, began, place = [], None, 0
+            _forget_silence(lines)
+            now, place = _Asked(item.at.timestamp()), 0
             known.clear()
         if not isinstance(item, TraceEntry) or item.direction == "!":
             continue
@@ -110,23 +152,52 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
         size += len(data)
         if size > MAX_REPLAY:
             raise RecordingError(f"recording: {size} bytes of lines, expected {MAX_REPLAY} at most")
-        began = at if began is None else began
         if item.direction == "<":
-            answered, asked_at = known.get(codec.answer_key(data), (pieces, began))
-            answered.append(TimedLine(max(0.0, at - asked_at), data))
+            answered = known.get(codec.answer_key(data), now)
+            answered.at = answered.at or at  # nobody asked for a greeting
+            answered.end = number
+            answered.pieces.append(TimedLine(max(0.0, at - answered.at), data))
             continue
-        pieces, began = [], at
-        known[codec.request_key(data)] = pieces, began
-        last = (
-            plan.answers.setdefault(bare(codec, data), LineAnswers())
-            if data
-            else plan.secrets.setdefault(place, LineAnswers())
-        )
-        last.given.append(pieces)
+        now = _Asked(at, bare(codec, data) if data else place, number)
+        known[codec.request_key(data)] = now
+        lines.append(now)
         place += 1
-    last.forget_silence()
-    plan.answers = {line: one for line, one in plan.answers.items() if one.given}
+    _forget_silence(lines)
+    _arrange(plan, lines, codec)
     return plan
+
+
+def _forget_silence(lines: list[_Asked]) -> None:
+    """Leave out the last line of a link that ended before an answer: its answer is not known."""
+    if lines and not lines[-1].pieces:
+        lines.pop()
+
+
+def _arrange(plan: LinesPlan, lines: list[_Asked], codec: LineCodec) -> None:
+    """Put what each line got in its place in a plan."""
+    triggers = [one for one in lines if isinstance(one.line, bytes) and is_trigger(codec, one.line)]
+    plan.triggers = len(triggers)
+    for one in lines:
+        answers = (
+            plan.answers.setdefault(one.line, LineAnswers())
+            if isinstance(one.line, bytes)
+            else plan.secrets.setdefault(one.line, LineAnswers())
+        )
+        answers.given.append(one.pieces)
+        answers.moments.append(_moment(one.begin, triggers))
+
+
+def _moment(place: int, triggers: list[_Asked]) -> int:
+    """Return the moment of a place in a recording, see :class:`LineAnswers`."""
+    before = bisect_left(triggers, place, key=lambda one: one.begin)
+    end = triggers[before - 1].end if before else None
+    return 2 * before - (before > 0 and (end is None or end > place))
+
+
+def is_trigger(codec: LineCodec, line: bytes) -> bool:
+    """Return True if a client's line triggers the camera."""
+    row = codec.row_of(line.decode(codec.encoding, "replace"))
+    return codec.message_type(m.Sender.CLIENT, row) is m.Trigger
 
 
 def bare(codec: LineCodec, data: bytes) -> bytes:
@@ -174,6 +245,7 @@ class ReplayedLines(LineCamera):
         self._on_over = None if loop else on_over
         self._places: dict[LineClient, int] = {}
         self._triggered = 0  # triggers that were played
+        self._answered = 0  # the last trigger that was answered to its end
         self._images = self._recorded_images(recording, known.name)
 
     def make_codec(self) -> LineCodec:
@@ -205,7 +277,7 @@ class ReplayedLines(LineCamera):
             if isinstance(item, Result):
                 of_result[item.number] = triggers
             elif isinstance(item, TraceEntry) and item.direction == ">":
-                triggers += self._triggers(bare(self.lines, bytes.fromhex(item.hex)))
+                triggers += is_trigger(self.lines, bare(self.lines, bytes.fromhex(item.hex)))
         found: dict[int, bytes] = {}
         size = 0
         for result, picture, _ in recording.judged(camera):
@@ -232,11 +304,9 @@ class ReplayedLines(LineCamera):
     @property
     def remaining(self) -> int:
         """Number of triggers that are left, in this round."""
-        return sum(one.left for line, one in self.plan.answers.items() if self._triggers(line))
-
-    def _triggers(self, line: bytes) -> bool:
-        row = self.lines.row_of(line.decode(self.lines.encoding, "replace"))
-        return self.lines.message_type(m.Sender.CLIENT, row) is m.Trigger
+        return sum(
+            one.left for line, one in self.plan.answers.items() if is_trigger(self.lines, line)
+        )
 
     def begins_session(self, message: HeardLine) -> bool:
         """Return True: whoever says a line that is not in the recording is sent away."""
@@ -263,17 +333,46 @@ class ReplayedLines(LineCamera):
         if found is None:
             client.end(f"nothing in the recording answers {line[:64]!r}")
             return
-        triggers = self._triggers(data)
+        triggers = is_trigger(self.lines, data)
         self._triggered += triggers
         if triggers and not found.left and not self._loop:
             client.answer(None)
             return
         if place + 1 in self.plan.secrets:
             client.hide_next()
-        self._play(client, found.take(loop=self._loop), client.go_on)
+        pieces = self._take(data, found)
+        self._play(client, pieces, self._ended(client, trigger=triggers and bool(pieces)))
         if triggers and self._on_over is not None and not self.remaining:
             tell, self._on_over = self._on_over, None
             tell()
+
+    def _take(self, line: bytes, found: LineAnswers) -> list[TimedLine]:
+        """Return what a line gets now."""
+        if (
+            is_trigger(self.lines, line)
+            or not self.plan.triggers
+            or found is not self.plan.answers.get(line)
+        ):
+            return found.take(loop=self._loop)
+        return found.take_at(self._moment())
+
+    def _moment(self) -> int:
+        """Return the moment of the recording that is played, see :class:`LineAnswers`."""
+        number = self._triggered
+        if self._loop and number:
+            number = (number - 1) % self.plan.triggers + 1
+        return 2 * number - (self._answered < self._triggered)
+
+    def _ended(self, client: LineClient, *, trigger: bool) -> Callable[[], None]:
+        """Return what is done once a line has got all that it gets."""
+        number = self._triggered
+
+        def end() -> None:
+            if trigger:
+                self._answered = max(self._answered, number)
+            client.go_on()
+
+        return end
 
     def _play(
         self, client: LineClient, pieces: list[TimedLine], done: Callable[[], None] | None = None

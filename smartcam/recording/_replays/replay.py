@@ -423,9 +423,9 @@ def replay(
 ) -> ReplayedCamera | ReplayedLines:
     """Return an emulated camera that plays a recording, of whatever protocol.
 
-    One of frames is a :class:`ReplayedCamera`. One of lines gives the n-th of equal lines what the
-    recorded n-th one got, after the same time. One of a fleet's camera has no frames: its results
-    are played.
+    One of frames is a :class:`ReplayedCamera`. One of lines gives the n-th trigger what the
+    recorded n-th one got, after the same time, and other lines what was answered at that moment.
+    One of a fleet's camera has no frames: its results are played.
 
     Args:
         recording: recording to play.
