@@ -49,7 +49,10 @@ each_parser = pytest.mark.parametrize("parser", PARSERS.values(), ids=list(PARSE
 each_parser_in_turn = pytest.mark.parametrize(
     "parser",
     [
-        pytest.param(one, marks=[pytest.mark.long] if one.short == PAST_LOOKAHEAD else [])
+        pytest.param(
+            one,
+            marks=[pytest.mark.long, pytest.mark.widest] if one.short == PAST_LOOKAHEAD else [],
+        )
         for one in PARSERS.values()
         if one.name != "YAML"
     ]

@@ -203,7 +203,7 @@ def test_slow_network_that_loses_packets_loses_no_result(network: Network, tmp_p
         assert busy.wait() == (0, f"{[*range(1, 21)]} 0\n", "")
 
 
-@pytest.mark.parametrize("kept", [100, 2])
+@pytest.mark.parametrize("kept", [pytest.param(100, marks=pytest.mark.widest), 2])
 def test_cable_that_is_pulled_for_longer_than_the_lease(
     kept: int, network: Network, tmp_path: Path
 ) -> None:

@@ -102,6 +102,7 @@ async def test_killed_agent_is_replaced() -> None:
         assert "Reconnected" in await work.told()
 
 
+@pytest.mark.widest
 async def test_stopped_agent_is_replaced_and_does_not_take_it_back() -> None:
     async with hosts_at_work() as (hosts, work):
         hosts.agents["north"].signal(signal.SIGSTOP)  # as if its cable was cut
@@ -156,6 +157,7 @@ async def test_host_that_is_cut_off_is_replaced_and_stands_by_when_it_is_back(
         assert work.camera.connected
 
 
+@pytest.mark.widest
 async def test_router_that_is_back_leaves_one_agent_with_the_camera() -> None:
     """It is the one that had it, unless a slow machine brings the other back that much earlier."""
     async with hosts_at_work() as (hosts, work):

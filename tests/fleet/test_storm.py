@@ -19,7 +19,7 @@ async def test_each_gets_its_own_result_inside_a_process() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.widest)])
 async def test_each_gets_its_own_result_inside_a_process_for_long(seed: int) -> None:
     figures = await storm_in_process(3000, seed)
     check(figures, 3000)

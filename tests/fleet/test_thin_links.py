@@ -46,12 +46,14 @@ def test_stream_is_as_late_as_one_frame_is_where_a_fifo_is_seconds_late(links: T
     assert beside["p50"] > raw["p50"] > 0  # by how much: benchmarks.thin_links
 
 
+@pytest.mark.widest
 def test_one_frame_on_request_takes_little_more_than_its_encoding_and_way(links: ThinLinks) -> None:
     links.shape(100)
     found = one_on_request(links, 40)
     assert 3_000 < found["size"] < 20_000
 
 
+@pytest.mark.widest
 def test_bit_rate_is_held(links: ThinLinks) -> None:
     links.shape(20)
     found = streamed(links, "small", 8.0, encoding="jpeg", bitrate=3e6)
@@ -59,6 +61,7 @@ def test_bit_rate_is_held(links: ThinLinks) -> None:
     assert 0 < found["bitrate"] <= 3.6e6
 
 
+@pytest.mark.widest
 def test_latency_is_held_where_the_link_is_thin(links: ThinLinks) -> None:
     links.shape(2)
     found = streamed(links, "small", 8.0, encoding="jpeg", latency=0.06)

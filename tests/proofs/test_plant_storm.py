@@ -21,6 +21,7 @@ SEED = 1
 
 @pytest.mark.long
 @pytest.mark.real_time
+@pytest.mark.widest
 async def test_plant_in_a_storm_mixes_up_nothing_and_loses_nothing_unseen(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

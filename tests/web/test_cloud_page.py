@@ -107,6 +107,7 @@ async def test_colours_and_places_are_those_of_the_cloud(page: Page) -> None:
         assert seen == pytest.approx(0.4 * np.cos(0.35), rel=0.12)
 
 
+@pytest.mark.widest
 async def test_dragging_turns_and_reset_turns_back(page: Page) -> None:
     async with opened(page, SCENE):
         before = await picture(page)
@@ -134,6 +135,7 @@ async def test_dragging_turns_and_reset_turns_back(page: Page) -> None:
         assert not np.array_equal(before, await picture(page))
 
 
+@pytest.mark.widest
 async def test_wheel_zooms(page: Page) -> None:
     async with opened(page, SCENE):
         before = where(await picture(page), RED)[2]
@@ -149,6 +151,7 @@ async def until_grown(page: Page, before: int) -> None:
     pytest.fail("it did not grow")
 
 
+@pytest.mark.widest
 async def test_two_fingers_zoom_and_one_turns(page: Page) -> None:
     async with opened(page, SCENE):
         before = await picture(page)
@@ -173,6 +176,7 @@ async def test_two_fingers_zoom_and_one_turns(page: Page) -> None:
         await touch.detach()
 
 
+@pytest.mark.widest
 async def test_colour_by_height_point_size_and_axes(page: Page) -> None:
     async with opened(page, Cloud(SCENE.points), up="-z") as site:
         assert await page.input_value("#colour") == "height"  # it has no picture
@@ -204,6 +208,7 @@ def refuse(*_args: object) -> Any:
     raise MemoryError("too much")
 
 
+@pytest.mark.widest
 async def test_newer_cloud_takes_the_place(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     async with opened(page, None) as site:
         assert await page.inner_text("#empty") == "No cloud yet."
@@ -246,6 +251,7 @@ async def test_server_that_goes_is_said_and_comes_back(page: Page) -> None:
             await page.goto("about:blank")
 
 
+@pytest.mark.widest
 async def test_lost_context_comes_back(page: Page) -> None:
     async with opened(page, SCENE):
         before = await picture(page)

@@ -42,7 +42,14 @@ def start(link: Link, end: int, *arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)  # noqa: S603
 
 
-@pytest.mark.parametrize(("crf", "repair"), [(4, 0.1), (23, 0.1), (23, 0)])
+@pytest.mark.parametrize(
+    ("crf", "repair"),
+    [
+        pytest.param(4, 0.1, marks=pytest.mark.widest),
+        (23, 0.1),
+        pytest.param(23, 0, marks=pytest.mark.widest),
+    ],
+)
 def test_pictures_over_a_link_that_loses_packets(link: Link, crf: int, repair: float) -> None:
     link.loss = 0.05
     seconds = LOSSY + OUTAGE + AFTER

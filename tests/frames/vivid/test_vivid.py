@@ -11,6 +11,7 @@ from tests.frames.vivid import machine
 
 
 @pytest.mark.long
+@pytest.mark.widest
 def test_the_driver_does_with_the_kernel_what_it_should(tmp_path: Path) -> None:
     if (why := machine.missing()) is not None:
         pytest.skip(why)
