@@ -334,6 +334,7 @@ async def split(pair: Pair) -> str:
     return winner
 
 
+@pytest.mark.long
 async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
     async with pair_at_work() as (pair, _):
         winner = await split(pair)
@@ -348,6 +349,7 @@ async def test_split_is_settled_by_the_camera_and_nobody_flaps() -> None:
         assert winner in str(loser._claims.given_up[NAME])
 
 
+@pytest.mark.long
 async def test_program_follows_to_who_won_a_split() -> None:
     async with pair_at_work() as (pair, work):
         await split(pair)
@@ -441,6 +443,7 @@ async def test_who_is_not_back_with_the_bus_is_replaced_after_a_while() -> None:
         await until(lambda: pair.having() == ["south"], 2 * ASK + SOON)
 
 
+@pytest.mark.long
 async def test_camera_whose_winner_ends_during_a_split_is_taken_again() -> None:
     async with pair_at_work() as (pair, work):
         winner = await split(pair)

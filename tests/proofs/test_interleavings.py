@@ -80,6 +80,7 @@ def test_visit_finds_a_container_without_a_fate() -> None:
     assert not visit(variant).unbalanced
 
 
+@pytest.mark.long
 def test_visit_finds_what_goes_wrong_where_an_assumption_does() -> None:
     """Else it would find nothing anywhere."""
     shown = Variant(name="", in_order=False, exact=True, triggers=1, sensors=1, depth=13)
@@ -87,6 +88,7 @@ def test_visit_finds_what_goes_wrong_where_an_assumption_does() -> None:
     assert visit(shown).worst == visit(hidden).worst == "older"
 
 
+@pytest.mark.long
 def test_order_that_nobody_can_see_changes_nothing() -> None:
     """What is left out unless ``exact`` is asked for."""
     some = Variant(name="", sensors=1, triggers=1, results=(0, 1), depth=60)
