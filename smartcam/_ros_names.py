@@ -46,7 +46,7 @@ def check_domain(domain: int) -> int:
     """Return a domain's number.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is not valid.
     """
     if not 0 <= domain <= 0xFFFFFFFF:
         raise ConfigurationError(f"ROS domain {domain}: expected 0 or more")

@@ -231,7 +231,8 @@ class Calibration(Protocol):
         none included; it must not wait. It may be called again for the same container.
 
         Args:
-            localizations: of one container; their header has the camera's name as its frame.
+            localizations: localizations of one container; their header has the camera's name as its
+                frame.
 
         Raises:
             CalibrationError: one of them cannot be brought there. That makes the whole result an
@@ -445,7 +446,7 @@ class Statistics:
         triggered: outcome of a trigger of ours.
         streamed: nobody had triggered it, and somebody was listening.
         late: came after its trigger had given up.
-        wrong_application: from another application than expected; not interpreted.
+        wrong_application: containers from another application than expected; not interpreted.
         uninterpretable: does not fit its layout.
         unclaimed: nobody had triggered it and nobody was listening.
         empty_slots: all-zero records skipped by interpreters.

@@ -53,7 +53,7 @@ class Observer:
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """See a frame that went over the wire, or bytes that make none.
+        """See a frame that went over the wire, or bytes that make no frame.
 
         Frames are decoded for this only where an observer overrides it.
         """
@@ -88,7 +88,7 @@ class Observers:
     """All observers of one client; never raises.
 
     Args:
-        observers: in the order in which they are called.
+        observers: observers in the order in which they are called.
 
     Attributes:
         see_states: whether any looks at events.

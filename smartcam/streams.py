@@ -190,7 +190,7 @@ class Queue(Generic[T]):
         Args:
             items: the items.
             now: when they came.
-            size: of all of them.
+            size: bytes of all of them.
         """
         queued = self._items
         if (

@@ -112,9 +112,9 @@ async def tower(
 
     Args:
         options: how it is told.
-        seed: of where everything lies, and of all noise.
+        seed: seed of where everything lies, and of all noise.
         table: another one; None: one of the seed.
-        colours: of the blocks.
+        colours: colours of the blocks.
         layers: blocks to put onto the tower.
 
     Raises:

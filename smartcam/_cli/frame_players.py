@@ -106,7 +106,7 @@ def rtsp_urls(
 async def send_rtp(source: FrameSource, players: Players, options: Options) -> None:
     """Send a source by RTP whenever it is there, until cancelled; tell what a player needs.
 
-    Raises ConfigurationError: the address is none, or the file cannot be written.
+    Raises ConfigurationError: the address is not valid, or the file cannot be written.
     """
     from smartcam.frames import RtpSender
 

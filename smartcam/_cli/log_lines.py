@@ -88,7 +88,7 @@ class LineHandler(logging.Handler):
     """Has a thread write lines to a file; never waits for it.
 
     Args:
-        descriptor: of the file.
+        descriptor: descriptor of the file.
         most: lines that wait.
 
     Attributes:

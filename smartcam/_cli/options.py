@@ -161,7 +161,7 @@ def naming(what: str) -> Iterator[None]:
 
 
 def from_hex(text: str, where: str) -> bytes:
-    """Return the bytes of hex text (ConfigurationError: it is none); spaces are allowed."""
+    """Return the bytes of hex text (ConfigurationError: it is not hex); spaces are allowed."""
     try:
         return bytes.fromhex(text)
     except ValueError as exc:

@@ -96,7 +96,7 @@ class Serving:
 
     Args:
         server: the agent.
-        options: of the command.
+        options: options of the command.
         as_lines: what happens is logged, and not printed for people.
         show: says what is there, once it is; None: a line of each camera.
     """

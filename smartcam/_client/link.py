@@ -90,7 +90,7 @@ class Chunk:
     Attributes:
         received_at: loop time when it came.
         events: what it gave, in order.
-        frames: in how many frames the events came; an event may be made of many (In-Sight).
+        frames: number of frames in which the events came; an event may be made of many (In-Sight).
         delivery: number of the delivery on its link, from 1.
     """
 

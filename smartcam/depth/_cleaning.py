@@ -36,7 +36,8 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
 
     Args:
         depth: (H, W): uint16 in steps of ``scale``, or float of any width in metres (or whatever
-            else: disparities are passed on as they are). 0, negative and not finite ones are none.
+            else: disparities are passed on as they are). 0, negative and not finite values stand
+                for no disparity.
         scale: metres of a step of uint16.
 
     Returns:

@@ -111,11 +111,11 @@ class TowerTable:
     """The table, what lies on it, and the robot that takes it.
 
     Args:
-        seed: of all noise, and of how far the camera is beside where the robot thinks it is.
+        seed: seed of all noise, and of how far the camera is beside where the robot thinks it is.
 
     Attributes:
         blocks: what lies there; who builds knows nothing of it.
-        random: for all noise.
+        random: generator of all noise.
         held: what the gripper has.
     """
 

@@ -256,7 +256,7 @@ class Examination:
     def make_camera(self) -> Camera:
         """Return a client that takes the camera once and never takes it back.
 
-        Raises ConfigurationError: a time-out is none.
+        Raises ConfigurationError: a time-out is not valid.
         """
         asked = self.options
         options: CameraOptions = {

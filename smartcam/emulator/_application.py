@@ -124,7 +124,7 @@ class Application(EmulatorData):
             turn: runs of this application before this one, since it was loaded.
             time: seconds since the device was made.
             scene: what the camera looks at.
-            values: of the input container.
+            values: values of the input container.
             byte_order: order of the bytes of a number.
 
         Raises:

@@ -116,7 +116,7 @@ class LinkOwner(Protocol):
         ...
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        """Note a frame that a machine saw, or bytes that make none."""
+        """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:

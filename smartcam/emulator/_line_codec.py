@@ -54,7 +54,7 @@ class LineCodec:
         line_end: what the camera ends its lines with.
         ends: what ends a client's line.
         max_line: bytes of a client's line, its end not counted.
-        encoding: of characters.
+        encoding: encoding of characters.
         split: splits an answer into what it is known by and the text that rows read.
     """
 

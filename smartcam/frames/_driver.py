@@ -24,7 +24,7 @@ class StreamFormat(NamedTuple):
     """The format and size that a source streams, or could.
 
     Attributes:
-        format: of the pixels.
+        format: format of the pixels.
         width: pixels.
         height: pixels.
         rates: frames a second that it can do, the first is the fastest; empty: it does not say.
@@ -47,7 +47,7 @@ class FoundSource:
 
     Attributes:
         url: opens it.
-        name: for people.
+        name: name shown to people.
         formats: what it can stream.
         remark: what keeps it from being opened, or "".
     """

@@ -86,7 +86,7 @@ class FrameSource(FrameSink):
     :func:`smartcam.frames.open`.
 
     Args:
-        driver: of the device; it is the source's from now on.
+        driver: driver of the device; it is the source's from now on.
         camera_info: the lens, which every frame gets; None: as the driver has it.
         timeout: seconds that an iteration waits for a frame; None: as long as it takes.
         stall: seconds without a frame after which a streaming device counts as stuck: readers get
@@ -94,7 +94,7 @@ class FrameSource(FrameSink):
         linger: seconds that it goes on streaming after the last reader, for one that comes back.
 
     Raises:
-        ConfigurationError: a time that is none.
+        ConfigurationError: a time that is not valid.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class FrameSource(FrameSink):
             timeout: seconds that an iteration waits for an event; None: as long as it takes.
 
         Raises:
-            ConfigurationError: no name, or a number that is none.
+            ConfigurationError: no name, or a number that is not valid.
         """
         return FrameEvents(self, names, size, timeout)
 

@@ -61,7 +61,7 @@ class RobotRequest(NamedTuple):
     """A request of a robot.
 
     Attributes:
-        word: the word, in capitals; "" for what is none.
+        word: the word, in capitals; "" where there is no word.
         application: number behind the word, None without one.
         tag: number before the word, which the answer repeats; None without one.
         given: what came, for the error.

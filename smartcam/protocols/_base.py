@@ -141,7 +141,7 @@ class Dialect(ABC):
     """One wire variant of a protocol: what the client needs to know of it.
 
     Args:
-        name: as in ``?dialect=``.
+        name: name as in ``?dialect=``.
         about: one line for people.
         source: where it is described, with its grade.
         quirks: names of the deviations from the dialect that this one has, as in ``?quirks=``.

@@ -99,7 +99,7 @@ class CameraLog(Sequence["LogEntry"]):
 
     @property
     def received(self) -> list[m.Message]:
-        """Messages that clients have sent; bytes that make none are left out."""
+        """Messages that clients have sent; bytes that make no message are left out."""
         return _messages(self._read(), "in")
 
     @property
@@ -113,7 +113,7 @@ class CameraLog(Sequence["LogEntry"]):
         """See that these messages went over the wire, in this order.
 
         Args:
-            expected: of the client and of the camera; others may stand between them.
+            expected: messages of the client and of the camera; others may stand between them.
             only: the client sent nothing else. What the camera said is not looked at unless it is
                 expected.
             timeout: seconds that they may still take.

@@ -68,18 +68,19 @@ class ColourSite(ThreadedSite):
         source: source that the caller opens and closes. It streams for each picture that is asked
             for; ``linger`` lets it stream on in between.
         colours: range of colours that the page begins with.
-        quality: of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as it is.
+        quality: quality of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as
+            it is.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         token: what every call must carry in ``Authorization: Bearer``, as
             :class:`~smartcam.web.LiveSite` has it.
 
     Attributes:
-        source: as given.
-        colours: as given.
+        source: source that was given.
+        colours: colours that were given.
 
     Raises:
-        ConfigurationError: the token cannot be used, or the quality is none.
+        ConfigurationError: the token cannot be used, or the quality is not valid.
         MissingExtraError: the extra ``depth`` is not installed.
     """
 
@@ -232,7 +233,7 @@ class RangeBody(CallBody):
         """Return it.
 
         Raises:
-            RefusedError: it is none.
+            RefusedError: it is not valid.
         """
         try:
             return ColourRange(**self.model_dump())

@@ -54,13 +54,13 @@ class FramesSite(Site):
             names it among its protocols: ``bearer.TOKEN``.
 
     Attributes:
-        sources: as given.
-        changes: as given.
+        sources: sources that were given.
+        changes: changes that were given.
         failures: reason why a source is not open, by its place in ``sources``; set by whoever
             opens the sources.
 
     Raises:
-        ConfigurationError: the token cannot be used, or the quality is none.
+        ConfigurationError: the token cannot be used, or the quality is not valid.
         MissingExtraError: the extra ``frames`` is not installed.
     """
 

@@ -72,7 +72,7 @@ class SitePictures:
         quality: quality of the JPEGs that are made. A frame that comes as a JPEG stays as it is.
 
     Attributes:
-        sources: as given.
+        sources: sources that were given.
         failures: reason why a source is not open, by its place in ``sources``.
         viewers: sockets of the pages that show a source.
     """
@@ -144,7 +144,7 @@ class SitePictures:
         """Have a source open until this is cancelled, and try again where it cannot be opened.
 
         Args:
-            place: of the source.
+            place: place of the source.
             tried: is told each time what went wrong, None for nothing.
         """
         for delay in Backoff().delays():
@@ -219,8 +219,8 @@ class Viewer(PageSocket):
     """The WebSocket of a page that shows a source.
 
     Attributes:
-        place: of the source.
-        address: of who looks.
+        place: place of the source.
+        address: address of the viewer.
         gone: is set when that is over.
     """
 

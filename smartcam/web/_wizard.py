@@ -43,7 +43,7 @@ class WizardSite(Site):
             and ``_`` at least. None: nothing on a loopback address; on any other one is made.
 
     Attributes:
-        service: as given.
+        service: service that was given.
 
     Raises:
         ConfigurationError: the token cannot be used.

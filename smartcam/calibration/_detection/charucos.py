@@ -44,7 +44,7 @@ MIN_QUADRANGLES = 5
 
 MIN_MODULE_PIXELS, MAX_UNREAD_MODULE_PIXELS = 0.6, 2.5
 """Pixels of a module of a marker: with fewer it is not read in double size, either; with more there
-is none, where none was read."""
+is not there, where none was read."""
 
 MAX_SQUARES_OFF = 0.3
 """Sides of a square by which a corner may lie off where the nearest markers see it."""

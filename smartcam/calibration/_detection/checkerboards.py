@@ -287,7 +287,7 @@ def _number_part(
     """Return the numbering of a part of a board whose mark is seen; None where no mark is seen.
 
     Beside the dark dot at the origin the paper is light: around the dot, and along both of the
-    board's edges that meet there. So a place within the board or on something else is none.
+    board's edges that meet there. So a place within the board or on something else is no corner.
     """
     found = []
     for way in ways:

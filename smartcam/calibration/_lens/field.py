@@ -58,7 +58,7 @@ class Sensitivity(NamedTuple):
 
 
 def check_distance(distance: float | None) -> None:
-    """Refuse a distance that is none; None means infinity. Raises ``NOT_FINITE``."""
+    """Refuse a distance that is not valid; None means infinity. Raises ``NOT_FINITE``."""
     if distance is not None and not (math.isfinite(distance) and distance > 0.0):
         raise Code.NOT_FINITE.unexpected(
             "distance: expected a positive number of metres, or None for infinity",

@@ -94,7 +94,7 @@ def strays(
 
     ``more``: variance beside the points' own, pixels^2. ``used``: the views that it is of; of the
     others, a view may be bad for a few of its points. ``lens``: whether the lens is fitted to the
-    views; else a point is none that one that fits the other points brings to its place.
+    views; else a point is not a stray if a camera that fits the other points brings to its place.
     """
     equations = [one.equations(more) for one in fitted]
     off = _stray_squares(equations, used)

@@ -312,7 +312,7 @@ def fit_corners(
     (SCALE_MISMATCH), which is followed: rulers that were measured wrong, or not at all.
 
     Args:
-        target: with the lengths that it has on paper.
+        target: target with the lengths that it has on paper.
         ids: (N,), numbers of the target's points that were touched, three at least.
         touches: (N, 3), where the robot's tip was, metres.
         touch_sigma: standard deviation of one coordinate of a touch, metres, as in

@@ -95,8 +95,8 @@ def rectify(
         size: size of the output, width and height in pixels; None: the source's.
 
     Raises:
-        CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is none or too large,
-            lenses of different models; ``WRONG_SIZE``: images of different sizes;
+        CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is not valid or too
+            large, lenses of different models; ``WRONG_SIZE``: images of different sizes;
             ``OUT_OF_FIELD``: the images would have nothing in them, as of cameras behind each
             other, or of which one stands on its head.
     """

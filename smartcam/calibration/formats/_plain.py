@@ -90,7 +90,9 @@ def _cut(value: object) -> str:
 
 
 def load_json(text: str) -> Plain:
-    """Return a JSON document; its numbers are texts (``MALFORMED``: it is none, or too deep)."""
+    """Return a JSON document; its numbers are texts (``MALFORMED``: it is not JSON, or too
+    deep).
+    """
     try:
         return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as exc:
@@ -100,7 +102,7 @@ def load_json(text: str) -> Plain:
 def load_yaml(text: str) -> Plain:
     """Return a YAML document, that of OpenCV too; its scalars are texts, its tags are dropped.
 
-    Raises ``MALFORMED``: it is none, it has aliases or a key twice, or is too deep;
+    Raises ``MALFORMED``: it is no YAML, it has aliases or a key twice, or is too deep;
     MissingExtraError: PyYAML is not installed.
     """
     if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
@@ -225,7 +227,8 @@ def flag(value: Plain, where: str) -> bool:
 def frame_name(value: Plain, where: str) -> str:
     """Return a frame's name that every format can hold.
 
-    Raises ``BAD_NAME``: it is none, too long, or has letters that mean something in a file or on a
+    Raises ``BAD_NAME``: it is not valid, too long, or has letters that mean something in a file or
+        on a
     command line.
     """
     if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):

@@ -295,7 +295,7 @@ class _Views:
         if answers.get("next") == "calculate":
             return {}
         typed = None
-        if isinstance(self._robot, str):  # a pose that is none shall not cost a picture
+        if isinstance(self._robot, str):  # a pose that is not valid shall not cost a picture
             typed = _typed_pose(self._robot, answers)
         image = await self._take_picture()
         flange = typed or await self._flange()

@@ -206,7 +206,7 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
 
 
 def _is_command(one: Said) -> bool:
-    """Return True if a message is a command; questions and the session's end are none."""
+    """Return True if a message is a command; questions and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
     return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
 

@@ -121,7 +121,7 @@ class Device:
     Args:
         applications: the programs stored on it; at least one, ids differ.
         active: id of the loaded one; default the first.
-        running: in run mode from the beginning.
+        running: True for run mode from the beginning.
         quirks: what is not known about real cameras.
         clock_time: what its clock shows at first; a time without a zone is taken as it is.
         scene: the table it looks at.

@@ -93,7 +93,7 @@ class WireCodec(Protocol):
 class WireMessage(Transmission):
     """A message on its way, or something inserted."""
 
-    what: Frame | bytes  # the frame that its sender meant; bytes for what makes none
+    what: Frame | bytes  # the frame that its sender meant; bytes where they make no frame
     original: bytes  # its bytes
     changeable: bool = True  # whether later faults act on it
     passed: bytearray = field(default_factory=bytearray)  # what has passed

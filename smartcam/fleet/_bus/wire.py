@@ -96,7 +96,7 @@ def decode(payload: bytes, what: str) -> BusMessage:
     """Return the message in ``payload``.
 
     Raises:
-        RemoteProtocolError: it is none; ``what`` is said to be broken.
+        RemoteProtocolError: it is not valid; ``what`` is said to be broken.
     """
     try:
         (size,) = _LENGTH.unpack_from(payload)

@@ -32,7 +32,7 @@ class FrameOrder(NamedTuple):
         encoding: form in which the frame is to come.
         timeout: seconds that the call may take.
         rest: seconds from one frame of a stream to the next, at least.
-        have: for H.264, number of the last encoded frame that the program has; 0 for none.
+        have: number, for H.264, of the last encoded frame that the program has; 0 for none.
     """
 
     program: str
@@ -49,7 +49,7 @@ class TakenFrame(NamedTuple):
     Attributes:
         frame: the frame in the form in which it is to come.
         took: seconds to encode it.
-        number: for H.264, place of the frame in the stream; else 0.
+        number: place, for H.264, of the frame in the stream; else 0.
     """
 
     frame: Frame

@@ -104,7 +104,7 @@ class Codecs:
         pixels (4:2:0), of YUV formats as many as they did.
 
         Args:
-            frame: of 8 bits; Mono8, RGB8, BGR8, MJPEG, or any YUV.
+            frame: frame of 8 bits; Mono8, RGB8, BGR8, MJPEG, or any YUV.
             quality: 1 to 100.
 
         Raises:

@@ -171,13 +171,13 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> N
     nobody knows which one the maker means.
 
     Args:
-        formula: as the description has it.
+        formula: formula as the description has it.
         variables: value of each name in it.
         whole: whether all is whole numbers, as in an ``IntSwissKnife``.
 
     Raises:
-        MessageError: it is none, has a name that is not known, or no value: a division by zero,
-            a number past its bounds, or two values by two readings.
+        MessageError: it is not valid, has a name that is not known, or no value: a division by
+            zero, a number past its bounds, or two values by two readings.
     """
     tree, other = _parsed(formula)
     value = _worked_out(formula, tree, variables, whole)

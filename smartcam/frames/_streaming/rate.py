@@ -54,7 +54,7 @@ class RateStatistics:
     """The quality and rates that a rate control has set, and the reason.
 
     Attributes:
-        quality: of JPEG, that frames are to have.
+        quality: JPEG quality that frames are to have.
         fps: frames a second at most.
         why: what these follow: "bit rate", "latency" or "the best quality"; "" before the first
             frame. Behind it stands "at the lowest quality" where there are fewer frames, too, and
@@ -115,7 +115,7 @@ class RateControl:
     Args:
         bitrate: bits a second on average.
         latency: seconds from capture to arrival.
-        quality: of JPEG, the lowest and the best, 1 to 100.
+        quality: JPEG quality, the lowest and the best, 1 to 100.
         fps: frames a second, the fewest and the most.
 
     Raises:

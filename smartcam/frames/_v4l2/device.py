@@ -240,7 +240,7 @@ class CaptureDevice:
             return
         kind = next(
             (name for bit, name in _OTHER_KINDS.items() if does & bit),
-            "no camera: it captures no pictures, or gives none by streaming",
+            "no camera: it captures no pictures, or does not stream them",
         )
         here = tuple(f"{path} ({name})" for path, name in system.nodes().items())
         raise FrameSourceError(

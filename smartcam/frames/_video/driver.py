@@ -295,7 +295,7 @@ class _Playback:
 
     Args:
         fps: pictures a second; None: by their time stamps.
-        rate: of those without a stamp.
+        rate: rate of frames without a stamp.
     """
 
     def __init__(self, fps: float | None, rate: float | None) -> None:

@@ -76,7 +76,7 @@ class Pixels(NamedTuple):
     """The pixels of a decoded frame, in one of our formats.
 
     Attributes:
-        format: of the pixels.
+        format: format of the pixels.
         width: pixels.
         height: pixels.
         stride: bytes from row to row.
@@ -95,7 +95,7 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     """Return our format of one of FFmpeg's.
 
     Args:
-        name: as ``yuv420p``.
+        name: name such as ``yuv420p``.
         colour_range: AVColorRange; 0, which is unknown, is the limited one.
         space: AVColorSpace.
 

@@ -187,7 +187,7 @@ class _PartsStream:
             await asyncio.sleep(left)
         seconds = f"{self._timeout:g} s"
         if self._loop.time() - self._heard < self._timeout:
-            text = f"expected a picture, got bytes that make none for {seconds}"
+            text = f"expected a picture, got bytes that make no picture for {seconds}"
             self._decoding.over(FrameFormatError(f"{self._name}: {text}"))
         else:
             text = f"expected an answer, got none within {seconds}"

@@ -53,8 +53,8 @@ class WebStream:
     """The body of an answer to GET.
 
     Args:
-        name: of the source, for errors.
-        url: with user and password.
+        name: name of the source, for errors.
+        url: URL with user and password.
         tls: how the server shows who it is, where it is asked by TLS.
 
     Attributes:
@@ -112,7 +112,7 @@ class WebStream:
         """Yield the body as it comes.
 
         Raises:
-            MessageError: its chunks are none.
+            MessageError: its chunks are not valid.
             OSError: the connection is lost.
         """
         if "chunked" not in self.answer.header("transfer-encoding").lower():

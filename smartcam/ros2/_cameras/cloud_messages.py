@@ -75,8 +75,9 @@ def compressed_depth_fields(
     """Return a depth picture as image_transport's ``compressedDepth`` has it.
 
     Its data are an int32, which is 0, two float32 (a, b), and a PNG with 16 bits. For ``32FC1`` a
-    value v of the PNG is the depth ``a / (v - b)``, 0 is none; a and b are such that the nearest
-    and the farthest depth of the picture use the whole range. For ``16UC1`` values are millimetres.
+    value v of the PNG is the depth ``a / (v - b)``, 0 means no depth; a and b are such that the
+    nearest and the farthest depth of the picture use the whole range. For ``16UC1`` values are
+    millimetres.
     Source: ``codec.cpp`` and ``compression_common.h`` of image_transport_plugins.
 
     Args:

@@ -24,7 +24,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
 def as_path(url: str) -> Path | None:
-    """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" is none.
+    """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" means no file.
 
     Raises:
         ConfigurationError: it is of another scheme.
@@ -65,7 +65,9 @@ class CameraLens:
         self._writing = asyncio.Lock()
 
     async def load(self) -> None:
-        """Read the file, once; one that is none is told in the log, and counts as not there."""
+        """Read the file, once; one that is not valid is told in the log, and counts as not
+        there.
+        """
         if self._read or self._path is None:
             return
         async with self._writing:

@@ -227,7 +227,7 @@ class NativeNode(NamedNode):
         """Return an end that rclpy makes.
 
         Raises:
-            RosError: rclpy makes none.
+            RosError: rclpy makes no endpoint.
         """
         self.check_open()
         try:

@@ -142,7 +142,7 @@ def range_of(
     """Return a range as it is declared: both bounds, or neither.
 
     Raises:
-        ConfigurationError: there can be none, or it holds nothing.
+        ConfigurationError: there can be no such value, or it holds nothing.
     """
     if minimum is None and maximum is None and step is None:
         return None, None, None
@@ -212,7 +212,7 @@ def typed(name: str, given: object, declared: int = NOT_SET) -> Typed:
         declared: the type of a list without elements.
 
     Raises:
-        ConfigurationError: it can be none.
+        ConfigurationError: it can be no parameter.
     """
     if isinstance(given, Typed):
         return given

@@ -269,9 +269,9 @@ class DelayBytes(Pace, name="delay"):
     """Pass everything later; the order stays, the end of the stream comes later too.
 
     Args:
-        seconds: for everything.
+        seconds: seconds for everything.
         jitter: seconds; up to so much more, evenly spread, for each piece that comes.
-        seed: of the jitter.
+        seed: seed of the jitter.
     """
 
     seconds: float
@@ -294,10 +294,10 @@ class DatagramRule(Rule):
     """A rule for UDP.
 
     Args:
-        number: of the datagram in its direction and connection, from 1; None lets the probability
-            decide.
-        probability: of each datagram, 0 to 1.
-        seed: of the chance; the same seed picks the same datagrams.
+        number: number of the datagram in its direction and connection, from 1; None lets the
+            probability decide.
+        probability: probability for each datagram, 0 to 1.
+        seed: seed of the chance; the same seed picks the same datagrams.
     """
 
     number: int | None = None

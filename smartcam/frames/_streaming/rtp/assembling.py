@@ -22,7 +22,7 @@ class AccessUnit(NamedTuple):
     """One encoded frame that came whole.
 
     Attributes:
-        data: as in a file (annex B, or a JPEG).
+        data: bytes as in a file (annex B, or a JPEG).
         timestamp: ticks of 90 kHz.
         lost: packets that were lost since the last one that came whole.
         damaged: frames since then that did not come whole, as far as one saw something of them.

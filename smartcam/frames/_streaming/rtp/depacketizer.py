@@ -38,7 +38,7 @@ class Depacketizer:
 
     Args:
         window: packets.
-        kind: of the payloads.
+        kind: kind of the payloads.
         wary: whether the marker is to prove itself first.
 
     Attributes:
@@ -77,7 +77,7 @@ class Depacketizer:
         """Take a packet, and return the frames that are whole with it.
 
         Args:
-            packet: of the stream.
+            packet: packet of the stream.
             now: when it arrived.
         """
         if packet.ssrc != self._ssrc:

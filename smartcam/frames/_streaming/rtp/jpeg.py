@@ -58,7 +58,7 @@ class JpegUnits:
     """The kind of a stream of JPEGs; it remembers tables that are sent once.
 
     Args:
-        size: of the pictures where the packets have no room for it: above 2040 pixels.
+        size: size of the pictures where the packets have no room for it: above 2040 pixels.
     """
 
     def __init__(self, size: tuple[int, int] | None = None) -> None:

@@ -31,7 +31,7 @@ class RtpPacket(NamedTuple):
     """One packet of a stream.
 
     Attributes:
-        marker: of video: the last packet of a picture.
+        marker: True for the last packet of a picture, in video.
         payload_type: 0 to 127.
         sequence: 0 to 65535.
         timestamp: 0 to 2**32 - 1; of video in ticks of 90 kHz.
@@ -89,10 +89,10 @@ class ReportBlock(NamedTuple):
 
     Attributes:
         ssrc: the stream.
-        fraction: of its packets that were lost since the last report, in 256ths.
+        fraction: part of its packets that was lost since the last report, in 256ths.
         lost: packets since the beginning; below 0 where there were more duplicates.
         highest: sequence number, with the count of its wraps above the 16 bits.
-        jitter: of the arrival, ticks of the stream's clock.
+        jitter: jitter of the arrival, ticks of the stream's clock.
         last_report: the middle 32 bits of the last sender report's NTP time; 0: none came.
         delay: since that came, in 65536ths of a second.
     """
@@ -125,9 +125,9 @@ class SenderReport(NamedTuple):
     Attributes:
         ssrc: the stream.
         ntp: seconds since 1900 in units of 2**-32, at the same moment as
-        timestamp: of the stream's clock.
+        timestamp: time of the stream's clock.
         packets: sent since the beginning.
-        octets: of payload in them.
+        octets: bytes of payload in these packets.
         blocks: what it says of others' streams, at most 31.
     """
 
@@ -235,7 +235,8 @@ def parse_rtcp(data: bytes) -> list[Report]:
     """Read a datagram of RTCP; kinds of packets that we have no use for are left out.
 
     Raises:
-        MessageError: it is none: a length or count that does not fit, or not a report at first.
+        MessageError: it is not valid: a length or count that does not fit, or not a report at
+            first.
     """
     found: list[Report] = []
     place = 0

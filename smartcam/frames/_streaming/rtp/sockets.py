@@ -34,9 +34,9 @@ class Endpoint(NamedTuple):
     """An address with its kind.
 
     Attributes:
-        family: of sockets.
+        family: family of the sockets.
         host: a number, not a name.
-        port: of RTP; RTCP has the next one.
+        port: port of RTP; RTCP has the next one.
     """
 
     family: socket.AddressFamily
@@ -175,8 +175,8 @@ class SocketPair:
         """Call for each datagram, with who sent it, until :meth:`close`.
 
         Args:
-            rtp: for those of the stream; None: they are not read.
-            rtcp: for reports.
+            rtp: receiver of the stream's packets; None: they are not read.
+            rtcp: receiver of reports.
             read: after those that came together.
         """
         for one, take in ((self.rtp, rtp), (self.rtcp, rtcp)):

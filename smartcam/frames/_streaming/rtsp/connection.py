@@ -242,7 +242,7 @@ class RtspConnection(asyncio.Protocol):
         """Return the next message.
 
         Raises:
-            RtspError: what came is none, or half of one.
+            RtspError: no request came, or half of one.
         """
         now = asyncio.get_running_loop().time
         half_since: float | None = None

@@ -41,9 +41,9 @@ class RtspError(Exception):
     """A request that is answered with an error.
 
     Args:
-        status: of RFC 2326, section 7.1.1.
+        status: status of RFC 2326, section 7.1.1.
         text: why, for people; the body of the answer.
-        headers: of the answer.
+        headers: headers of the answer.
         fatal: nothing more can be cut from these bytes.
     """
 
@@ -118,7 +118,7 @@ class RequestParser:
         """Return the next whole message; None: it is not there yet.
 
         Raises:
-            RtspError: it can be none; a fatal one.
+            RtspError: they can be no request; the error is fatal.
         """
         while self._start is None:
             if self._data[:1] == b"$":

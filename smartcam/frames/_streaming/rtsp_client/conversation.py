@@ -48,8 +48,8 @@ class ConversationPlan(NamedTuple):
     """Whom to ask, and for what.
 
     Attributes:
-        name: of the source, for errors.
-        url: with user and password.
+        name: name of the source, for errors.
+        url: URL with user and password.
         timeout: seconds until it plays, and for each answer after that.
         transports: ``tcp`` and ``udp``, in the order in which they are tried.
         elsewhere: whether a redirect to another host or port is followed.

@@ -40,7 +40,7 @@ class RtspLink(asyncio.Protocol):
     """A connection to a server; one task asks, and packets are handed on as they come.
 
     Args:
-        name: of the source, for errors.
+        name: name of the source, for errors.
         credentials: what to show who asks for a password.
 
     Attributes:
