@@ -266,9 +266,7 @@ class TrafficLog:
         fault: str | None = None,
         wire: bytes | None = None,
     ) -> None:
-        """Keep a frame, bytes that make no frame, or why they are ignored; see
-        :class:`LogEntry`.
-        """
+        """Keep a frame, bytes that make no frame, or why they are ignored (:class:`LogEntry`)."""
         if isinstance(what, RemoteProtocolError):
             # not kept itself: it holds on to the place where it was raised
             data, error = what.data.hex(" "), str(what)

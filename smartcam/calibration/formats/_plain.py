@@ -90,9 +90,7 @@ def _cut(value: object) -> str:
 
 
 def load_json(text: str) -> Plain:
-    """Return a JSON document; its numbers are texts (``MALFORMED``: it is not JSON, or too
-    deep).
-    """
+    """Return a JSON document, its numbers as texts; MALFORMED: it is no JSON, or too deep."""
     try:
         return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as exc:

@@ -273,7 +273,8 @@ class VideoReading(PictureReading):
         while not self._pictures and not self.stopped.is_set():
             if self.plan.network and time.monotonic() - begun > self.plan.timeout:
                 raise self.plan.wrong(
-                    f"expected a picture, got bytes that make no picture for {self.plan.timeout:g} s"
+                    "expected a picture, got bytes that make no picture for "
+                    f"{self.plan.timeout:g} s"
                 )
             asked = time.monotonic()
             packet = self._tried(lambda: next(self._packets, None))

@@ -65,9 +65,7 @@ class CameraLens:
         self._writing = asyncio.Lock()
 
     async def load(self) -> None:
-        """Read the file, once; one that is not valid is told in the log, and counts as not
-        there.
-        """
+        """Read the file, once; log one that is not valid, and take it as missing."""
         if self._read or self._path is None:
             return
         async with self._writing:
