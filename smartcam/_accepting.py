@@ -84,7 +84,7 @@ class Occupant(Protocol):
         ...
 
     def turn_away(self, why: str) -> None:
-        """End it at once; harmless when said twice."""
+        """End the connection at once; harmless when said twice."""
         ...
 
 
@@ -202,7 +202,7 @@ class Places(Generic[G]):
             self._send_away(found[1], why)
 
     def end_overdue(self, now: float) -> None:
-        """Have those go whose time is over; one that has a session then gets the time anew."""
+        """End connections whose time is over; one with a session then gets the time anew."""
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue

@@ -127,7 +127,7 @@ class _ThreadCall:
         self._done.acquire()
 
     def wait(self, timeout: float | None) -> bool:
-        """Begin it, and wait until it is done; return whether it is. Ctrl-C ends it, and is raised.
+        """Begin the call, wait for its end, return whether it ended. Ctrl-C ends it, and is raised.
 
         Args:
             timeout: seconds; None where what is called has deadlines of its own.
@@ -232,7 +232,7 @@ class LoopThread:
         tell_of_forks(self)
 
     def start(self) -> None:
-        """Start it; does nothing if it runs."""
+        """Start the thread; do nothing if it runs."""
         if self._thread is not None:
             return
         ready: threading.Event = threading.Event()
@@ -256,7 +256,7 @@ class LoopThread:
             )
 
     def stop(self) -> None:
-        """End it. Harmless when done twice, and in a fork, which has no such thread."""
+        """End the thread. Harmless when done twice, and in a fork, which has no such thread."""
         if self._forked:
             return
         thread, self._thread = self._thread, None

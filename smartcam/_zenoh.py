@@ -282,7 +282,7 @@ class ZenohSession:
     # ------------------------------------------------------------------ life
 
     async def open(self, timeout: float) -> Self:
-        """Open it.
+        """Open the session.
 
         Raises:
             ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
@@ -408,7 +408,7 @@ class ZenohSession:
         return ConnectFailedError(text, attempts=(why,))
 
     async def close(self) -> None:
-        """Close it; what was declared is gone with it. Idempotent."""
+        """Close the session, and with it all declarations. Idempotent."""
         session, self._session = self._session, None
         self._reopening = False
         if self._look is not None:
@@ -429,7 +429,7 @@ class ZenohSession:
                 await asyncio.shield(closing)
 
     def _threads(self) -> list[ThreadPoolExecutor]:
-        """Return those of whoever stands on it; what they have to say yet is said first."""
+        """Return the threads of the session's users; their last messages are sent first."""
         repliers, self._repliers = self._repliers, None
         return [] if repliers is None else [repliers]
 
@@ -657,7 +657,7 @@ class ZenohDeclared:
         return None if self._by_dropping else it
 
     def again(self) -> None:
-        """Declare it at the session that is there now."""
+        """Declare the key at the session that is there now."""
         if not self._closed and self._it is None:
             self._it = self._how(self._end.session)
 

@@ -364,7 +364,7 @@ class Subscribers(Generic[T]):
         self._in_order: list[weakref.ref[Queue[T]]] | None = None
 
     def add(self, queue: Queue[T]) -> None:
-        """Offer it what comes from now on."""
+        """Offer a subscriber all items from now on."""
         self.references[weakref.ref(queue, self._discard)] = None
         self._in_order = None
 

@@ -73,7 +73,7 @@ class PendingTrigger(SentTrigger):
     unproven: list[_Unproven] = field(init=False, default_factory=list)
 
     def fail(self, error: Exception) -> None:
-        """Give its caller the reason why there are none."""
+        """End the trigger: its caller gets the error instead of results."""
         self.ended = True
         self.outcome.set_exception(error)
 

@@ -49,7 +49,7 @@ class ColourRange:
     value: tuple[int, int] = (0, 255)
 
     def __post_init__(self) -> None:
-        """Check it."""
+        """Check the limits."""
         for name, most in MOST.items():
             given: Any = getattr(self, name)
             try:
@@ -118,7 +118,7 @@ class ColourRange:
         return around_hsv(hsv(picture), x, y, radius, margin)
 
     def as_json(self) -> str:
-        """Return it as JSON, of which ``ColourRange(**json.loads(text))`` makes it again."""
+        """Return the range as JSON, of which ``ColourRange(**json.loads(text))`` makes it again."""
         return json.dumps(asdict(self))
 
 

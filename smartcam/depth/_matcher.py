@@ -75,7 +75,7 @@ class _WordParameter(NamedTuple):
 
     @property
     def default(self) -> str:
-        """Of what nobody said."""
+        """Value that is used where the user gives none."""
         return self.words[0]
 
     def __str__(self) -> str:

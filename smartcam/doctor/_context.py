@@ -136,7 +136,7 @@ class FrameObserver(Observer):
     _trace: Callable[[TraceEntry], None]
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """Give it."""
+        """Pass the frame on."""
         self._trace(entry)
 
 

@@ -95,7 +95,7 @@ class AddressSet:
         return same and first.number <= address.number <= last.number
 
     def without(self, others: AddressSet) -> AddressSet:
-        """Return those that are not in another set."""
+        """Return the addresses that are not in another set."""
         left: list[Span] = []
         for first, last in self._spans:
             for away in others._spans:

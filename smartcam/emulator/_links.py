@@ -351,7 +351,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             transport.abort()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Pass it to the link of its address; too many links drop the one silent for longest."""
+        """Pass a datagram to its address' link; of too many links drop the longest silent one."""
         if self._transport is None:
             return  # the port is shut, the loop had this one already
         now = asyncio.get_running_loop().time()

@@ -178,7 +178,7 @@ class FrameDriver(ABC):
         )
 
     async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame | None:
-        """Have whoever has the device trigger it, and return the picture that this caused.
+        """Have the device's owner trigger it, and return the picture that this caused.
 
         Args:
             timeout: seconds for everything.
@@ -206,7 +206,7 @@ class FrameDriver(ABC):
 
     @abstractmethod
     async def start(self, sink: FrameSink) -> None:
-        """Have it stream into ``sink``. A device that was lost since is opened anew.
+        """Start the stream into ``sink``. A device that was lost since is opened anew.
 
         Raises:
             FrameSourceError: it does not; nothing streams.
@@ -214,8 +214,8 @@ class FrameDriver(ABC):
 
     @abstractmethod
     async def stop(self) -> None:
-        """Have it stream no longer: nothing runs for it. After that ``sink`` hears nothing."""
+        """Stop the stream and all that runs for it. After that ``sink`` hears nothing."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Give it back. Idempotent, and right after any failure."""
+        """Give the device back. Idempotent, and right after any failure."""

@@ -130,12 +130,12 @@ class RosbridgeNode(NamedNode):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open it."""
+        """Open the node."""
         if self._running is None:
             self._running = asyncio.create_task(self._link.run())
 
     async def stop(self) -> None:
-        """Close it: withdraw everything from the bridge, which takes some seconds. Idempotent."""
+        """Withdraw everything from the bridge, which takes some seconds. Idempotent."""
         running, self._running = self._running, None
         if running is None:
             return

@@ -80,7 +80,7 @@ class RosbridgeService:
     # ------------------------------------------------------------------ for the node
 
     def advertise(self) -> None:
-        """Advertise it, where it is not closed."""
+        """Advertise the service, unless it is closed."""
         if self._node.has(self):
             self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
             self.ready = True

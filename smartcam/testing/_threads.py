@@ -56,7 +56,7 @@ class _InLoop:
     _owns_thread: bool  # it is started and ended with it
 
     def start(self) -> None:
-        """Start it; does nothing if it runs.
+        """Start what lives in the thread; do nothing if it runs.
 
         Raises:
             ConfigurationError: it cannot listen; nothing is started.
@@ -70,7 +70,7 @@ class _InLoop:
             raise
 
     def stop(self) -> None:
-        """Stop it; the log can still be read. Harmless when done twice."""
+        """Stop what lives in the thread; the log can still be read. Harmless when done twice."""
         try:
             self._thread.call(self._hosted.stop, CALL_TIMEOUT)
         except ConfigurationError:
@@ -247,7 +247,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.command, name)
 
     def advance(self, seconds: float) -> None:
-        """Move its clock, which must be a manual one; all that falls due has happened then.
+        """Move the camera's manual clock on; all that falls due has happened then.
 
         Raises:
             ConfigurationError: it runs in real time, or the time is negative.

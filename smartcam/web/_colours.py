@@ -204,7 +204,7 @@ class ColourSite(ThreadedSite):
 
     @contextlib.contextmanager
     def _one_more(self) -> Iterator[None]:
-        """Count one who waits for a frame."""
+        """Count a viewer that waits for a frame."""
         if self._looks >= MAX_LOOKS:
             raise RefusedError(503, f"picture {MAX_LOOKS + 1}", f"{MAX_LOOKS} at one time")
         self._looks += 1
@@ -230,7 +230,7 @@ class RangeBody(CallBody):
     value: list[int]
 
     def colours(self) -> ColourRange:
-        """Return it.
+        """Return the range.
 
         Raises:
             RefusedError: it is not valid.

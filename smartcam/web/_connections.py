@@ -95,23 +95,23 @@ class Visitor(asyncio.Protocol):
             self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Pass it on, unless it is a head without end."""
+        """Pass the bytes on, unless they are a head without end."""
         if self._head is not None:
             self._look_at(data, self._head)
         if self._inner is not None and not self._transport.is_closing():
             self._inner.data_received(data)
 
     def eof_received(self) -> bool | None:
-        """Pass it on."""
+        """Pass the end on."""
         return None if self._inner is None else self._inner.eof_received()
 
     def pause_writing(self) -> None:
-        """Pass it on."""
+        """Pass the pause on."""
         if self._inner is not None:
             self._inner.pause_writing()
 
     def resume_writing(self) -> None:
-        """Pass it on."""
+        """Pass the end of a pause on."""
         if self._inner is not None:
             self._inner.resume_writing()
 

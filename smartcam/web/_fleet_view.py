@@ -162,7 +162,7 @@ class FleetView:
     # ------------------------------------------------------------------ who is there
 
     async def _begin(self) -> None:
-        """Learn who is there."""
+        """Learn which agents and cameras are there."""
         if self._events is not None:
             self._events.close()
         self._events = stream = self.fleet.events(max_queue=MAX_EVENTS)
@@ -177,7 +177,7 @@ class FleetView:
         await self._look()
 
     async def _hear(self) -> None:
-        """Hear who came and who went."""
+        """Note cameras that came or went."""
         stream = self._events
         if stream is None:
             return

@@ -182,7 +182,7 @@ class ShiftHistory:
     # ------------------------------------------------------------------ for the page
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as the page takes it: bars, and the failures, the oldest first."""
+        """Return the history as the page takes it: bars, and the failures, the oldest first."""
         failures = [
             {**asdict(one), "picture": one.serial in self._pictures} for one in self._failures
         ]

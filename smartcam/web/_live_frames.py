@@ -72,7 +72,7 @@ class LiveFrames:
             await asyncio.sleep(LOOK)
 
     async def _show(self, camera: HasFrames) -> None:
-        """Have its frames there until the page shows another camera."""
+        """Keep the camera's frames until the page shows another camera."""
         pictures = SitePictures([camera.frame_source("jpeg", JPEG_QUALITY)], JPEG_QUALITY)
         pictures.start()
         keeping = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")

@@ -172,7 +172,7 @@ class _Calm(logging.LoggerAdapter[logging.Logger]):
     """Takes what aiohttp logs. It is about what clients send wrong: no errors with tracebacks."""
 
     def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
-        """Log it at INFO at most."""
+        """Log a message at INFO at most."""
         super().log(min(level, logging.INFO), msg, *args, **kwargs)
 
 

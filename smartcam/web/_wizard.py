@@ -207,7 +207,7 @@ def _repeat(service: CalibrationService, body: _StepToken) -> object:
 
 @_call("POST", "/abort", writes="journal", body=_StepToken, sample='{"token": "..."}')
 def _abort(service: CalibrationService, body: _StepToken) -> object:
-    """End it without a result; what was measured stays in the journal."""
+    """End the wizard without a result; what was measured stays in the journal."""
     return service.session.abort(body.token)
 
 

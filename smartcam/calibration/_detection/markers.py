@@ -58,7 +58,7 @@ class Markers(NamedTuple):
     ids: NDArray[np.intp]  # (N,)
 
     def some(self, which: NDArray[np.bool_]) -> Markers:
-        """Return some of them."""
+        """Return some of the markers."""
         return Markers(self.quads[which], self.ids[which])
 
 

@@ -59,7 +59,7 @@ class Input(ABC):
     default: Any = None
 
     def schema(self) -> dict[str, Any]:
-        """Return its JSON Schema.
+        """Return the input's JSON Schema.
 
         A unit stands in ``x-unit``, options as a ``const`` and a ``title`` each.
         """

@@ -164,7 +164,7 @@ class InSightDevice:
         return self._agenda[0][0] if self._agenda else None
 
     def advance_to(self, now: int) -> None:
-        """Bring its time up, nanoseconds, and do what was due, in order, each at its own time.
+        """Move the device's time on, nanoseconds, and do what falls due, in order of time.
 
         An earlier time than before changes nothing.
         """

@@ -100,7 +100,7 @@ class WireMessage(Transmission):
 
     @classmethod
     def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:
-        """Return one that passes as it is."""
+        """Return a message that passes as it is."""
         return cls([data], what=what, original=data)
 
     @property

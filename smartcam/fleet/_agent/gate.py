@@ -137,7 +137,7 @@ class Gate:
         return waiting
 
     def give_up(self, waiting: InLine) -> None:
-        """Take one that has lined up out again, or back what it was granted."""
+        """Take a waiting caller out of the line, or back the turn that it was granted."""
         if waiting in self._line:
             self._line.remove(waiting)
         elif waiting.reservation is not None:

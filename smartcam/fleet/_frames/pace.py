@@ -20,7 +20,7 @@ PATIENCE = 1.25
 
 
 class FramePace:
-    """Of one stream. All times are of one clock."""
+    """Pace of one stream. All times are of one clock."""
 
     def __init__(self) -> None:
         self._gave: float | None = None

@@ -97,7 +97,7 @@ class FrameStream(ABC):
         """Return the numbers of frames sent, skipped and lost, to be told with the next frames."""
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """End the stream. Idempotent."""
         self.wake()
 
 

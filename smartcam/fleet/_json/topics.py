@@ -164,7 +164,7 @@ class CameraTopics:
         self.interpret(host.settings.interpret_as)
 
     def interpret(self, spec: Any) -> None:
-        """Have its containers read in another way from now on.
+        """Have the camera's containers read in another way from now on.
 
         Raises:
             ConfigurationError: ``spec`` is not valid.

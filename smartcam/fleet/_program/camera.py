@@ -445,7 +445,7 @@ class FleetCamera(Camera[ValueT]):
         self._stir(error)
 
     def _stir(self, what: Status | LinkError) -> None:
-        """Give who waits something to look at."""
+        """Wake the callers that wait for a change."""
         for queue in self._watching:
             queue.put_nowait(what)
 

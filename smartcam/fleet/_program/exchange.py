@@ -36,7 +36,7 @@ MAX_AGENTS_NUMBERED = 1000
 
 
 class _BusPlace(Handle):
-    """Somebody who is given what is said under one key."""
+    """Receiver of the messages under one key."""
 
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
         self.key, self.call = key, call

@@ -206,7 +206,7 @@ class Receiver:
 
     @property
     def epoch(self) -> int:
-        """Of the agent whose states were taken last; 0 before."""
+        """Epoch of the agent whose states were taken last; 0 before."""
         return self._states.epoch
 
     # ------------------------------------------------------------------ on demand

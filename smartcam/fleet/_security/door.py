@@ -235,7 +235,7 @@ class Door:
         self._expect_look(max(0.0, self._rested - asyncio.get_running_loop().time()))
 
     def _expect_look(self, delay: float | None) -> None:
-        """Look who comes in ``delay`` seconds, or not; what was expected before is forgotten."""
+        """Look at the port in ``delay`` seconds, or not at all; this replaces an earlier plan."""
         if self._coming is not None:
             self._coming.cancel()
             self._coming = None

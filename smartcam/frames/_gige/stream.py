@@ -76,7 +76,7 @@ class StreamSocket:
             return False
 
     def close(self) -> None:
-        """Close it. Idempotent."""
+        """Close the socket. Idempotent."""
         self.socket.close()
 
 

@@ -107,7 +107,7 @@ class CaptureDevice:
         return device
 
     def close(self) -> None:
-        """Give it back."""
+        """Give the device back."""
         system.close(self.number)
 
     @property

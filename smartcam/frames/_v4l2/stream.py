@@ -59,7 +59,7 @@ class CaptureStream:
         self._bad = self._empty = 0
 
     def close(self) -> None:
-        """Stop it, and give buffers and device back."""
+        """Stop the stream, and give buffers and device back."""
         self._buffers.release()
         self.device.close()
 

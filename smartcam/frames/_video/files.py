@@ -146,7 +146,7 @@ class PictureReading(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Give it back. Idempotent."""
+        """Close what is read. Idempotent."""
 
 
 class VideoReading(PictureReading):
@@ -342,7 +342,7 @@ class VideoReading(PictureReading):
             raise self.plan.wrong(f"{exc}; #format=RGB8 converts") from exc
 
     def close(self) -> None:
-        """Close it."""
+        """Close the video."""
         self._container.close()
 
     def _error(self, failure: Exception, took: float) -> FrameSourceError:

@@ -103,7 +103,7 @@ class WebStream:
         )
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """End the stream. Idempotent."""
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.transport.abort()

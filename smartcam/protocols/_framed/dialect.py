@@ -359,7 +359,7 @@ class FramedDialect(Dialect):
 
     @cached_property
     def constant(self) -> dict[type[Message], tuple[bytes, int, int | None]]:
-        """Of the messages that have no body: whole frame, id, id of the answer."""
+        """Messages without a body: the whole frame, its id, the id of the answer."""
         found: dict[type[Message], tuple[bytes, int, int | None]] = {}
         for row in self.table:
             if not row.fields:

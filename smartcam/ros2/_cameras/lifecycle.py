@@ -167,7 +167,7 @@ class CameraLifecycle(Lifecycle):
             await asyncio.sleep(next(delays))
 
     async def close(self) -> None:
-        """End it; others are told, and then it serves no more. Idempotent."""
+        """End the node: tell others, and then stop its services. Idempotent."""
         self.closed = True
         starting, self._starting = self._starting, None
         try:

@@ -42,11 +42,11 @@ class CameraPart(Protocol):
     """A part of a camera's node, which owns what it declares, and its tasks."""
 
     def start(self) -> Awaitable[None] | None:
-        """Declare it, and begin."""
+        """Declare the part, and begin."""
         ...
 
     async def close(self) -> None:
-        """End it, within seconds; also where starting it failed."""
+        """End the part, within seconds; also where starting it failed."""
         ...
 
 

@@ -123,7 +123,7 @@ class NativeNode(NamedNode):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open it.
+        """Open the node.
 
         Raises:
             RosError: rclpy makes no node.
@@ -160,7 +160,7 @@ class NativeNode(NamedNode):
                     end.fail(str(why))
 
     async def stop(self) -> None:
-        """Close it, with all that it publishes, hears, serves and calls. Idempotent, bounded."""
+        """Close the node with its publishers, subscriptions and services. Idempotent, bounded."""
         spun = self._spun
         if spun is None:
             return

@@ -245,7 +245,7 @@ class NativeClient:
             raise ServiceCallError(f"{self.name}: this client is closed", service=self.name)
 
     async def call(self, request: object = None, /, *, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call it, once somebody serves it.
+        """Call the service, once somebody serves it.
 
         Args:
             request: one of the type's own, or a mapping of its fields.

@@ -189,7 +189,7 @@ class SpunNode:
         return True
 
     def abandon(self) -> None:
-        """End it at the program's end, where nobody has done so; bounded."""
+        """End a node that is still open at the program's end, in bounded time."""
         self.end()
         self._thread.join(EXIT_TIMEOUT)
 

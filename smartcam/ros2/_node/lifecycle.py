@@ -186,23 +186,23 @@ class Lifecycle:
         """Begin a transition that was asked for."""
 
     async def configure(self) -> None:
-        """Have it configured: from Unconfigured to Inactive, else nothing; as :meth:`change`."""
+        """Go from Unconfigured to Inactive as :meth:`change` does; else do nothing."""
         await self._have("configure", INACTIVE, ACTIVE)
 
     async def activate(self) -> None:
-        """Have it active: from Inactive to Active, else nothing; as :meth:`change`."""
+        """Go from Inactive to Active as :meth:`change` does; else do nothing."""
         await self._have("activate", ACTIVE)
 
     async def deactivate(self) -> None:
-        """Have it not active: from Active to Inactive, else nothing; as :meth:`change`."""
+        """Go from Active to Inactive as :meth:`change` does; else do nothing."""
         await self._have("deactivate", INACTIVE, UNCONFIGURED)
 
     async def cleanup(self) -> None:
-        """Have it not configured: from Inactive to Unconfigured, else nothing; as `change`."""
+        """Go from Inactive to Unconfigured as :meth:`change` does; else do nothing."""
         await self._have("cleanup", UNCONFIGURED)
 
     async def shutdown(self) -> None:
-        """Have it Finalized, for good; as :meth:`change`."""
+        """Go to Finalized, for good, as :meth:`change` does."""
         await self._have("shutdown", FINALIZED)
 
     async def _have(self, label: str, *enough: LifecycleState) -> None:

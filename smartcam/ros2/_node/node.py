@@ -106,7 +106,7 @@ class Node(NamedNode):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open it.
+        """Open the node.
 
         Raises:
             ConnectFailedError: there is no router, or it cannot listen.
@@ -134,7 +134,7 @@ class Node(NamedNode):
             raise
 
     async def stop(self) -> None:
-        """Close it, with all that it publishes, hears, serves and calls. Idempotent."""
+        """Close the node, with all that it publishes, hears, serves and calls. Idempotent."""
         token, self._token = self._token, None
         if token is None:
             return

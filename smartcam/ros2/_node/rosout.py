@@ -157,7 +157,7 @@ class _Handler(logging.Handler):
         return True
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand it on."""
+        """Hand the log record on."""
         with _inside():
             try:
                 self._take(record)

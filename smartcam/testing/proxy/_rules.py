@@ -316,12 +316,12 @@ class DatagramRule(Rule):
 
 
 class Lose(DatagramRule):
-    """Let it vanish."""
+    """Drop the datagram."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repeat(DatagramRule):
-    """Send it more than once.
+    """Send the datagram more than once.
 
     Args:
         copies: how many more.
@@ -332,7 +332,7 @@ class Repeat(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Late(DatagramRule):
-    """Send it later; others overtake it.
+    """Send the datagram later; others overtake it.
 
     Args:
         seconds: how much.
@@ -345,7 +345,7 @@ class Late(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(DatagramRule):
-    """Send it behind those that follow.
+    """Send the datagram after the ones that follow.
 
     Args:
         behind: how many of the same direction and connection overtake it.

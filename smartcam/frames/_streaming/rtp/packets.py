@@ -47,7 +47,7 @@ class RtpPacket(NamedTuple):
     payload: bytes
 
     def pack(self) -> bytes:
-        """Return its bytes: no CSRC, no extension, no padding."""
+        """Return the packet's bytes: no CSRC, no extension, no padding."""
         second = self.marker << 7 | self.payload_type
         head = _HEAD.pack(VERSION << 6, second, self.sequence, self.timestamp, self.ssrc)
         return head + self.payload
@@ -106,7 +106,7 @@ class ReportBlock(NamedTuple):
     delay: int = 0
 
     def pack(self) -> bytes:
-        """Return its 24 bytes; ``lost`` is held within its 24 bits."""
+        """Return the block's 24 bytes; ``lost`` is held within its 24 bits."""
         lost = max(-(1 << 23), min(self.lost, (1 << 23) - 1)) & 0xFFFFFF
         rest = (self.highest, self.jitter, self.last_report, self.delay)
         return _BLOCK.pack(self.ssrc, self.fraction << 24 | lost, *rest)
@@ -139,7 +139,7 @@ class SenderReport(NamedTuple):
     blocks: tuple[ReportBlock, ...] = ()
 
     def pack(self) -> bytes:
-        """Return its bytes."""
+        """Return the report's bytes."""
         head = _SENDER.pack(*(part & mask for part, mask in zip(self[:5], _MASKS, strict=True)))
         return _packet(SR, len(self.blocks), head + b"".join(b.pack() for b in self.blocks))
 
@@ -151,7 +151,7 @@ class ReceiverReport(NamedTuple):
     blocks: tuple[ReportBlock, ...] = ()
 
     def pack(self) -> bytes:
-        """Return its bytes."""
+        """Return the report's bytes."""
         body = self.ssrc.to_bytes(4, "big") + b"".join(one.pack() for one in self.blocks)
         return _packet(RR, len(self.blocks), body)
 
@@ -163,7 +163,7 @@ class SourceDescription(NamedTuple):
     cname: str
 
     def pack(self) -> bytes:
-        """Return its bytes; a name is cut after 255."""
+        """Return the description's bytes; a name is cut after 255 bytes."""
         name = self.cname.encode()[:255]
         body = self.ssrc.to_bytes(4, "big") + bytes((CNAME, len(name))) + name + b"\0"
         return _packet(SDES, 1, body + bytes(-len(body) % 4))
@@ -176,7 +176,7 @@ class Goodbye(NamedTuple):
     reason: str = ""
 
     def pack(self) -> bytes:
-        """Return its bytes; a reason is cut after 255."""
+        """Return the packet's bytes; a reason is cut after 255 bytes."""
         body = b"".join(one.to_bytes(4, "big") for one in self.ssrcs)
         if self.reason:
             reason = self.reason.encode()[:255]
@@ -199,7 +199,7 @@ class PacketsMissing(NamedTuple):
     sequences: tuple[int, ...]
 
     def pack(self) -> bytes:
-        """Return its bytes: one entry for up to 17 packets that are near each other."""
+        """Return the request's bytes: one entry for up to 17 packets that are near each other."""
         body = struct.pack("!II", self.ssrc, self.media)
         left = list(self.sequences)
         while left:
@@ -217,7 +217,7 @@ class PictureLost(NamedTuple):
     media: int
 
     def pack(self) -> bytes:
-        """Return its bytes."""
+        """Return the request's bytes."""
         return _packet(PSFB, PLI, struct.pack("!II", self.ssrc, self.media))
 
 

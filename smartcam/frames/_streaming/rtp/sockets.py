@@ -103,7 +103,7 @@ class SocketPair:
 
     @classmethod
     def listening(cls, at: Endpoint) -> SocketPair:
-        """Return those that a receiver has; a group is joined.
+        """Return the sockets of a receiver; a multicast group is joined.
 
         Raises:
             OSError: the port is in use, or there is no such address here.
@@ -124,7 +124,7 @@ class SocketPair:
 
     @classmethod
     def waiting(cls, at: Endpoint) -> SocketPair:
-        """Return those of who asks to be sent to: an even port of an address, and the next one.
+        """Return sockets to be sent to: an even port of an address, and the next one.
 
         Raises:
             OSError: no ports are free.
@@ -142,7 +142,7 @@ class SocketPair:
 
     @classmethod
     def sending(cls, to: Endpoint, ttl: int) -> SocketPair:
-        """Return those that a sender has.
+        """Return the sockets of a sender.
 
         Raises:
             OSError: no ports are free.

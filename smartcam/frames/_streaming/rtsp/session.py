@@ -69,7 +69,7 @@ class RtspSession:
 
     @property
     def ssrc(self) -> int:
-        """Of its packets."""
+        """SSRC of the session's packets."""
         return self._numbering.ssrc
 
     def start(self, delivery: PacketDelivery) -> None:

@@ -118,7 +118,7 @@ class RtspConversation:
             raise plan.wrong(f"cannot be read: {why(exc)}") from None
 
     async def play(self) -> None:
-        """Have it play, and keep the session alive until :meth:`close`.
+        """Have the camera play, and keep the session alive until :meth:`close`.
 
         Raises:
             FrameSourceError: it refuses, or is silent.

@@ -96,7 +96,7 @@ class RtspLink(asyncio.Protocol):
         return socket.AF_INET6 if ":" in str(self.peer[0]) else socket.AF_INET
 
     def fail(self, why: str) -> None:
-        """End it for a reason that :attr:`on_end` is told."""
+        """End the link for a reason that :attr:`on_end` is told."""
         self._end(why)
 
     def _of_socket(self, what: str) -> Any:
@@ -161,12 +161,12 @@ class RtspLink(asyncio.Protocol):
         return True
 
     def close(self) -> None:
-        """End it, when what was written is taken; nothing is handed on any more. Idempotent."""
+        """End the link when all written bytes are taken; nothing is handed on now. Idempotent."""
         self.on_packet, self.on_read, self.on_end = _ignore, _ignore, _ignore
         self._end("it was closed")
 
     def abort(self) -> None:
-        """End it at once. Idempotent."""
+        """End the link at once. Idempotent."""
         self.close()
         if self._transport is not None:
             self._transport.abort()
@@ -191,7 +191,7 @@ class RtspLink(asyncio.Protocol):
         self.on_read()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Tell whoever waits for an answer that none comes."""
+        """Fail all calls that wait for an answer."""
         why = getattr(exc, "strerror", None) if exc is not None else None
         self._end(f"the connection is lost: {why}" if why else "the server closed the connection")
 

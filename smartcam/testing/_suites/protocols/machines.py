@@ -136,7 +136,7 @@ class MachineChecks(Parameters):
         strategies.each_drawn(check)
 
     def test_end_of_the_link_is_told_once(self, stream: Conversation) -> None:
-        """Wherever it ends, in the middle of an answer as well; then nothing is read any more."""
+        """Check an end anywhere, also within an answer; nothing is read after it."""
         for place, halves in _places(stream):
             player = Player(self.protocol, stream).play(place)
             judge = _Judge(player.machine)
