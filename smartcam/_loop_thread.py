@@ -27,7 +27,7 @@ CALL_TIMEOUT = 10.0
 well under a millisecond; longer means that something in there, such as a generator of an
 application, does not return."""
 
-LOCK_WAIT_TIME = 0.1
+MAX_LOCK_WAIT_TIME = 0.1
 """Seconds that Ctrl-C may have to wait where a lock's wait is not interrupted: on Windows, and
 elsewhere if it comes between the lock's look for signals and its wait."""
 
@@ -135,7 +135,7 @@ class _ThreadCall:
         try:
             self._mailbox.post(self._begin)
             deadline = None if timeout is None else time.monotonic() + timeout
-            while not self._done.acquire(timeout=LOCK_WAIT_TIME):
+            while not self._done.acquire(timeout=MAX_LOCK_WAIT_TIME):
                 if deadline is not None and time.monotonic() >= deadline:
                     return False
         except BaseException:  # KeyboardInterrupt, in the main thread

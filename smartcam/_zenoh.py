@@ -99,7 +99,7 @@ ROUTER_TIMEOUT = 3.0
 
 NOT_ZENOH = "nothing there speaks Zenoh"
 
-DECLARED_AT_ONCE = 32
+MAX_DECLARED_AT_ONCE = 32
 """Declarations made in one turn of the event loop at most."""
 
 _ONE = (1).to_bytes(8, sys.byteorder)
@@ -379,7 +379,7 @@ class ZenohSession:
             raise ConfigurationError(f"{self._what} is not open")
         await self._open(timeout)
         for number, one in enumerate(tuple(self._declared)):
-            if number % DECLARED_AT_ONCE == 0:
+            if number % MAX_DECLARED_AT_ONCE == 0:
                 await asyncio.sleep(0)
             one.again()
         self._reopening = False

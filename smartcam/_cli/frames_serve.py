@@ -42,7 +42,7 @@ MAX_SHOWN = 4
 FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
 """Errors of a source that will hardly ever be what was asked for."""
 
-FIRST = 3.0
+FIRST_TRY_TIMEOUT = 3.0
 """Seconds that the first try of each source is waited for, before the others are served."""
 
 PERIOD = 1.0
@@ -168,9 +168,9 @@ async def serve_sources(
 
 
 async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Options) -> None:
-    """Serve, once each source was tried, or :data:`FIRST` seconds are over."""
+    """Serve, once each source was tried, or :data:`FIRST_TRY_TIMEOUT` seconds are over."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(FIRST):
+        async with asyncio.timeout(FIRST_TRY_TIMEOUT):
             await tries.check()
     async with contextlib.AsyncExitStack() as stack:
         server: RtspServer | None = None

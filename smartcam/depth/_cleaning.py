@@ -26,7 +26,7 @@ MILLIMETRE: Final = 1e-3
 MAX_PASSES: Final = 16
 """Iterations, and pixels that holes are filled over: 8 times as many are still a few seconds."""
 
-SCENE: Final = 0.5
+MIN_NEW_SCENE_SHARE: Final = 0.5
 """Share of the pixels that must change by more than an edge for a new scene."""
 
 
@@ -189,7 +189,7 @@ class TemporalFilter:
         both = there & (average > 0)
         step = new - average
         changed = both & (np.abs(step) >= self.delta)
-        if np.count_nonzero(changed) > SCENE * np.count_nonzero(both):
+        if np.count_nonzero(changed) > MIN_NEW_SCENE_SHARE * np.count_nonzero(both):
             return self._begin(new)
         kept = both & ~changed
         np.add(average, np.float32(self.alpha) * step, out=average, where=kept)

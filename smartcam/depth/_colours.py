@@ -25,7 +25,7 @@ MOST: Final = {"hue": 179, "saturation": 255, "value": 255}
 HUE_UNITS: Final = 180
 """Hues on the circle of colours in OpenCV's units, two degrees each."""
 
-DULL: Final = 40
+MIN_COLOURFUL: Final = 40
 """Saturation or value below which a hue is nothing but noise."""
 
 
@@ -148,9 +148,9 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
     near = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
     hues, saturations, values = near.reshape(-1, 3).astype(int).T
     saturation, value = _spread(saturations, margin), _spread(values, margin)
-    if np.median(values) < DULL:
+    if np.median(values) < MIN_COLOURFUL:
         return ColourRange(value=(0, value[1]))
-    if np.median(saturations) < DULL:
+    if np.median(saturations) < MIN_COLOURFUL:
         return ColourRange(saturation=(0, saturation[1]), value=value)
     # the hues as seen from their middle, so that red is no two colours
     middle = round(np.angle(np.exp(2j * np.pi * hues / HUE_UNITS).sum()) * HUE_UNITS / (2 * np.pi))

@@ -45,8 +45,8 @@ class ReaderStatistics:
 class FrameReader:
     """One reader of a source: an iterator that gives the newest frame, and skips what it missed.
 
-    The device streams while there is a reader. One that is closed, or that nobody holds any
-    longer, does not count.
+    The device streams while there is a reader: one that is not closed, and that somebody still
+    refers to.
     """
 
     def __init__(self, source: FrameSource, timeout: float | None) -> None:

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
-FLUSH = 1.0
+FLUSH_TIMEOUT = 1.0
 """Seconds at the end for what waits to be sent."""
 ASK_TIMEOUT = 5.0
 """Seconds for the answer to a call of ours."""
-REPEAT = 10.0
+REPEAT_INTERVAL = 10.0
 """Seconds between two sayings of what is latched on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
 _LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.INFO}
@@ -155,7 +155,7 @@ class RosbridgeNode(NamedNode):
 
     async def _withdraw_all(self) -> None:
         with contextlib.suppress(TimeoutError):  # it does not read
-            async with asyncio.timeout(FLUSH):
+            async with asyncio.timeout(FLUSH_TIMEOUT):
                 await self._outbox.flushed()
         for service in tuple(self._services.values()):
             self.forget(service)
@@ -325,7 +325,7 @@ class RosbridgeNode(NamedNode):
     async def _repeat_shared(self) -> None:
         within = f"{self.full_name}/"
         while True:
-            await asyncio.sleep(REPEAT)
+            await asyncio.sleep(REPEAT_INTERVAL)
             for publisher in self._publishers.values():
                 if publisher.exists and not publisher.name.startswith(within):
                     publisher.lane.say_again()

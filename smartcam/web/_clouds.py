@@ -35,7 +35,7 @@ MAX_VIEWERS: Final = 8
 PROTOCOL: Final = "smartcam.cloud"
 """Subprotocol of the WebSockets that send clouds."""
 
-PART: Final = 1 << 16
+PART_BYTES: Final = 1 << 16
 """Bytes of a message that are written at a time."""
 
 SLOW: Final = 60.0
@@ -219,8 +219,8 @@ class CloudViewer(PageSocket):
             self._shown.clear()
             async with asyncio.timeout(SLOW):
                 await self._socket.send_str(json.dumps({"number": number, **cloud.about}))
-                for start in range(0, len(cloud.body), PART):
-                    await self._socket.send_bytes(cloud.body[start : start + PART])
+                for start in range(0, len(cloud.body), PART_BYTES):
+                    await self._socket.send_bytes(cloud.body[start : start + PART_BYTES])
                     await asyncio.sleep(0)
                 await self._shown.wait()
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
     from smartcam.geometry._inside import Array
 
-FEWEST = 4
+MIN_CORNERS = 4
 """Corners that fix a pose at least."""
 
 LARGEST_DOUBLED = 2600
@@ -89,7 +89,7 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     row, column = np.divmod(ids, target.columns - 1)
     colours = (1 - 2 * ((row + column) % 2)) * np.sign(corners.gains)
     seen = corners.fitted & (colours * (colours @ corners.fitted) > 0)
-    if seen.sum() < FEWEST:
+    if seen.sum() < MIN_CORNERS:
         raise _not_found(target, "clear enough", int(seen.sum()))
     return TargetView(
         target=target,
@@ -110,19 +110,19 @@ def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
     """
     seen = _detect(image, target)
     count = len(seen.ids)
-    if seen.otherwise >= max(FEWEST, seen.agreeing + 1):
+    if seen.otherwise >= max(MIN_CORNERS, seen.agreeing + 1):
         raise _other_pattern(target, seen)
     check_one_board(seen.agreeing, seen.contrary, _name(target))
-    if 2 * count > max(len(target.points), 4 * FEWEST):
+    if 2 * count > max(len(target.points), 4 * MIN_CORNERS):
         return seen
-    if seen.side and len(_detect(_flipped(image), target).ids) >= max(FEWEST, 2 * count):
+    if seen.side and len(_detect(_flipped(image), target).ids) >= max(MIN_CORNERS, 2 * count):
         raise Code.MIRRORED.refusal(
             f"{_name(target)}: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
             "the sheet as one reads it",
             "its mirror image",
         )
-    if count < FEWEST:
+    if count < MIN_CORNERS:
         read = f"beside {seen.markers} markers of its dictionary"
         if seen.markers:
             read += f", of which {seen.agreeing} stand to each other as on such a board"
@@ -186,7 +186,7 @@ def _detect(image: GreyImage, target: Charuco) -> _Sighting:
 
 def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
     """Return True if all corners were found that should be in the image."""
-    if len(seen.ids) < FEWEST:
+    if len(seen.ids) < MIN_CORNERS:
         return False
     matrix = fit_homography(target.points[seen.ids, :2], seen.points)
     if matrix is None:
@@ -302,8 +302,8 @@ def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:
     return Code.TARGET_NOT_FOUND.refusal(
-        f"charuco: expected at least {FEWEST} corners of a board of {target.columns} x "
+        f"charuco: expected at least {MIN_CORNERS} corners of a board of {target.columns} x "
         f"{target.rows} squares, found {count} {how}",
-        FEWEST,
+        MIN_CORNERS,
         count,
     )

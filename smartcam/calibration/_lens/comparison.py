@@ -36,7 +36,7 @@ LEVEL: Final = 0.01
 SMALLEST: Final = 1e-9
 """A chance that is less is not told: the noise is not as normal as that."""
 
-STEPS: Final = 50
+MAX_STEPS: Final = 50
 """The fit of the motion takes at most this many steps; it usually takes five."""
 
 SETTLED: Final = 1e-9
@@ -261,7 +261,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
     ``far``: they are directions, so it is a turn. Gauss and Newton.
     """
     seen, motion = first.project(gauge), IDENTITY
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         moved = gauge @ motion.rotation.T + motion.translation
         by_motion = sensitivity(second, moved, far=far).by_motion.reshape(-1, 6)
         off = (seen - _project(second, moved)).reshape(-1)

@@ -54,7 +54,7 @@ MIN_POINTS_KEPT: Final = 8
 MEDIAN: Final = 2.0 * math.log(2.0)
 """Median of the squared length of two independent normal numbers with a variance of 1."""
 
-NAMED: Final = 5
+MAX_NAMED: Final = 5
 """Points that a text names at most."""
 
 WORST: Final = 10.0
@@ -187,10 +187,10 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
     rest = [one for one in found if one.ident not in often]
     if rest:
         each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
-        more = f", and {len(each) - NAMED} more" if len(each) > NAMED else ""
+        more = f", and {len(each) - MAX_NAMED} more" if len(each) > MAX_NAMED else ""
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{', '.join(each[:NAMED])}{more}: each {done}"
+            f"{', '.join(each[:MAX_NAMED])}{more}: each {done}"
         )
 
 
@@ -255,10 +255,10 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
     copies = [", ".join(one) for one in groups.values() if len(one) > 1]
     if copies:
-        more = f", and {len(copies) - NAMED} more" if len(copies) > NAMED else ""
+        more = f", and {len(copies) - MAX_NAMED} more" if len(copies) > MAX_NAMED else ""
         yield Code.COINCIDENT.remark(
-            f"views that are the same to the last digit: {'; '.join(copies[:NAMED])}{more}: they "
-            "count as often as they are there, and errors come out too small"
+            f"views that are the same to the last digit: {'; '.join(copies[:MAX_NAMED])}{more}: "
+            "they count as often as they are there, and errors come out too small"
         )
     length = float(np.ptp(views[0].target.points, axis=0).max())
     if length > LONGEST:

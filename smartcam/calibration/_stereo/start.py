@@ -31,7 +31,7 @@ RIGHT: Final = "right"
 SIDES: Final = (LEFT, RIGHT)
 """Names of the sides by number."""
 
-GUESSES: Final = 20
+MAX_GUESSES: Final = 20
 """Pairs at most that are tried for a first guess of the transform."""
 
 GROSS: Final = 10.0
@@ -166,7 +166,7 @@ def _rig(
         if one is not None and two is not None and moment[1] is not None
     ]
     best, least, off = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
-    some = pairs[:: math.ceil(len(pairs) / GUESSES)]
+    some = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
     for turn, (_, one, two, _) in itertools.product(turns, some):
         # T_right_left = T_right_target T_target_left; that with the least median counts, which half
         # of the pairs may not spoil: Rousseeuw, Least Median of Squares Regression (1984).

@@ -48,9 +48,9 @@ _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,4})?
 _NOT_FINITE = re.compile(r"[-+]?\.?(?:nan|inf|infinity)", re.IGNORECASE)
 _NAME = re.compile(r"[\w/][\w./+-]*")
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
-_PRINTED = 1e-4
+_MAX_PRINTED_DEVIATION = 1e-4
 """Largest deviation from a rotation of a matrix that was printed with few digits."""
-_EXACT = 1e-6
+_MAX_EXACT_DEVIATION = 1e-6
 """Largest deviation of a matrix that is taken as it is; :class:`Transform` has the same bound."""
 
 
@@ -246,11 +246,11 @@ def rigid(
     Raises ``MALFORMED``: its last row; ``NOT_RIGID``: it is no rotation.
     """
     matrix = np.array(rows, dtype=np.float64)
-    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_EXACT):
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_MAX_EXACT_DEVIATION):
         raise malformed(where, "a last row 0 0 0 1", " ".join(f"{value:g}" for value in matrix[3]))
     rotation = matrix[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if _EXACT <= off < _PRINTED:
+    if _MAX_EXACT_DEVIATION <= off < _MAX_PRINTED_DEVIATION:
         rotation = _nearest_rotation(rotation)
     return Transform(target, source, rotation, matrix[:3, 3])
 

@@ -64,7 +64,7 @@ MAX_VIEWS = 40
 ADVISED_VIEWS = 10
 """Views from which on the wizard offers to calculate first."""
 
-CALCULATION = 120.0
+CALCULATION_TIMEOUT = 120.0
 """Seconds that the calculation may take; of 15 views it takes a few."""
 
 _MOVES: Mapping[str, str] = {
@@ -349,7 +349,7 @@ class _Views:
             description="Several ways are compared by the poses that each has not seen.",
             button="Calculate",
             notes=(f"{len(self._samples)} views",),
-            timeout=CALCULATION,
+            timeout=CALCULATION_TIMEOUT,
         )
         found = (await ask(step, self._solve)).outcome
         if "code" in found:

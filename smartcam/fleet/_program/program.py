@@ -31,7 +31,7 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 LOOK_AGAIN = 0.1
 """Seconds between two looks whether an agent has come."""
 
-LAST_LOOK = 1.0
+LAST_LOOK_TIMEOUT = 1.0
 """Seconds that a look may take at what is there instead."""
 
 
@@ -137,7 +137,7 @@ class Program:
             await asyncio.sleep(min(LOOK_AGAIN, left))
         what, meant = "camera", ""
         if "*" not in self._camera:
-            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK)
+            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK_TIMEOUT)
             meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
             what = f"camera {self._camera}"
         whose = self.bus.identity

@@ -49,7 +49,7 @@ REST = 4.0
 """Rest after a look at connections, in multiples of what it took, however many come: it looks at
 every descriptor, and an agent may have thousands of cameras."""
 
-CALM_GROWTH = 8
+MAX_CALM_GROWTH = 8
 """Descriptors more than at the last look that are taken for calm."""
 
 CHECK_AFTER = 50
@@ -188,7 +188,7 @@ class Door:
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         lowest, before = _lowest_free(most), self._lowest
         self._lowest = lowest
-        calm = not self.shut and lowest <= before + CALM_GROWTH
+        calm = not self.shut and lowest <= before + MAX_CALM_GROWTH
         delay = LOOK_EVERY_IF_CALM if calm else LOOK_EVERY
         self._timer = asyncio.get_running_loop().call_later(delay, self._look)
         self._looks += 1

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-LEAST: Final = 0.05
+MIN_INTERVAL: Final = 0.05
 """Seconds between two messages."""
 
 MAX_WAITING_EVENTS: Final = 64
@@ -93,7 +93,7 @@ class CameraStatusTopic:
                 if fields != said:
                     said = fields
                     self._say(publisher, fields)
-                    await asyncio.sleep(LEAST)
+                    await asyncio.sleep(MIN_INTERVAL)
                 try:
                     await anext(events)
                 except (SmartCamError, StopAsyncIteration):

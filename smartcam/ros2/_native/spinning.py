@@ -24,7 +24,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 THREADS = 4
 """Threads of a node's executor: a set of parameters takes one until its hook has answered."""
 
-LOOK_AGAIN = 1.0
+LOOK_INTERVAL = 1.0
 """Seconds between two looks of a spinning thread whether its event loop is still there."""
 
 AFTER_ERROR = 0.05
@@ -242,7 +242,7 @@ class SpunNode:
             if not context.ok():
                 return RosError(f"{self._name}: rclpy's context was shut down: the node is gone")
             try:
-                self.executor.spin_once(LOOK_AGAIN)
+                self.executor.spin_once(LOOK_INTERVAL)
             except shut_down:
                 continue
             except NoReplyError:

@@ -34,7 +34,7 @@ _TO_ARRAY: Final = 5
 _NUMBERS: Final = (INTEGER, DOUBLE)
 _INT64: Final = (-(1 << 63), (1 << 63) - 1)
 
-_CLOSE: Final = 1e-9
+_MAX_DEVIATION: Final = 1e-9
 """Largest deviation of a double from a bound or a step, as a part of either."""
 
 
@@ -124,7 +124,9 @@ class ParameterDescription:
 
 
 def _double_fits(value: float, first: float, last: float, step: float) -> bool:
-    if math.isclose(value, first, rel_tol=_CLOSE) or math.isclose(value, last, rel_tol=_CLOSE):
+    if math.isclose(value, first, rel_tol=_MAX_DEVIATION) or math.isclose(
+        value, last, rel_tol=_MAX_DEVIATION
+    ):
         return True
     if not first <= value <= last:
         return False
@@ -133,7 +135,7 @@ def _double_fits(value: float, first: float, last: float, step: float) -> bool:
     if not math.isfinite(value):
         return False
     nearest = first + round((value - first) / step) * step
-    return math.isclose(value, nearest, rel_tol=_CLOSE, abs_tol=_CLOSE * step)
+    return math.isclose(value, nearest, rel_tol=_MAX_DEVIATION, abs_tol=_MAX_DEVIATION * step)
 
 
 def range_of(

@@ -124,8 +124,8 @@ class SenderReport(NamedTuple):
 
     Attributes:
         ssrc: the stream.
-        ntp: seconds since 1900 in units of 2**-32, at the same moment as
-        timestamp: time of the stream's clock.
+        ntp: wall clock of the report, seconds since 1900 in units of 2**-32.
+        timestamp: the stream's clock at the same moment.
         packets: sent since the beginning.
         octets: bytes of payload in these packets.
         blocks: what it says of others' streams, at most 31.
@@ -191,7 +191,7 @@ class PacketsMissing(NamedTuple):
     Attributes:
         ssrc: the receiver.
         media: the stream.
-        sequences: numbers of the packets that are missing.
+        sequences: numbers of the missing packets.
     """
 
     ssrc: int

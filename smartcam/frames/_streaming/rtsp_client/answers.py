@@ -30,7 +30,7 @@ _BEGINS: Final = re.compile(
     rb"\$|RTSP/\d|(?:ANNOUNCE|GET_PARAMETER|OPTIONS|PAUSE|REDIRECT|SET_PARAMETER|TEARDOWN) "
 )
 
-LONGEST_BEGIN: Final = 16
+MAX_BEGIN_BYTES: Final = 16
 """Bytes by which it is known that a message begins, at most."""
 
 USUAL_CHANNELS: Final = range(4)
@@ -124,7 +124,7 @@ class AnswerParser:
     def _begins(self) -> bool | None:
         """Return True if a message begins; None: bytes that looked like one were thrown away."""
         found = _BEGINS.search(self._data)
-        gone = found.start() if found else max(0, len(self._data) - LONGEST_BEGIN)
+        gone = found.start() if found else max(0, len(self._data) - MAX_BEGIN_BYTES)
         if gone:
             self._strays += len(self._data[:gone].strip(b"\r\n\0 "))
             del self._data[:gone]

@@ -47,7 +47,7 @@ REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 ENOUGH = 1000
 """Messages after which bytes without an end are messages."""
 
-HIDDEN = 2
+MAX_HIDDEN_FACTOR = 2
 """Largest memory of a machine for bytes that wait, in multiples of the bound, events apart."""
 
 
@@ -182,7 +182,9 @@ class MachineChecks(Parameters):
             if messages > ENOUGH:
                 break  # they are messages
         kept = tracemalloc.get_traced_memory()[0] - before
-        assert kept <= HIDDEN * self.max_waiting, f"{where}: the machine has grown by {kept} bytes"
+        assert kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
+            f"{where}: the machine has grown by {kept} bytes"
+        )
 
     # ------------------------------------------------------------------ requests
 
