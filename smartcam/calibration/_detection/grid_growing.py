@@ -101,7 +101,7 @@ def lattices(
 
 
 def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
-    """Return a test that two dots' ``areas`` (N,) are alike, or one is ``larger`` times the other."""
+    """Return a test that dots' ``areas`` (N,) are alike, or one ``larger`` times the other."""
 
     def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
         part = areas[one] / (larger * areas[other])

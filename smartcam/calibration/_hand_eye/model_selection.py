@@ -1,14 +1,14 @@
 """Choose the way of solving a camera and a robot that predicts unseen poses best.
 
-There are two ways. ``robot`` corrects each pose of the robot as far as its noise allows. It is best
+There are two ways. ``robot`` corrects each pose of the robot as far as noise allows. It is best
 where the robot's only error is noise. ``reprojection`` takes the robot's poses as they are given and
 minimizes the error on the target. It is best where a robot has other errors (joints with offsets,
 gears with play, a sheet of another size), which corrections of single poses do not describe.
 
 The poses decide between the two: each way is solved again without one pose, and predicts from the
 robot's given pose where the camera would see the target. The distance to where it was seen is the
-held-out error: on the target, in metres, as in picking. ``reprojection`` is taken where its held-out
-errors are smaller by more than chance. Blends of the two predict no better: 0.2 % worse over 26
+held-out error: on the target, in metres, as in picking. ``reprojection`` is taken where its errors
+are smaller by more than chance. Blends of the two predict no better: 0.2 % worse over 26
 kinds of simulated robots, up to 9 % worse on recorded ones (measured).
 
 The camera's parameters and the target's scale are adjusted as well where two things hold: the

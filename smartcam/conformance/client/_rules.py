@@ -1,6 +1,6 @@
 """Rules for a client, checked against its messages and its results.
 
-Each rule takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns what was wrong, in
+Each rule takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake in
 words, or None.
 """
 
