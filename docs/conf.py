@@ -57,6 +57,9 @@ from smartcam.settings import CameraSettings
 from smartcam.web import _clouds as cloud_page
 from smartcam.web import _colours as colour_page
 from smartcam.web import _emulator as emulator_page
+from smartcam.web import _fleet as fleet_page
+from smartcam.web import _live as live_page
+from smartcam.web import _wizard as wizard_page
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -615,6 +618,21 @@ def calls_cloud() -> str:
     return _calls(cloud_page.CALLS)
 
 
+def calls_wizard() -> str:
+    """Return the calls of the page of a calibration."""
+    return _calls(wizard_page.CALLS)
+
+
+def calls_live() -> str:
+    """Return the calls of the page of one camera."""
+    return _calls(live_page.CALLS)
+
+
+def calls_fleet() -> str:
+    """Return the calls of the page of a fleet."""
+    return _calls(fleet_page.CALLS)
+
+
 def _calls(calls: Iterable[Any]) -> str:
     rows = [
         (call.method, f"`{call.path}`", call.about, f"`{call.sample}`" if call.sample else "")
@@ -684,6 +702,17 @@ def layers() -> str:
     return "\n".join(f"```text\n{text.replace(' :', ',')}\n```\n" for text in texts)
 
 
+def modules() -> str:
+    """Return each module with the first line of its docstring."""
+    rows: list[tuple[str, str, str]] = []
+    for path in sorted((ROOT / "smartcam").rglob("*.py")):
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        first = re.sub(r":\w+:`[~.]?(?:[\w.]+\.)?(\w+)`", r"`\1`", text.split("\n\n")[0])
+        folder = ".".join(path.relative_to(ROOT).parent.parts)
+        rows.append((f"`{folder}`", f"`{path.stem}`", " ".join(first.replace("``", "`").split())))
+    return _table(("in", "module", "holds"), rows)
+
+
 def limits() -> str:
     """Return the constants of :data:`LIMITS` with their values and the reasons in the source."""
     rows: list[tuple[object, ...]] = []
@@ -719,10 +748,12 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, quirks_insight, settings, transitions, policies, layers, limits),
+        modules,
         *(application, scenario, cue, faults_which, faults_wire, faults_device),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
         *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
         *(access_rights, calls_emulator, calls_colours, calls_cloud),
+        *(calls_wizard, calls_live, calls_fleet),
     )
 }
 """What ``{generated}`` knows."""

@@ -22,7 +22,6 @@ from smartcam.web import _emulator as emulator
 from smartcam.web import _routes as routes
 from smartcam.web import _serialize as serialize
 from smartcam.web import _streams as streams
-from smartcam.web._fleet import CALLS as FLEET_CALLS
 from smartcam.web._fleet import LINGER, MAX_CAMERAS
 from smartcam.web._fleet import MAX_VIEWERS as MAX_FLEET_VIEWERS
 from smartcam.web._fleet_rows import BAD_SECONDS, MAX_QUEUE
@@ -30,12 +29,10 @@ from smartcam.web._fleet_socket import ALIVE, MAX_ROWS
 from smartcam.web._fleet_view import BUCKET, PERIOD, SERIES, SORTS, Filter
 from smartcam.web._frames import CALLS as FRAMES_CALLS
 from smartcam.web._history import BAR_SECONDS, MAX_BARS, MAX_PICTURES
-from smartcam.web._live import CALLS as LIVE_CALLS
 from smartcam.web._live import MAX_NEWS
 from smartcam.web._live_view import MAX_RESULTS
 from smartcam.web._pictures import MAX_VIEWERS
 from smartcam.web._verdicts import FAIL_WORDS, NOT_WORDS, PASS_WORDS
-from smartcam.web._wizard import CALLS as WIZARD_CALLS
 from tests import ROOT
 from tests.web.sitekit import TOKEN
 
@@ -95,12 +92,10 @@ def test_frames_page_has_its_numbers() -> None:
 @pytest.mark.parametrize(
     ("page", "calls"),
     [
-        (LIVE_PAGE, LIVE_CALLS),
         (FLEET_PAGE, [one for one in FLEET_CALLS if "{camera}" not in one.path]),
-        (WIZARD_PAGE, WIZARD_CALLS),
         (FRAMES_PAGE, FRAMES_CALLS),
     ],
-    ids=["live", "fleet", "calibrating", "frames"],
+    ids=["frames"],
 )
 def test_table_has_every_call(page: str, calls: Iterable[Any]) -> None:
     table = page.partition("\n## Calls\n")[2].partition("\n`GET /api")[0]
