@@ -786,7 +786,8 @@ def setup(app: Any) -> None:
 
 def _link_results(_app: Any, _name: str, source: list[str]) -> None:
     """Let a page's links to results, which are no pages, lead to these files."""
-    source[0] = source[0].replace("](../results/", "](path:../results/")
+    for way in ("../results/", "../../results/"):
+        source[0] = source[0].replace(f"]({way}", f"](path:{way}")
 
 
 def _plain_types(
