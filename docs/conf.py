@@ -629,8 +629,8 @@ def calls_live() -> str:
 
 
 def calls_fleet() -> str:
-    """Return the calls of the page of a fleet."""
-    return _calls(fleet_page.CALLS)
+    """Return the calls of the page of a fleet, without those of one camera."""
+    return _calls(one for one in fleet_page.CALLS if "{camera}" not in one.path)
 
 
 def _calls(calls: Iterable[Any]) -> str:
