@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 import subprocess
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, get_args
 
 import pytest
 
@@ -37,7 +37,7 @@ from tests import ROOT
 from tests.web.sitekit import TOKEN
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
 PAGE = (ROOT / "docs" / "control.md").read_text(encoding="utf-8")
 FLEET_PAGE = (ROOT / "docs" / "fleet-page.md").read_text(encoding="utf-8")
