@@ -102,7 +102,7 @@ class Queue(Generic[T]):
         return bool(self._items)
 
     def share(self, ready: asyncio.Event) -> None:
-        """Set this event where something comes, or it ends; for who reads several."""
+        """Set this event where something comes, or it ends; for readers of several."""
         self._ready = ready
         if self._items or self._ended:
             ready.set()

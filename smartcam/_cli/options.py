@@ -153,7 +153,7 @@ def runs(
 
 @contextmanager
 def naming(what: str) -> Iterator[None]:
-    """Make what goes wrong with a file in here a ConfigurationError that says whose it is."""
+    """Turn errors of a file in the block into a ConfigurationError that names the file."""
     try:
         yield
     except OSError as exc:

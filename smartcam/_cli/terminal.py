@@ -22,7 +22,7 @@ PERIOD = 1.0
 
 
 def tinted(word: str, text: str | None = None) -> str:
-    """Return a word in its colour, or a text in the word's; :func:`click.echo` takes it off a file.
+    """Return a word, or a text, in the word's colour; :func:`click.echo` removes it in files.
 
     Plain where NO_COLOR is set or the terminal is dumb.
     """

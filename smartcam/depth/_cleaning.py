@@ -145,7 +145,7 @@ class TemporalFilter:
     """Averages the depth maps of a camera that stands still, each pixel for itself.
 
     A pixel that differs from its average by ``delta`` or more begins anew: something moved, or an
-    edge went over it. Where half of the picture does so, or maps of another size come, all of it
+    edge went over it. Where half of the picture jumps, or maps of another size come, all of it
     begins anew. A hole takes no part, and for ``persistence`` maps it shows the average that was
     there before, unless a pixel beside it begins anew.
 

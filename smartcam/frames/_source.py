@@ -237,7 +237,7 @@ class FrameSource(FrameSink):
         self._task.add_done_callback(self._stopped)
 
     def _stopped(self, task: asyncio.Task[None]) -> None:
-        """Begin again for who came meanwhile; tell readers where somebody cancelled the task."""
+        """Begin again for readers that came meanwhile; tell readers of a cancelled task."""
         if task is not self._task or self._loop is None:
             return
         self._task = None
@@ -326,7 +326,8 @@ class FrameSource(FrameSink):
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
 
-        Who asks often keeps a reader, or opens the source with ``linger``: without either the
+        A program that asks often keeps a reader, or opens the source with ``linger``: without
+            either the
         device begins to stream for each.
         """
         max_age = check_age(max_age, "max_age")

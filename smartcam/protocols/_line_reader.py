@@ -36,7 +36,7 @@ class LineReader:
         return bytes(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Take what came. Whoever feeds it bounds what waits, by :func:`len`."""
+        """Take bytes. The caller bounds what waits, by :func:`len`."""
         self._buffer += data
 
     def next_line(self) -> str | None:

@@ -203,7 +203,7 @@ class LineDialect(Dialect):
         return f"{type(message).__name__} ({'' if row is None else row.line[:32]})"
 
     def unsupported(self, message_type: type[m.Message]) -> UnsupportedError:
-        """Return the error of who asks for a message that it does not have; it names the make."""
+        """Return the error for a message that the dialect does not have; it names the make."""
         plain = super().unsupported(message_type)
         return UnsupportedError(f"{self.make}: {plain}") if self.make else plain
 

@@ -216,7 +216,7 @@ class Recorder(Observer):
         event loop has other things to do.
 
         Raises:
-            RecordingError: the recording had failed, or does so now.
+            RecordingError: the recording has failed, before or now.
         """
         with self._more:
             self._taking, self._closing = False, True

@@ -96,7 +96,7 @@ class CloudSite(ThreadedSite):
     def show(self, cloud: Cloud) -> None:
         """Show a cloud in place of the last one, from the event loop's thread.
 
-        Whoever looks gets it as soon as the last one is shown; one that is replaced before is
+        A viewer gets it as soon as the last one is shown; one that is replaced before is
         skipped. It is thinned and packed in a thread.
 
         Raises:

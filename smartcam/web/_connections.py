@@ -1,7 +1,7 @@
 """The connections of a site: how many there are, and how long each may take for a request.
 
 It is the policy of every port (:mod:`smartcam._accepting`), and holds before a token is looked at.
-What stands for a session is a request that is there in whole, while it is answered.
+A whole request counts as a session while it is answered.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Visitor(asyncio.Protocol):
 
     @contextlib.contextmanager
     def request(self, request: web.BaseRequest) -> Iterator[None]:
-        """Deal, while in here, with a request whose head is there."""
+        """Mark a request whose head has come, as long as the block runs."""
         self._acceptor.expect(self, None, "")
         self._head = None
         try:
@@ -142,7 +142,7 @@ class Visitor(asyncio.Protocol):
 
     @contextlib.contextmanager
     def answer(self) -> Iterator[None]:
-        """Answer, while in here, a request that is there in whole: the place is safe."""
+        """Mark a whole request as being answered as long as the block runs: it keeps its place."""
         self.settled = True
         try:
             yield

@@ -159,7 +159,7 @@ class SitePictures:
             await asyncio.sleep(delay)
 
     async def view(self, place: int, request: web.Request) -> web.WebSocketResponse:
-        """Show a source to who asks, until the end.
+        """Show a source to a viewer, until the end.
 
         Raises:
             RefusedError: it is no WebSocket, or there are :data:`MAX_VIEWERS` already.

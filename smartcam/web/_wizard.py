@@ -36,7 +36,7 @@ class WizardSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        service: the calibrations' folder and their wizards; closed by who made it.
+        service: the calibrations' folder and their wizards; closed by its maker.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``

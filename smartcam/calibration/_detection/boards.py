@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
 
 USUAL_SIDE_PX = 800
-"""Longest side, pixels, of the image that is looked at in half of this size first, then in this,
-and then in double size, as far as it is as large."""
+"""Longest side, pixels, of a usual image: a board is looked for in half of this size, in this size,
+and in double size, as far as the image is as large."""
 
 NEIGHBOURS = 8
 """Saddles around one among which a board's next ones are: four and what else is near."""

@@ -18,10 +18,10 @@ LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
 """Pixels beside a chart, above it, below it, and on the right."""
 
 ADVANCE: Final = 7.5
-"""Width of a letter, about, pixels."""
+"""Approximate width of a letter, pixels."""
 
 CUT: Final = 3.0
-"""Bars that are higher than the highest of a used view by more are cut, with their number."""
+"""Multiple of the highest bar of a used view beyond which a bar is cut, with its number."""
 
 MAX_LINES: Final = 5
 """Horizontal lines of a chart at most."""

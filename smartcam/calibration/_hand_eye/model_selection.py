@@ -1,7 +1,7 @@
 """Choose the way of solving a camera and a robot that predicts unseen poses best.
 
 There are two ways. ``robot`` corrects each pose of the robot as far as noise allows. It is best
-where the robot's only error is noise. ``reprojection`` takes the robot's poses as they are given and
+where the robot's only error is noise. ``reprojection`` takes the robot's poses as they are and
 minimizes the error on the target. It is best where a robot has other errors (joints with offsets,
 gears with play, a sheet of another size), which corrections of single poses do not describe.
 

@@ -294,7 +294,7 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
 
 
 def most_rms(views: Sequence[TargetView], worst: float = WORST, part: float = WORST_PART) -> float:
-    """Return the residuals, rms of a coordinate in pixels, beyond which views cannot be so."""
+    """Return the residuals, rms of a coordinate in pixels, beyond which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)
     return max(worst, part * longer, WORST_SIGMAS * noise)

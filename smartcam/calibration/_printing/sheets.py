@@ -243,7 +243,7 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     Args:
         target: the target as it was to be printed.
         measured_ruler: how long the printed rulers along x and along y are, mm. A target has one
-            scale, the mean of both: what makes them differ by more than half a percent is no
+            scale, the mean of both. Rulers that differ by more than half a percent show no
             scale, but a printer that pulls the paper unevenly.
 
     Raises:

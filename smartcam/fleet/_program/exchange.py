@@ -74,7 +74,7 @@ class Exchange(Bus):
     # ------------------------------------------------------------------ for many
 
     def see_all(self, see: Callable[[str, bool], None]) -> None:
-        """Hear of all cameras' presences from now on, for who watches one of them, and for all.
+        """Hear of all cameras' presences from now on, for watchers of one camera or of all.
 
         ``see(key, present)`` is called for each.
         """

@@ -79,7 +79,7 @@ class H264Encoder:
         self._count = 0
 
     def begin_anew(self) -> None:
-        """Have the next frame be a key frame, for who joins or has lost something."""
+        """Have the next frame be a key frame, for a viewer that joins or has lost something."""
         self._broken += 1
 
     async def encode(self, frame: Frame) -> Frame:

@@ -121,7 +121,7 @@ def _samples(
 
 
 def _packed(name: str, code: int, colours: str) -> PixelFormat:
-    """Return a format whose samples share bytes; the code's third digits are its bits."""
+    """Return a format whose samples share bytes; the second byte of the code has its bits."""
     packing = PACKINGS[next(end for end in PACKINGS if name.endswith(end))]
     depth = 10 if "10" in name else 12
     layout = SampleLayout(COLOURS[colours], 2, packing=packing)

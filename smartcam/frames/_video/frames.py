@@ -59,7 +59,7 @@ _TRANSPARENT: Final = {"yuva420p": "yuv420p", "yuva422p": "yuv422p", "yuva444p":
 """FFmpeg's formats with a plane of alpha behind Y, U and V, and the same without."""
 
 CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
-"""Formats that FFmpeg converts to for who asks, and what it calls them."""
+"""Formats that FFmpeg converts to on request, and its names for them."""
 
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
 _RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them

@@ -479,7 +479,7 @@ class FramedDialect(Dialect):
         return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for who knows better.
+        """Return any request by its id, for users who know it better than the table.
 
         Raises:
             LocalProtocolError: Connect and Disconnect.

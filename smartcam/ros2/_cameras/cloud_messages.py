@@ -34,7 +34,7 @@ LARGEST_VALUE: Final = 65534.0
 """Steps of a compressed depth from the farthest, which is 1, to the nearest."""
 
 MIN_DEPTH_RANGE: Final = 1.001
-"""Farthest depth of a picture over the nearest, at least, for its steps to be of some size."""
+"""Least ratio of the farthest and the nearest depth in a picture, so that its steps are not 0."""
 
 PNG_OPTIONS: Final = (16, 1)
 """OpenCV's IMWRITE_PNG_COMPRESSION, and the quickest compression."""

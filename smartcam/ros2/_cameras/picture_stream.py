@@ -22,7 +22,7 @@ LOOK_INTERVAL: Final = 0.1
 """Seconds between two looks whether somebody hears."""
 
 SELDOM: Final = 1.0
-"""Seconds between two looks where the graph tells of who comes; and for looks after it has."""
+"""Seconds between two looks where the graph tells of new listeners."""
 
 AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
 """Delays after which a source that ended is opened again, while somebody hears."""

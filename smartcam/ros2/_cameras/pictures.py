@@ -43,7 +43,7 @@ class CameraPictures:
 
     Topics, private to the node: ``image_raw``, ``camera_info``, ``image_raw/compressed``; services:
     ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp:
-    when it was captured. Who is slow gets the newest, and holds up nobody.
+    when it was captured. A slow subscriber gets the newest, and holds up nobody.
 
     Args:
         camera: the camera; None where ``frames`` is all there is.

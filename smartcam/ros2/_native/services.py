@@ -190,7 +190,7 @@ class NativeService:
 
 
 class NativeClient:
-    """ServiceCalls a service through rclpy; made by :meth:`NativeNode.client`.
+    """Calls a service through rclpy; made by :meth:`NativeNode.client`.
 
     Attributes:
         name: absolute name of the service.

@@ -109,12 +109,12 @@ class RosParameters:
     # ------------------------------------------------------------------ life
 
     def open(self) -> None:
-        """Let other nodes see them; the node does so when it is opened."""
+        """Let other nodes see the parameters; the node calls it when it is opened."""
         if self._services is not None:
             self._services.open()
 
     async def close(self) -> None:
-        """Give up sets that are under way; what is declared stays. The node does so."""
+        """Give up sets that are under way; declared parameters stay. The node calls it."""
         if self._services is not None:
             self._services.close()
         for task in self._tasks:

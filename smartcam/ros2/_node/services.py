@@ -178,7 +178,7 @@ class RosService(RosEnd):
         self._context.zenoh.refuse(query, f"{self.name}: {why}")
 
     def _on_graph(self, entity: Entity, present: bool) -> None:
-        """Give up what was called by who is gone."""
+        """Give up the calls of a client that is gone."""
         if present:
             return
         left = [call for call in self._waiting if call.attachment.gid != entity.gid]

@@ -155,7 +155,7 @@ def scaled(quality: int) -> tuple[bytes, ...]:
 
 
 def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
-    """Return the tables that stand one behind the other: of 64 bytes, or of 128 by a bit each."""
+    """Return the tables in ``data``: each has 64 bytes, or 128 where its bit in ``wide`` is set."""
     found: list[bytes] = []
     while data and len(found) < 4:
         size = 128 if wide >> len(found) & 1 else 64

@@ -95,7 +95,7 @@ class PacketWays(Protocol):
         read: Callable[[], None],
         /,
     ) -> None:
-        """Call for each packet and report, with who sent it, and after those that came together."""
+        """Call for each packet and report, with its sender, and after those that came together."""
         ...
 
     def report(self, data: bytes, to: tuple[Any, ...], /) -> None:

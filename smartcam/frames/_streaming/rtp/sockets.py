@@ -24,7 +24,7 @@ SEND_BUFFER: Final = 128 << 10
 """Bytes that may wait in the system, a twentieth of a second on a link of 20 Mbit/s."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
-"""asm-generic/socket.h: past rmem_max, for who may administer the network."""
+"""asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
 
 TRIES: Final = 32
 """Tries to find two free ports side by side."""
@@ -172,7 +172,7 @@ class SocketPair:
         rtcp: Callable[[bytes, tuple[Any, ...]], None],
         read: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call for each datagram, with who sent it, until :meth:`close`.
+        """Call for each datagram, with its sender, until :meth:`close`.
 
         Args:
             rtp: receiver of the stream's packets; None: they are not read.

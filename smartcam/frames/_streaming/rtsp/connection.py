@@ -182,7 +182,7 @@ class RtspConnection(asyncio.Protocol):
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Answer, while in here, a request of somebody who may look."""
+        """Mark a viewer's request as being answered, as long as the block runs."""
         self._serving = True
         try:
             yield

@@ -91,7 +91,7 @@ def answer(
 class RequestParser:
     """Cuts requests and packets from bytes that come in any pieces.
 
-    What is held is bounded by :data:`ROOM` and by what one feeds before one takes.
+    It holds at most :data:`ROOM` bytes and those that were fed since the last call of next.
     """
 
     def __init__(self) -> None:
