@@ -514,7 +514,7 @@ class ZenohSession:
     def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
         """Answer a query, and end it; never waits.
 
-        The engine may wait for who has asked, as that one has said in the query; so threads do it.
+        The engine may wait for the asker, where the query says that it may; hence the threads.
 
         Args:
             query: the engine's.

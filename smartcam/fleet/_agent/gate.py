@@ -92,7 +92,7 @@ class Gate:
         await self._pass(program, reservation, timeout)
 
     def release(self, reservation: Hashable) -> None:
-        """End a reservation, or the wait for it; one that is not there is none."""
+        """End a reservation, or the wait for it; does nothing where neither is there."""
         self._reservations.discard(reservation)
         if not self._reservations:
             self._free("Released")

@@ -351,7 +351,7 @@ class SharedFrames:
         ending.add_done_callback(self._done)
 
     def leave(self, program: str, stream: int) -> None:
-        """End a stream; one that is not there is none."""
+        """End a stream; does nothing where it is not known."""
         viewer = self._viewers.get((program, stream))
         if viewer is not None:
             self._leave((program, stream), viewer)

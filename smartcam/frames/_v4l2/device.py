@@ -92,7 +92,8 @@ class CaptureDevice:
         """Open a device that captures pictures.
 
         Raises:
-            FrameSourceError: there is none, it is none, or it is not allowed.
+            FrameSourceError: there is no such file, it is no device of
+                V4L2, or it may not be opened.
         """
         try:
             number = system.open(path)

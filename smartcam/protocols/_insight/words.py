@@ -2,7 +2,7 @@
 
 Native mode is text over telnet (TCP port 23). The client sends one command a line, the camera
 answers with a status code on a line of its own and, where the command asks for something, with data
-behind it. Nothing in here does input or output.
+behind it. Nothing in this module does input or output.
 
 Where a fact comes from stands in ``docs/insight.md``: *manual* is the maker's published help,
 *clients* is what public clients and records of their traffic show (derived).
