@@ -179,7 +179,7 @@ class _ThreadCall:
             self._succeed(got)
 
     async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
-        """Run a coroutine; who waits goes on without another turn of the loop."""
+        """Run a coroutine; the waiting thread goes on without another turn of the loop."""
         try:
             got = await work
         except asyncio.CancelledError:

@@ -55,8 +55,9 @@ LEASE_TIME = 5.0
 """Seconds without a sign of life after which an end counts as gone; a killed one goes at once."""
 
 MAX_LISTING_TIME = 120.0
-"""Seconds after which the engine ends the answer to who is there as if it was whole, however long
-who asks would wait. By itself it takes 10; thousands of presences on a busy machine take longer."""
+"""Seconds after which the engine ends the list of those present as if it was whole, however long
+the asker would wait. By itself it takes 10; thousands of presences on a busy machine take
+longer."""
 
 PORTS = range(20_000, 32_000)
 """The ports tried for port 0, below the range from which systems give ports to connections.

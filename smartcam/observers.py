@@ -26,7 +26,7 @@ class TraceEntry(NamedTuple):
     """One frame as ``--trace`` writes it.
 
     Attributes:
-        at: when, UTC.
+        at: time, UTC.
         camera: name of the camera.
         direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
             unfinished frame when the link ended.
@@ -80,7 +80,7 @@ class Observer:
             camera: name of the camera.
             error: a trigger without a result, a container that does not fit its layout, a lost
                link, a reconnect that failed.
-            triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+            triggered_at: when ``trigger()`` was called, UTC; None where the error ended no trigger.
         """
 
 

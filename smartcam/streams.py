@@ -108,7 +108,7 @@ class Queue(Generic[T]):
             ready.set()
 
     def keep(self, source: object) -> None:
-        """Refer to where the items come from until the end: who has the stream alone needs it."""
+        """Refer to the items' source until the end, for a program that keeps the stream alone."""
         if not self._ended:
             self._kept = source
 

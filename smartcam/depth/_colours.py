@@ -35,7 +35,8 @@ class ColourRange:
 
     Attributes:
         hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
-            green, 90 cyan, 120 blue, 150 magenta. From more than to goes over 179: ``(170, 10)``
+            green, 90 cyan, 120 blue, 150 magenta. A first hue above the second goes over 179:
+                ``(170, 10)``
             is red.
         saturation: from, to, each 0 (grey) to 255.
         value: from, to, each 0 (black) to 255: the largest of red, green and blue.
@@ -226,7 +227,7 @@ def find_regions(
         ratio: least and largest ratio of the longer to the shorter side.
         fullness: least part of its rectangle that a region fills, 0 to 1.
         whole: whether one that touches the picture's rim is not wanted: it may be cut off.
-        most: so many of them, the largest.
+        most: number of regions at most; the largest are returned.
 
     Raises:
         ConfigurationError: a range that holds nothing.

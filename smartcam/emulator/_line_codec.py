@@ -55,7 +55,7 @@ class LineCodec:
         ends: what ends a client's line.
         max_line: bytes of a client's line, its end not counted.
         encoding: encoding of characters.
-        split: splits an answer into what it is known by and the text that rows read.
+        split: function that splits an answer into its word or ticket and the text that rows read.
     """
 
     def __init__(

@@ -79,7 +79,7 @@ class FrameSink(ABC):
     def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
         """Take that the picture of the trigger under way will not come."""
 
-    async def taken(self) -> None:  # noqa: B027 - who has no readers waits for none
+    async def taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
         """Return once every reader has taken the last frame: for a recording that is to lose none.
 
         Cancellation: safe.

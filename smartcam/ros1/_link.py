@@ -38,7 +38,7 @@ HEARTBEAT_INTERVAL = 10.0
 """Seconds of silence after which it is asked whether it is there; half of them to answer."""
 MIN_LIFETIME = 5.0
 """Seconds that a link must have lived for the next try to come at once."""
-LARGEST = 8 << 20
+MAX_MESSAGE_BYTES = 8 << 20
 """Bytes of a message from a bridge; a longer one ends the link."""
 
 
@@ -102,7 +102,10 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
                 web = await session.ws_connect(
-                    url, timeout=timeout, heartbeat=HEARTBEAT_INTERVAL, max_msg_size=LARGEST
+                    url,
+                    timeout=timeout,
+                    heartbeat=HEARTBEAT_INTERVAL,
+                    max_msg_size=MAX_MESSAGE_BYTES,
                 )
         except TimeoutError:
             raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s") from None

@@ -59,7 +59,7 @@ class RosbridgeNode(NamedNode):
         on_change: function called in the event loop when the bridge has come or gone.
 
     Raises:
-        ConfigurationError: a name or the URL cannot be.
+        ConfigurationError: a name or the URL is not valid.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -174,7 +174,7 @@ class RosbridgeNode(NamedNode):
                 ``latched`` count.
 
         Raises:
-            ConfigurationError: the topic cannot be, is there already, or there is no such type.
+            ConfigurationError: the topic is not valid, is there already, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
@@ -193,7 +193,7 @@ class RosbridgeNode(NamedNode):
             qos: quality of service, of which ``depth`` counts, for messages that wait for a reader.
 
         Raises:
-            ConfigurationError: the topic cannot be, or there is no such type.
+            ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
@@ -225,7 +225,7 @@ class RosbridgeNode(NamedNode):
             timeout: seconds that the handler may take.
 
         Raises:
-            ConfigurationError: the name cannot be, is there already, or there is no such type.
+            ConfigurationError: the name is not valid, is there already, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.service(type), self._new_name(service, "service", self._services)

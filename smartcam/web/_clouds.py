@@ -1,6 +1,6 @@
 """The site of clouds: the newest one, to whoever looks.
 
-Each who looks has a WebSocket, with one cloud on the way at a time: the next one, the newest then,
+Each viewer has a WebSocket, with one cloud on the way at a time: the next one, the newest then,
 goes when the page says that it has shown the last. A cloud crosses as it lies in memory, in parts,
 so that the loop goes on meanwhile. A large one is thinned for the page, which says so.
 """
@@ -146,7 +146,7 @@ class CloudSite(ThreadedSite):
 
 def _seen(made: asyncio.Future[_Packed]) -> None:
     if not made.cancelled():
-        made.exception()  # who asked may be gone, and then nobody else asks
+        made.exception()  # the asker may be gone, and then nobody else asks
 
 
 def packed(cloud: Cloud) -> _Packed:

@@ -1,4 +1,4 @@
-"""One who looks at the fleet's page: is told what changed of the rows in sight."""
+"""A viewer of the fleet's page, who is told what changed of the rows in sight."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class FramesSite(Site):
         quality: quality of the JPEGs that are made, 1 to 100. A JPEG from a camera stays as it is.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
-        changes: whether who looks may set features of the devices, execute their commands and
+        changes: whether viewers may set features of the devices, execute their commands and
             trigger them; anybody who can open the page may then.
         token: what every call must carry in ``Authorization: Bearer``, as
             :class:`~smartcam.web.LiveSite` has it. A browser's WebSocket, which can carry none,

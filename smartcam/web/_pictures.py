@@ -1,9 +1,9 @@
 """The newest frames of some sources, to whoever looks: what pages of pictures have in common.
 
-Each who looks at a source has a reader of it and a WebSocket, with one picture on the way at a
-time: the next one, the newest then, goes when the page says that it has shown the last. So who is
-slow skips, and delays neither the device nor anybody else. With nobody there is no reader, and
-the device does not stream.
+Each viewer of a source has a reader of it and a WebSocket, with one picture on the way at a
+time: the next one, the newest then, goes when the page says that it has shown the last. So a viewer
+who is slow skips, and delays neither the device nor anybody else. With nobody there is no reader,
+and the device does not stream.
 """
 
 from __future__ import annotations
@@ -212,7 +212,7 @@ def _pressed(frame: Frame, quality: int) -> bytes:
 
 def _seen(made: asyncio.Future[bytes]) -> None:
     if not made.cancelled():
-        made.exception()  # who asked may be gone, and then nobody else asks
+        made.exception()  # the asker may be gone, and then nobody else asks
 
 
 class Viewer(PageSocket):

@@ -35,7 +35,7 @@ MIN_ELLIPSE_SHARE = 0.85
 """A dot fills at least this part of its moments' ellipse: rectangles fill 0.955, triangles 0.83."""
 
 MAX_ASPECT_RATIO = 6.0
-"""A dot is at most as many times longer than wide: one that is seen 80 degrees from the front."""
+"""Length over width of a dot at most: one that is seen 80 degrees from the front."""
 
 
 MIN_RECTANGLE_SHARE = 0.2

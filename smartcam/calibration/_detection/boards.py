@@ -37,7 +37,7 @@ and in double size, as far as the image is as large."""
 NEIGHBOURS = 8
 """Saddles around one among which a board's next ones are: four and what else is near."""
 
-PART = 0.45
+FITTED_SHARE = 0.45
 """Edges at a corner are fitted along this part of a square's side, short of the next edges."""
 
 MIN_FITTED_SHARE = 0.6
@@ -205,7 +205,7 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
     inside[inside] = like_corners(image, points[inside], ways[inside])
     if inside.any():
         lengths = np.linalg.norm(ways[inside], axis=2)
-        part = np.minimum(PART, MAX_REACH / lengths.max(axis=1))[:, None, None]
+        part = np.minimum(FITTED_SHARE, MAX_REACH / lengths.max(axis=1))[:, None, None]
         corners = refine_corners(image, points[inside], part * ways[inside])
         aside = np.linalg.norm(corners.points - points[inside], axis=1)
         step = lengths.min(axis=1)

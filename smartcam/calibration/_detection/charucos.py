@@ -49,7 +49,7 @@ is not there, where none was read."""
 MAX_SQUARES_OFF = 0.3
 """Sides of a square by which a corner may lie off where the nearest markers see it."""
 
-PART = 0.45
+FITTED_SHARE = 0.45
 """The edges at a corner are fitted along this part of a square's side."""
 
 
@@ -83,8 +83,10 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     matrix = fit_homography(flat, found)
     if matrix is None:
         raise _not_found(target, "all in a line", len(ids))
-    ways = local_steps(partial(apply_homography, matrix), flat, PART * target.square)
-    clear = (1 - target.marker / target.square) / 2 / PART - 1 / np.linalg.norm(ways, axis=2)
+    ways = local_steps(partial(apply_homography, matrix), flat, FITTED_SHARE * target.square)
+    clear = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
+        ways, axis=2
+    )
     corners = refine_corners(image, found, ways, clear)
     row, column = np.divmod(ids, target.columns - 1)
     colours = (1 - 2 * ((row + column) % 2)) * np.sign(corners.gains)

@@ -30,7 +30,7 @@ Source: S. van der Walt and N. Smith, viridis (public domain).
 """
 
 STEPS: Final = 24
-"""Colours of a map: neighbours in one merge into one rectangle."""
+"""Colours of a map: neighbours of one colour merge into one rectangle."""
 
 MAX_DECADES: Final = 3.0
 """A map's colours span this many powers of ten at most; smaller values have the first colour."""

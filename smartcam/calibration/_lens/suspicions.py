@@ -57,18 +57,18 @@ MEDIAN: Final = 2.0 * math.log(2.0)
 MAX_NAMED: Final = 5
 """Points that a text names at most."""
 
-WORST: Final = 10.0
+MAX_RMS_PX: Final = 10.0
 """Pixels rms, beyond which points are not those of the target: a lens' wrong model leaves less."""
 
 WORST_PART: Final = 0.015
 """Residuals, rms, beyond which the points are not those of the target, as a part of the longer side
-of the image: it counts where it is more pixels than WORST."""
+of the image: it counts where it is more pixels than MAX_RMS_PX."""
 
 WORST_SIGMAS: Final = 20.0
 """Residuals, rms, beyond which the points are not those of the target, as a multiple of the points'
-standard deviation: it counts where it is more pixels than WORST."""
+standard deviation: it counts where it is more pixels than MAX_RMS_PX."""
 
-LONGEST: Final = 20.0
+MAX_TARGET_METRES: Final = 20.0
 """Metres that no target is long: a board in millimetres is 200."""
 
 OFF_MIDDLE: Final = 0.2
@@ -261,10 +261,10 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
             "they count as often as they are there, and errors come out too small"
         )
     length = float(np.ptp(views[0].target.points, axis=0).max())
-    if length > LONGEST:
+    if length > MAX_TARGET_METRES:
         yield Code.SCALE_MISMATCH.remark(
-            f"expected a target of {LONGEST:g} m at most, got one of {length:g} m: are its lengths "
-            "in metres? All lengths that are found are in proportion"
+            f"expected a target of {MAX_TARGET_METRES:g} m at most, got one of {length:g} m: are its "
+            "lengths in metres? All lengths that are found are in proportion"
         )
 
 
@@ -293,7 +293,9 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
         )
 
 
-def most_rms(views: Sequence[TargetView], worst: float = WORST, part: float = WORST_PART) -> float:
+def most_rms(
+    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = WORST_PART
+) -> float:
     """Return the residuals, rms of a coordinate in pixels, beyond which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)

@@ -308,7 +308,7 @@ class Device:
         """
         if self._session:
             self._enter(DeviceState.DISCONNECTED)
-        self._session = self._owes_switch = False  # an answer is for who asked
+        self._session = self._owes_switch = False  # an answer is for the client that asked
         self._output = []
 
     def watch(self, on_entered: Callable[[DeviceState], None]) -> None:

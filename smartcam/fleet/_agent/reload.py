@@ -104,7 +104,7 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
     """Return a file with its cameras.
 
     Raises:
-        ValueError: the cameras cannot be.
+        ValueError: the cameras are not valid.
     """
     plan = {planned.name: planned for planned in file.plan()}
     seen: dict[str, str] = {}

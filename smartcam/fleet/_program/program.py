@@ -32,7 +32,7 @@ LOOK_AGAIN = 0.1
 """Seconds between two looks whether an agent has come."""
 
 LAST_LOOK_TIMEOUT = 1.0
-"""Seconds that a look may take at what is there instead."""
+"""Seconds for the look at which fleets are there instead of the wanted one."""
 
 
 Reply = BusMessage | TriggerReply
@@ -103,7 +103,7 @@ class Program:
 
     @property
     def name(self) -> str:
-        """Its name, which no other program has: its role, and what a person would call it."""
+        """The program's unique name: its role, and what a person would call it."""
         return self._name.name
 
     @property

@@ -295,7 +295,7 @@ def _check(
 
 
 def _check_pair(value: tuple[float, float], name: str) -> None:
-    """Check that both are numbers; which range they have says who calls."""
+    """Check that both are numbers; the caller checks their range."""
     if not isinstance(value, tuple) or len(value) != 2:
         raise wrong_argument(name, "the least and the most, a pair", value, "RateControl")
     for one in value:

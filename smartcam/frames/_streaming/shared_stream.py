@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LINGER: Final = 2.0
-"""Seconds that the source is read on without a viewer: who has asked for its parameters begins to
-play in that time."""
+"""Seconds that the source is read on without a viewer: a client that has asked for its parameters
+begins to play in that time."""
 
 KEY_PAUSE: Final = 1.0
 """Seconds between two key frames that viewers ask for, however many they are."""

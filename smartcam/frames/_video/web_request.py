@@ -58,7 +58,7 @@ class WebStream:
         tls: how the server shows who it is, where it is asked by TLS.
 
     Attributes:
-        answer: once :meth:`open` has returned.
+        answer: head of the server's answer; there once :meth:`open` has returned.
     """
 
     answer: WebAnswer

@@ -51,7 +51,7 @@ class CameraLens:
         size: function that returns the pictures' width and height.
 
     Raises:
-        ConfigurationError: the URL cannot be.
+        ConfigurationError: the URL is not valid.
     """
 
     def __init__(

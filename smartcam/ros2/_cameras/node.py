@@ -222,7 +222,7 @@ class CameraNode(Server):
         """Open the node, and begin with all that it is made of.
 
         Raises:
-            SmartCamError: something of it cannot be; all is undone.
+            SmartCamError: something of it is not valid; all is undone.
 
         Cancellation: leaves it closed.
         """

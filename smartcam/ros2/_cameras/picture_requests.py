@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_TIMEOUT: Final = 60.0
-"""Seconds that a request may give a picture, and has where it says none."""
+"""Longest ``timeout`` of a request, seconds, and the one of a request without any."""
 
 
 async def one_frame(

@@ -57,7 +57,7 @@ class CameraPictures:
         quality: quality of JPEGs, 1 to 100.
 
     Raises:
-        ConfigurationError: a value cannot be, or there is neither a camera nor a source.
+        ConfigurationError: a value is not valid, or there is neither a camera nor a source.
     """
 
     def __init__(

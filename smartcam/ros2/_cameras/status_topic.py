@@ -45,7 +45,7 @@ class CameraStatusTopic:
         """Return a topic's full name; empty for none, and for the one that a node always has.
 
         Raises:
-            ConfigurationError: the topic cannot be.
+            ConfigurationError: the topic is not valid.
         """
         if not topic:
             return ""
@@ -56,7 +56,7 @@ class CameraStatusTopic:
         """Publish on a topic, instead of the one that was said before; empty for none.
 
         Raises:
-            ConfigurationError: the topic cannot be.
+            ConfigurationError: the topic is not valid.
         """
         full = self.resolve(topic)
         if full == self._topic:

@@ -61,7 +61,7 @@ class NativeNode(NamedNode):
         graph: view of the other nodes.
 
     Raises:
-        ConfigurationError: a name or domain cannot be, or there is no rclpy.
+        ConfigurationError: a name or domain is not valid, or there is no rclpy.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -260,7 +260,8 @@ class NativeNode(NamedNode):
             qos: quality of service.
 
         Raises:
-            ConfigurationError: the topic cannot be, or the type is not known or has other fields.
+            ConfigurationError: the topic is not valid, or the type is not known or has other
+                fields.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
@@ -277,7 +278,7 @@ class NativeNode(NamedNode):
             qos: quality of service; its depth is that of the queue.
 
         Raises:
-            ConfigurationError: the topic cannot be, or the type is not built for this ROS.
+            ConfigurationError: the topic is not valid, or the type is not built for this ROS.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
@@ -304,7 +305,7 @@ class NativeNode(NamedNode):
             timeout: seconds that the handler may take.
 
         Raises:
-            ConfigurationError: the name cannot be, or the type is not known or has other fields.
+            ConfigurationError: the name is not valid, or the type is not known or has other fields.
             RosError: the node is not open.
         """
         del qos
@@ -322,7 +323,7 @@ class NativeNode(NamedNode):
             qos: quality of service; ROS' own for services is used.
 
         Raises:
-            ConfigurationError: the name cannot be, or the type is not built for this ROS.
+            ConfigurationError: the name is not valid, or the type is not built for this ROS.
             RosError: the node is not open.
         """
         del qos

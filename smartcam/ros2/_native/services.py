@@ -1,4 +1,4 @@
-"""The ends of services through rclpy: who serves, and who calls."""
+"""The ends of services through rclpy: servers and clients."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class NativeContext:
             if self._users:
                 return
             context, self._context = self._context, None
-        with contextlib.suppress(Exception):  # who has shut it down already
+        with contextlib.suppress(Exception):  # it may be shut down already
             context.try_shutdown()
 
 
@@ -199,7 +199,7 @@ class SpunNode:
         why: RosError | None = None
         try:
             context = self._context.open()
-        except BaseException as exc:  # noqa: BLE001 - told to who waits
+        except BaseException as exc:  # noqa: BLE001 - told to the waiter
             self.in_loop(self._tell, exc)
             _open.discard(self)
             return
@@ -207,7 +207,7 @@ class SpunNode:
             self._make(context)
             self.in_loop(self._tell, None)
             why = self._spin(context)
-        except BaseException as exc:  # noqa: BLE001 - told to who waits, or when all has ended
+        except BaseException as exc:  # noqa: BLE001 - told to the waiter, or when all has ended
             why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
         finally:
             self._close()

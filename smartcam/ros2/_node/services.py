@@ -1,4 +1,4 @@
-"""The ends of services: who serves, and who calls.
+"""The ends of services: servers and clients.
 
 As ``rmw_service_data.cpp`` and ``rmw_client_data.cpp`` of rmw_zenoh: a service is a complete
 queryable, a reply repeats number and GID of its request.

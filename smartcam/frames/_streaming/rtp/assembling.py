@@ -73,7 +73,7 @@ class OpenUnit(ABC):
 
     @abstractmethod
     def _added(self, payload: bytes) -> bool:
-        """Take a payload, which has bytes; return False if it cannot be."""
+        """Take a payload, which has bytes; return False if it is not valid."""
 
 
 class UnitKind(Protocol):

@@ -32,7 +32,7 @@ class Depacketizer:
     Another SSRC is a new stream.
 
     A frame ends with the packet that has the marker. Some senders put markers on each slice or
-    unit: who is wary waits until :data:`PROOFS` frames showed that the marker is right, or until
+    unit: a wary reader waits until :data:`PROOFS` frames showed that the marker is right, or until
     :meth:`end_marked`; behind a wrong one frames end with the next timestamp. Parameters without a
     picture belong to the next frame, whatever their marker and timestamp.
 

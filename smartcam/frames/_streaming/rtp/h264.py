@@ -30,7 +30,7 @@ def units(access_unit: bytes) -> list[bytes]:
         access_unit: bytes as in a file (ITU-T H.264, annex B).
 
     Raises:
-        FrameFormatError: it begins with none, or has one that cannot be.
+        FrameFormatError: it begins with none, or has one that is not valid.
     """
     data = bytes(access_unit)
     place = data.find(b"\0\0\1")

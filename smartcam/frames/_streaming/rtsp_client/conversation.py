@@ -321,7 +321,7 @@ class RtspConversation:
                 async with asyncio.timeout(min(self._plan.timeout, self._timeout)):
                     answer = await self.link.ask(method, self._aggregate, self._headers())
             except TimeoutError:
-                continue  # some do not answer while they play, and the packets tell who is gone
+                continue  # some do not answer while they play; packets show a dead one
             except FrameSourceError as error:
                 self.link.fail(str(error).removeprefix(f"{self._plan.name}: "))
                 return

@@ -41,7 +41,7 @@ class RtspLink(asyncio.Protocol):
 
     Args:
         name: name of the source, for errors.
-        credentials: what to show who asks for a password.
+        credentials: name and password, for a server that asks for them.
 
     Attributes:
         on_packet: takes a channel and a packet.
