@@ -100,6 +100,7 @@ HALF = {
     ),
     "a first line names its object": (docstrings, r"^(?!Is )[A-Z]\w+ (it|its|them|their)\b"),
     "'in here' may be a module or a folder": (docstrings, r"\bin here\b"),
+    "'cannot be' what?": (docstrings, r"\b(topic|name|value|URL|domain|range) cannot be[.,;]"),
     "'who' is no noun": (docstrings, r"\b(of|for|to|by|from|with|at) who\b"),
 }
 """Ways to say half a thing: what is wrong, where it is looked for, and how it is found."""
