@@ -263,8 +263,8 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
     length = float(np.ptp(views[0].target.points, axis=0).max())
     if length > MAX_TARGET_METRES:
         yield Code.SCALE_MISMATCH.remark(
-            f"expected a target of {MAX_TARGET_METRES:g} m at most, got one of {length:g} m: are its "
-            "lengths in metres? All lengths that are found are in proportion"
+            f"expected a target of {MAX_TARGET_METRES:g} m at most, got one of {length:g} m: are "
+            "its lengths in metres? All lengths that are found are in proportion"
         )
 
 
