@@ -60,7 +60,7 @@ class Gate:
             await self._pass(program, None, timeout)
 
     def goes_in(self, program: str) -> bool:
-        """Let a command begin if it need not wait; whether it did."""
+        """Let a command begin if it need not wait; return whether it began."""
         if self._line or (self.holder is not None and self.holder != program):
             return False
         self._active[program] += 1

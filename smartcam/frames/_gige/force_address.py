@@ -1,7 +1,7 @@
 """Give a GigE Vision camera another IP address until it is switched off, by its hardware address.
 
-A camera whose address is of no network here can be found and given one, but not opened. The camera
-carries it out only while nobody controls it.
+A camera whose address fits no network of this machine can be found and given one, but not opened.
+The camera carries it out only while nobody controls it.
 
 Source: GigE Vision 2.0, chapter 14.2 (FORCEIP).
 """

@@ -86,9 +86,9 @@ class RecordedError(NamedTuple):
         error: name of the exception's class.
         text: text of the error.
         triggered_at: time of the call of ``trigger()``, UTC; None where no trigger ended so.
-        since: time, for a gap (``error`` is ``RecordingGap``): when the first record came that was
-            not written, UTC; ``at`` is when the last did. None of other errors.
-        records: number, for a gap: how many were not written. None of other errors.
+        since: time of the first record that was not written, UTC, where ``error`` is
+            ``RecordingGap``; ``at`` is that of the last one. None for other errors.
+        records: number of records in a gap that were not written. None for other errors.
     """
 
     camera: str

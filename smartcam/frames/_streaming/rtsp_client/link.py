@@ -30,7 +30,7 @@ MAX_REFUSALS: Final = 3
 """Refusals of one request for its password, such as by a nonce that is too old."""
 
 MAX_UNANSWERED: Final = 32
-"""Requests without an answer that are remembered, for theirs may come late."""
+"""Unanswered requests that are remembered, since their answers may come late."""
 
 _ALLOWED: Final = ("GET_PARAMETER", "OPTIONS", "SET_PARAMETER")
 _ENDING: Final = ("REDIRECT", "TEARDOWN")
@@ -214,7 +214,7 @@ class RtspLink(asyncio.Protocol):
             self._waiting[1].set_result(answer)
 
     def _requested(self, request: ServerRequest) -> None:
-        """ServerAnswer what a server asks; some see whether somebody is there."""
+        """Answer a server's request; some ask whether the client is still there."""
         known = request.method in (*_ALLOWED, *_ENDING)
         cseq = next(iter(request.headers.get("cseq", ())), "0")[:16]
         said = "200 OK" if known else "501 Not Implemented"
