@@ -118,8 +118,7 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 
 
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
-    """Return entries from a serial on, as JSON and as they are, up to ``limit`` or
-    :data:`MAX_TOLD`.
+    """Return entries from a serial on as JSON and as they are: ``limit``, or :data:`MAX_TOLD`.
 
     ``next`` is the serial to go on with, ``missed`` how many are gone.
     """
