@@ -147,7 +147,6 @@ def test_names_on_a_page_are_in_the_package(page: str) -> None:
 
 ELSEWHERE = {
     "docs/architecture/inspection.md": {"TOOL_ok", "smartcam.tools"},  # a field, entry points
-    "docs/architecture/speed.md": {"sock_recv_into"},  # asyncio's
     "docs/decisions/0002-receive-task.md": {"epoll_wait"},  # the system's
     "docs/decisions/0011-recordings.md": {"Writer"},  # the mcap library's
     "docs/decisions/0015-the-house.md": {"smartcam/emulator.py", "smartcam/_emulator/"},  # rejected
