@@ -55,7 +55,7 @@ CURL = [
 def test_live_page_has_its_numbers() -> None:
     assert f"The last {MAX_RESULTS}." in LIVE_PAGE
     assert MAX_BARS * BAR_SECONDS == 10 * 3600  # "Last ten hours"
-    assert f"the last {MAX_PICTURES} such pictures" in LIVE_PAGE
+    assert f"the last {MAX_PICTURES} pictures of failures" in LIVE_PAGE
     assert f"faster than {MAX_NEWS / streams.PERIOD:g} a second" in LIVE_PAGE
     words = PASS_WORDS | FAIL_WORDS
     named = set(
