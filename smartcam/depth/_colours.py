@@ -36,8 +36,7 @@ class ColourRange:
     Attributes:
         hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
             green, 90 cyan, 120 blue, 150 magenta. A first hue above the second goes over 179:
-                ``(170, 10)``
-            is red.
+            ``(170, 10)`` is red.
         saturation: from, to, each 0 (grey) to 255.
         value: from, to, each 0 (black) to 255: the largest of red, green and blue.
 

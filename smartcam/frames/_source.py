@@ -327,8 +327,7 @@ class FrameSource(FrameSink):
         """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
 
         A program that asks often keeps a reader, or opens the source with ``linger``: without
-            either the
-        device begins to stream for each.
+        either the device begins to stream for each frame.
         """
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")

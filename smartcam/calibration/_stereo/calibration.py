@@ -325,8 +325,7 @@ def calibrate_stereo(
     Raises:
         CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
             ``SHAPE``: lists of different lengths, a coefficient that is not valid, or too many
-                points to
-            be free; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``;
+            points to be free; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``;
             ``POOR_FIT``: no lens or no transform shows the views, as where those of many pairs are
             of different moments; ``INSUFFICIENT_ROTATION``: the target was not tilted;
             ``MIRRORED`` pictures; ``COINCIDENT``: both sides are of one camera;

@@ -226,8 +226,7 @@ def frame_name(value: Plain, where: str) -> str:
     """Return a frame's name that every format can hold.
 
     Raises ``BAD_NAME``: it is not valid, too long, or has letters that mean something in a file or
-        on a
-    command line.
+    on a command line.
     """
     if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):
         raise Code.BAD_NAME.unexpected(
