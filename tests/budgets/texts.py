@@ -657,7 +657,7 @@ TEXTS: tuple[Parser, ...] = (
             "zeros, by bzip2": _bomb(zipfile.ZIP_BZIP2),
             "zeros, by LZMA": _bomb(zipfile.ZIP_LZMA),
         },
-        _description.MAX_PLAIN_BYTES_PACKED,
+        _description.LARGEST_PACKED,
         "frames._gige.description.LARGEST_PACKED",
     ),
     Parser(
