@@ -57,6 +57,9 @@ from smartcam.settings import CameraSettings
 from smartcam.web import _clouds as cloud_page
 from smartcam.web import _colours as colour_page
 from smartcam.web import _emulator as emulator_page
+from smartcam.web import _fleet as fleet_page
+from smartcam.web import _live as live_page
+from smartcam.web import _wizard as wizard_page
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -97,7 +100,7 @@ WORDS = {"I": "UINT32", "H": "UINT16"}
 
 LIMITS = (
     "protocols._framed.framing.DEFAULT_MAX_LENGTH",
-    "protocols._framed.framing.LARGE",
+    "protocols._framed.framing.MIN_OWN_BUFFER_BYTES",
     "protocols._framed.framing.FIRST_READ",
     "protocols._framed.framing.MAX_READ_BYTES",
     "protocols._framed.framing.MIN_READ_BYTES",
@@ -184,7 +187,7 @@ LIMITS = (
     "depth._tables.WORDS",
     "depth._pcd.MAX_UNPACKED",
     "frames._gige.assembler.MAX_GAPS_PER_BLOCK",
-    "frames._gige.description.LARGEST",
+    "frames._gige.description.MAX_PLAIN_BYTES",
     "frames._gige.description.LARGEST_PACKED",
     "frames._gige.description.MAX_ELEMENTS",
     "frames._gige.features.MAX_ELEMENTS_VISITED",
@@ -200,7 +203,7 @@ LIMITS = (
     "fleet._program.program.LOOK_AGAIN",
     "fleet._program.receiver.FILL_TIMEOUT",
     "_zenoh.LEASE_TIME",
-    "fleet._bus.zenoh.LONG",
+    "fleet._bus.zenoh.MAX_DIRECT_BYTES",
     "_zenoh.MAX_WAITING_BYTES",
     "_zenoh.TURN",
     "recording._mcap.form.MAX_CAMERAS",
@@ -234,8 +237,8 @@ LIMITS = (
     "calibration._detection.circle_grids.MORE_SPOTS",
     "calibration._detection.corners.MAX_REACH",
     "calibration._detection.dots.MAX_REACH",
-    "calibration._detection.image.LARGEST",
-    "calibration._detection.image.SMALLEST",
+    "calibration._detection.image.MAX_SIDE",
+    "calibration._detection.image.MIN_SIDE",
     "calibration._detection.image.USUAL_SIZE",
     "calibration._hand_eye.model_selection.MAX_FOLDS",
     "calibration._detection.grid_growing.MAX_SEEDS_TRIED",
@@ -615,6 +618,21 @@ def calls_cloud() -> str:
     return _calls(cloud_page.CALLS)
 
 
+def calls_wizard() -> str:
+    """Return the calls of the page of a calibration."""
+    return _calls(wizard_page.CALLS)
+
+
+def calls_live() -> str:
+    """Return the calls of the page of one camera."""
+    return _calls(live_page.CALLS)
+
+
+def calls_fleet() -> str:
+    """Return the calls of the page of a fleet, without those of one camera."""
+    return _calls(one for one in fleet_page.CALLS if "{camera}" not in one.path)
+
+
 def _calls(calls: Iterable[Any]) -> str:
     rows = [
         (call.method, f"`{call.path}`", call.about, f"`{call.sample}`" if call.sample else "")
@@ -684,6 +702,17 @@ def layers() -> str:
     return "\n".join(f"```text\n{text.replace(' :', ',')}\n```\n" for text in texts)
 
 
+def modules() -> str:
+    """Return each module with the first line of its docstring."""
+    rows: list[tuple[str, str, str]] = []
+    for path in sorted((ROOT / "smartcam").rglob("*.py")):
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        first = re.sub(r":\w+:`[~.]?(?:[\w.]+\.)?(\w+)`", r"`\1`", text.split("\n\n")[0])
+        folder = ".".join(path.relative_to(ROOT).parent.parts)
+        rows.append((f"`{folder}`", f"`{path.stem}`", " ".join(first.replace("``", "`").split())))
+    return _table(("in", "module", "holds"), rows)
+
+
 def limits() -> str:
     """Return the constants of :data:`LIMITS` with their values and the reasons in the source."""
     rows: list[tuple[object, ...]] = []
@@ -719,10 +748,12 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(messages, bodies, messages_b16, bodies_b16, messages_bid, bodies_bid),
         *(result_codes, wire_quirks, dialects, abilities),
         *(quirks, quirks_insight, settings, transitions, policies, layers, limits),
+        modules,
         *(application, scenario, cue, faults_which, faults_wire, faults_device),
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
         *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
         *(access_rights, calls_emulator, calls_colours, calls_cloud),
+        *(calls_wizard, calls_live, calls_fleet),
     )
 }
 """What ``{generated}`` knows."""
@@ -755,7 +786,8 @@ def setup(app: Any) -> None:
 
 def _link_results(_app: Any, _name: str, source: list[str]) -> None:
     """Let a page's links to results, which are no pages, lead to these files."""
-    source[0] = source[0].replace("](../results/", "](path:../results/")
+    for way in ("../results/", "../../results/"):
+        source[0] = source[0].replace(f"]({way}", f"](path:{way}")
 
 
 def _plain_types(

@@ -5,7 +5,7 @@ stay; it knows no socket and no clock. :class:`Acceptor` accepts, and keeps its 
 
 - A newcomer always gets in as long as one of the others has no session: the one without a session
   for longest makes room. One with a session never does. What a session is, the server says; what
-  anybody may ask without one, such as OPTIONS, is none.
+  anybody may ask without one, such as OPTIONS, is not one.
 - A connection that has no session in time is closed, whatever it says meanwhile.
 - One address has three quarters of the places at most; the programs of this machine share one
   address, so loopback may have all.
@@ -84,7 +84,7 @@ class Occupant(Protocol):
         ...
 
     def turn_away(self, why: str) -> None:
-        """End it at once; harmless when said twice."""
+        """End the connection at once; harmless when said twice."""
         ...
 
 
@@ -112,7 +112,7 @@ class Places(Generic[G]):
         own: name of a session in the log, "a session".
 
     Attributes:
-        most: as given; may be changed.
+        most: value that was given; may be changed.
         crowded_out: connections that were closed, or refused, because too many were open.
     """
 
@@ -180,7 +180,7 @@ class Places(Generic[G]):
 
         Args:
             occupant: the connection.
-            within: from now on.
+            within: seconds from now on.
             what: is missing then.
             now: the moment.
         """
@@ -202,7 +202,7 @@ class Places(Generic[G]):
             self._send_away(found[1], why)
 
     def end_overdue(self, now: float) -> None:
-        """Have those go whose time is over; one that has a session then gets the time anew."""
+        """End connections whose time is over; one with a session then gets the time anew."""
         for occupant, place in list(self._places.items()):
             if place.deadline > now or occupant not in self._places:
                 continue
@@ -302,7 +302,7 @@ class Acceptor(Generic[G]):
 
         Args:
             occupant: the connection.
-            address: of its peer, as a socket has it.
+            address: address of its peer, as a socket has it.
         """
         now = asyncio.get_running_loop().time()
         why = self.places.enter(occupant, str(address[0]) if address else "", now)
@@ -325,7 +325,7 @@ class Acceptor(Generic[G]):
 
         Args:
             occupant: the connection.
-            within: from now on.
+            within: seconds from now on.
             what: is missing then, for the log.
         """
         self.places.expect(occupant, within, what, asyncio.get_running_loop().time())

@@ -58,7 +58,7 @@ def takes(**checks: Check) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def a_number(value: Any, what: str, who: str) -> Any:
-    """Return a plain number that a float has room for; ``bool`` is none."""
+    """Return a plain number that a float has room for; ``bool`` is not one."""
     number = plain(value)
     if isinstance(number, (int, float)) and not isinstance(number, bool):
         try:
@@ -79,7 +79,7 @@ def a_finite_number(value: Any, what: str, who: str) -> Any:
 
 
 def an_integer(value: Any, what: str, who: str) -> Any:
-    """Return a plain integer of at most 64 bits, whichever it is; ``bool`` is none."""
+    """Return a plain integer of at most 64 bits, whichever it is; ``bool`` is not one."""
     number = plain(value)
     if type(number) is int and -(1 << 63) <= number < 1 << 63:
         return number
@@ -87,7 +87,7 @@ def an_integer(value: Any, what: str, who: str) -> Any:
 
 
 def a_list(value: Any, what: str, who: str) -> Any:
-    """Return the items of a sequence; a text is none."""
+    """Return the items of a sequence; a text is not one."""
     return check_all(value, what, "a list", who)
 
 

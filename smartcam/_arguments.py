@@ -65,7 +65,7 @@ def check_integer(
 ) -> int:
     """Return an integer from ``least`` to ``most``; None: it may be as large as it likes.
 
-    Integers of numpy and others with ``__index__`` are integers, ``bool`` is none.
+    Integers of numpy and others with ``__index__`` are integers, ``bool`` is not one.
     """
     number = value if type(value) is int else _as_integer(value)
     if number is None or number < least or (most is not None and number > most):
@@ -114,7 +114,7 @@ def check_number(
 ) -> float:
     """Return a finite number from ``least`` to ``most``; with ``above``, one above ``least``.
 
-    Numbers of numpy and fractions are numbers; ``bool``, texts and arrays are none.
+    Numbers of numpy and fractions are numbers; ``bool``, texts and arrays are not valid.
     """
     number = value if type(value) is float else _as_float(value)
     if number is None or not least <= number <= most or (above and number == least):

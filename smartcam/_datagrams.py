@@ -14,8 +14,9 @@ LARGEST_DATAGRAM = 1 << 16
 def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
     """Have an endpoint make room for one datagram at each read, not for asyncio's 256 KiB.
 
-    So much the C library takes from the system and gives back every time, until it has learned
-    better; in a young process that costs more than the rest of the read. The attribute is asyncio's
+    The C library takes 256 KiB from the system and gives them back at each read, until it has
+    learned better; in a young process that costs more than the rest of the read. The attribute is
+    asyncio's
     own, of both its loops, and not documented: a transport without it, such as uvloop's, is left as
     it is.
     """

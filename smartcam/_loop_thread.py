@@ -27,7 +27,7 @@ CALL_TIMEOUT = 10.0
 well under a millisecond; longer means that something in there, such as a generator of an
 application, does not return."""
 
-LOCK_WAIT_TIME = 0.1
+MAX_LOCK_WAIT_TIME = 0.1
 """Seconds that Ctrl-C may have to wait where a lock's wait is not interrupted: on Windows, and
 elsewhere if it comes between the lock's look for signals and its wait."""
 
@@ -127,7 +127,7 @@ class _ThreadCall:
         self._done.acquire()
 
     def wait(self, timeout: float | None) -> bool:
-        """Begin it, and wait until it is done; return whether it is. Ctrl-C ends it, and is raised.
+        """Begin the call, wait for its end, return whether it ended. Ctrl-C ends it, and is raised.
 
         Args:
             timeout: seconds; None where what is called has deadlines of its own.
@@ -135,7 +135,7 @@ class _ThreadCall:
         try:
             self._mailbox.post(self._begin)
             deadline = None if timeout is None else time.monotonic() + timeout
-            while not self._done.acquire(timeout=LOCK_WAIT_TIME):
+            while not self._done.acquire(timeout=MAX_LOCK_WAIT_TIME):
                 if deadline is not None and time.monotonic() >= deadline:
                     return False
         except BaseException:  # KeyboardInterrupt, in the main thread
@@ -179,7 +179,7 @@ class _ThreadCall:
             self._succeed(got)
 
     async def _finish_by(self, work: Coroutine[Any, Any, object]) -> None:
-        """Run a coroutine; who waits goes on without another turn of the loop."""
+        """Run a coroutine; the waiting thread goes on without another turn of the loop."""
         try:
             got = await work
         except asyncio.CancelledError:
@@ -232,7 +232,7 @@ class LoopThread:
         tell_of_forks(self)
 
     def start(self) -> None:
-        """Start it; does nothing if it runs."""
+        """Start the thread; do nothing if it runs."""
         if self._thread is not None:
             return
         ready: threading.Event = threading.Event()
@@ -256,7 +256,7 @@ class LoopThread:
             )
 
     def stop(self) -> None:
-        """End it. Harmless when done twice, and in a fork, which has no such thread."""
+        """End the thread. Harmless when done twice, and in a fork, which has no such thread."""
         if self._forked:
             return
         thread, self._thread = self._thread, None

@@ -9,7 +9,7 @@ import re
 
 from smartcam.exceptions import ConfigurationError
 
-MOST = 200
+MAX_NAME_CHARACTERS = 200
 """Characters of a name."""
 
 _WORD = r"(?!.*__)[A-Za-z_][A-Za-z0-9_]*"
@@ -24,7 +24,7 @@ def check_node(name: str) -> str:
     Raises:
         ConfigurationError: it cannot be one.
     """
-    if len(name) > MOST or not _NODE.fullmatch(name):
+    if len(name) > MAX_NAME_CHARACTERS or not _NODE.fullmatch(name):
         raise ConfigurationError(
             f"ROS node {name!r:.120}: expected letters, digits and _, not beginning with a digit, "
             "without __"
@@ -46,7 +46,7 @@ def check_domain(domain: int) -> int:
     """Return a domain's number.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is not valid.
     """
     if not 0 <= domain <= 0xFFFFFFFF:
         raise ConfigurationError(f"ROS domain {domain}: expected 0 or more")
@@ -90,7 +90,7 @@ def as_name(text: str) -> str:
 
 
 def _checked(name: str, what: str) -> str:
-    if len(name) > MOST or not _NAME.fullmatch(name) or "__" in name:
+    if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name) or "__" in name:
         raise ConfigurationError(
             f"ROS {what} {name!r:.120}: expected parts of letters, digits and _ joined by /, none "
             "beginning with a digit, without __"

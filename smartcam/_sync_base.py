@@ -216,13 +216,13 @@ class _Inside(Generic[T]):
         self.entered: bool = False
 
     async def enter(self) -> T:
-        """Enter it."""
+        """Enter the context."""
         value = await self._context.__aenter__()
         self.entered = True
         return value
 
     async def leave(self, exc: BaseException | None) -> None:
-        """Leave it; what was raised inside is raised by who called."""
+        """Leave the context; an error raised inside reaches the caller."""
         self.entered = False
         kind, trace = (None, None) if exc is None else (type(exc), exc.__traceback__)
         try:

@@ -235,7 +235,7 @@ def checked_localizations(value: object, camera: str) -> list[Localization]:
     """Return the localizations that a value is.
 
     Raises:
-        InterpretationError: it is none.
+        InterpretationError: it is not valid.
     """
     found = localizations_of(value)
     if found is None:

@@ -2,8 +2,8 @@
 
 An interpreter, a calibration, an observer, a predicate, a generator: where one is called
 ``except ENDS_PROGRAM: raise`` stands first, and then ``except BaseException``, which tells the
-error where it belongs. ``Exception`` is too little: what ``pytest.fail`` raises is none, nor is
-``CancelledError``, which would cancel the task that makes the call.
+error where it belongs. ``Exception`` is too little: what ``pytest.fail`` raises is no
+``Exception``, nor is ``CancelledError``, which would cancel the task that makes the call.
 """
 
 from __future__ import annotations

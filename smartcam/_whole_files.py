@@ -43,7 +43,7 @@ def replace_file(path: Path, body: bytes, *, backups: int = 0) -> None:
 
     Raises:
         FolderInUseError: another process writes in the folder and does not end.
-        OSError: the file cannot be written. What was there is there.
+        OSError: the file cannot be written. The file from before is still there.
     """
     with _writing(path) as alone:
         if alone:
@@ -82,7 +82,7 @@ def sync_folder(folder: Path) -> None:
 def _writing(path: Path) -> Iterator[bool]:
     """Be the only one that writes in a file's folder.
 
-    Yields whether it is so: there are file systems without locks.
+    Yields False where the file system has no locks.
     """
     handle = _open_lock(path.parent)
     try:

@@ -55,8 +55,9 @@ LEASE_TIME = 5.0
 """Seconds without a sign of life after which an end counts as gone; a killed one goes at once."""
 
 MAX_LISTING_TIME = 120.0
-"""Seconds after which the engine ends the answer to who is there as if it was whole, however long
-who asks would wait. By itself it takes 10; thousands of presences on a busy machine take longer."""
+"""Seconds after which the engine ends the list of those present as if it was whole, however long
+the asker would wait. By itself it takes 10; thousands of presences on a busy machine take
+longer."""
 
 PORTS = range(20_000, 32_000)
 """The ports tried for port 0, below the range from which systems give ports to connections.
@@ -99,7 +100,7 @@ ROUTER_TIMEOUT = 3.0
 
 NOT_ZENOH = "nothing there speaks Zenoh"
 
-DECLARED_AT_ONCE = 32
+MAX_DECLARED_AT_ONCE = 32
 """Declarations made in one turn of the event loop at most."""
 
 _ONE = (1).to_bytes(8, sys.byteorder)
@@ -282,7 +283,7 @@ class ZenohSession:
     # ------------------------------------------------------------------ life
 
     async def open(self, timeout: float) -> Self:
-        """Open it.
+        """Open the session.
 
         Raises:
             ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
@@ -379,7 +380,7 @@ class ZenohSession:
             raise ConfigurationError(f"{self._what} is not open")
         await self._open(timeout)
         for number, one in enumerate(tuple(self._declared)):
-            if number % DECLARED_AT_ONCE == 0:
+            if number % MAX_DECLARED_AT_ONCE == 0:
                 await asyncio.sleep(0)
             one.again()
         self._reopening = False
@@ -408,7 +409,7 @@ class ZenohSession:
         return ConnectFailedError(text, attempts=(why,))
 
     async def close(self) -> None:
-        """Close it; what was declared is gone with it. Idempotent."""
+        """Close the session, and with it all declarations. Idempotent."""
         session, self._session = self._session, None
         self._reopening = False
         if self._look is not None:
@@ -429,7 +430,7 @@ class ZenohSession:
                 await asyncio.shield(closing)
 
     def _threads(self) -> list[ThreadPoolExecutor]:
-        """Return those of whoever stands on it; what they have to say yet is said first."""
+        """Return the threads of the session's users; their last messages are sent first."""
         repliers, self._repliers = self._repliers, None
         return [] if repliers is None else [repliers]
 
@@ -514,7 +515,7 @@ class ZenohSession:
     def reply(self, query: Any, replies: list[tuple[str, bytes]], **how: Any) -> None:
         """Answer a query, and end it; never waits.
 
-        The engine may wait for who has asked, as that one has said in the query; so threads do it.
+        The engine may wait for the asker, where the query says that it may; hence the threads.
 
         Args:
             query: the engine's.
@@ -657,7 +658,7 @@ class ZenohDeclared:
         return None if self._by_dropping else it
 
     def again(self) -> None:
-        """Declare it at the session that is there now."""
+        """Declare the key at the session that is there now."""
         if not self._closed and self._it is None:
             self._it = self._how(self._end.session)
 

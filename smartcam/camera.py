@@ -802,7 +802,7 @@ class Camera(abc.ABC, Generic[ValueT]):
             encoding: ``raw`` is as the device gives them; ``jpeg``, or ``png`` and ``jpegxl``
                 without loss. They stay so until somebody asks for pixels. ``h264`` is decoded here,
                 and only whole pictures are given.
-            quality: of JPEG, 1 to 100.
+            quality: quality of JPEG, 1 to 100.
             bitrate: bits a second that JPEGs are held to, by quality first and frame rate then
                 (each frame's ``rate`` says how); of H.264 what its encoder keeps to.
             latency: seconds from a JPEG's capture to its arrival that are held the same way.
@@ -865,7 +865,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Where clocks or the source leave a doubt, it is the first one of which that is sure.
 
         Args:
-            moment: of ``time.monotonic()``; None: now.
+            moment: time of ``time.monotonic()``; None: now.
             encoding: as :meth:`frames` has it.
             quality: as :meth:`frames` has the argument.
             timeout: seconds.

@@ -51,8 +51,8 @@ __all__ = ["SmartCamera"]
 class SmartCamera(Camera[ValueT]):
     """A camera at the wire: this client has its only session.
 
-    :exc:`~smartcam.ConnectionTakenError` is what everything raises once another client has taken
-    the camera, which ends this one. Then make a new one.
+    Once another client has taken the camera, this client has ended: everything raises
+    :exc:`~smartcam.ConnectionTakenError`. Make a new client then.
     """
 
     def __init__(self, settings: CameraSettings, *, observers: Iterable[Observer] = ()) -> None:

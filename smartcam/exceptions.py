@@ -21,7 +21,7 @@
     ├── CalibrationError (ValueError)          samples that give no calibration: a code says why
     ├── FrameSourceError (OSError)             a source of pictures: gone, in use, stuck
     │   ├── FrameFeatureError                  no such feature, or not settable so now
-    │   ├── FrameFormatError                   pixels that it has not, or that are none
+    │   ├── FrameFormatError                   pixels that it has not, or that are not valid
     │   └── FrameTimeoutError (TimeoutError)   no picture in time
     ├── InspectionError                        a tool failed: the picture has no verdict
     ├── RecordingError (OSError)               a recording that could not be written, or read

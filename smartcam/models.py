@@ -59,8 +59,8 @@ class Status(enum.IntFlag):
 
     Source: SC manual p. 30 and p. 33 (published) for the first seven bits and their values; the
     bits need not be reset by the client, when a state ends the camera sends a status without it.
-    Where a dialect's own word differs, its table says which of its bits is which of these; what has
-    no like here stands 32 bits higher than on the wire. In ``bid`` Overtriggered is the Trigger
+    Where a dialect's own word differs, its table maps its bits to these; a bit that has no
+    counterpart here stands 32 bits higher than on the wire. In ``bid`` Overtriggered is the Trigger
     Error, which stays set until the errors are reset.
     """
 
@@ -129,16 +129,16 @@ def as_status(word: int) -> Status:
     return Status(word) if known is None else cast("Status", known)
 
 
-SHORT_BYTES = 16
+MAX_RAW_BYTES_IN_REPR = 16
 """Bytes of a container that a result's repr shows."""
 
-LONGEST_REPR = 300
+MAX_CHARACTERS_IN_REPR = 300
 """Characters of a value that a result's repr shows."""
 
 
 def _cut(value: object) -> str:
     text = repr(value)
-    return text if len(text) <= LONGEST_REPR else f"{text[:LONGEST_REPR]}..."
+    return text if len(text) <= MAX_CHARACTERS_IN_REPR else f"{text[:MAX_CHARACTERS_IN_REPR]}..."
 
 
 def _html() -> Any:
@@ -231,7 +231,8 @@ class Calibration(Protocol):
         none included; it must not wait. It may be called again for the same container.
 
         Args:
-            localizations: of one container; their header has the camera's name as its frame.
+            localizations: localizations of one container; their header has the camera's name as its
+                frame.
 
         Raises:
             CalibrationError: one of them cannot be brought there. That makes the whole result an
@@ -266,8 +267,12 @@ class Result(NamedTuple, Generic[ValueT]):
     value: ValueT
 
     def __repr__(self) -> str:
-        """Return the fields that say something, long ones cut."""
-        raw = self.raw if len(self.raw) <= SHORT_BYTES else self.raw[:SHORT_BYTES] + b"..."
+        """Return the fields that are not None, long ones cut."""
+        raw = (
+            self.raw
+            if len(self.raw) <= MAX_RAW_BYTES_IN_REPR
+            else self.raw[:MAX_RAW_BYTES_IN_REPR] + b"..."
+        )
         shown = self._asdict() | {"raw": raw}
         fields = (f"{name}={_cut(value)}" for name, value in shown.items() if value is not None)
         return f"Result({', '.join(fields)})"
@@ -278,7 +283,7 @@ class Result(NamedTuple, Generic[ValueT]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Capabilities:
-    """The abilities of a camera in its dialect; calling one that it lacks: UnsupportedError.
+    """The abilities of a camera in its dialect; calling a missing one raises UnsupportedError.
 
     Attributes:
         dialect: the dialect's name.
@@ -335,21 +340,21 @@ class CameraEvent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Connected(CameraEvent):
-    """The first session is there; ``url`` has what was found out pinned."""
+    """The first session was made; ``url`` names the dialect that was found."""
 
     url: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reconnected(CameraEvent):
-    """A later session is there, and which application is active was asked again."""
+    """A later session was made, and the camera has told its active application again."""
 
     url: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disconnected(CameraEvent):
-    """The session ended; ``reason`` says why, ``expected`` whether this side wanted it so."""
+    """The session ended; ``reason`` says why, ``expected`` is True if this side ended it."""
 
     reason: str
     expected: bool
@@ -385,8 +390,8 @@ class SubscriberStatistics:
         dropped: items lost to the policy or to ``min_interval``.
         queued: items waiting.
         queued_bytes: bytes of their containers; 0 for statuses and events.
-        missed: items that a fleet's camera sent and that did not come, since the program was cut
-            off from its agent for longer than that keeps them; 0 for a camera at the wire.
+        missed: items of a fleet's camera that were lost, since the program was cut off from its
+            agent for longer than the agent keeps them; 0 for a camera at the wire.
     """
 
     name: str
@@ -442,12 +447,12 @@ class Statistics:
 
     Attributes:
         received: result containers that arrived.
-        triggered: outcome of a trigger of ours.
-        streamed: nobody had triggered it, and somebody was listening.
-        late: came after its trigger had given up.
-        wrong_application: from another application than expected; not interpreted.
-        uninterpretable: does not fit its layout.
-        unclaimed: nobody had triggered it and nobody was listening.
+        triggered: results of this client's triggers.
+        streamed: results that nobody had triggered, while somebody was listening.
+        late: results that came after their trigger had given up.
+        wrong_application: containers from another application than expected; not interpreted.
+        uninterpretable: containers that do not fit their layout.
+        unclaimed: results that nobody had triggered and nobody was listening for.
         empty_slots: all-zero records skipped by interpreters.
         extra_results: containers that came for a trigger which had its results already; they are
             counted as streamed or unclaimed too.

@@ -26,7 +26,7 @@ class TraceEntry(NamedTuple):
     """One frame as ``--trace`` writes it.
 
     Attributes:
-        at: when, UTC.
+        at: time, UTC.
         camera: name of the camera.
         direction: ``>`` out, ``<`` in, ``!`` bytes that broke the protocol, or that were left of an
             unfinished frame when the link ended.
@@ -53,7 +53,7 @@ class Observer:
     """
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """See a frame that went over the wire, or bytes that make none.
+        """See a frame that went over the wire, or bytes that make no frame.
 
         Frames are decoded for this only where an observer overrides it.
         """
@@ -80,7 +80,7 @@ class Observer:
             camera: name of the camera.
             error: a trigger without a result, a container that does not fit its layout, a lost
                link, a reconnect that failed.
-            triggered_at: when ``trigger()`` was called, UTC; None where it was no trigger's end.
+            triggered_at: when ``trigger()`` was called, UTC; None where the error ended no trigger.
         """
 
 
@@ -88,7 +88,7 @@ class Observers:
     """All observers of one client; never raises.
 
     Args:
-        observers: in the order in which they are called.
+        observers: observers in the order in which they are called.
 
     Attributes:
         see_states: whether any looks at events.

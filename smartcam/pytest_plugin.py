@@ -70,7 +70,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Pytest: what was found of clients; what was found of a camera, its judge tells itself."""
+    """Pytest: show the findings about clients; the judge of cameras shows its own."""
     from smartcam.conformance._inside import terminal_summary
 
     terminal_summary(terminalreporter)
@@ -124,7 +124,7 @@ def emulated_fleet(request: pytest.FixtureRequest) -> Iterator[ThreadedFleet]:
 
 
 def _scenario(protocol: str, application: int | None, number: int) -> Scenario:
-    """Return a camera of a fleet, with an application that runs where the camera can be so."""
+    """Return a camera of a fleet, with a running application where the camera can have one."""
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 

@@ -136,7 +136,7 @@ class Registry:
             )
         try:
             loaded: object = points[0].load()
-        except (Exception, SystemExit) as exc:  # which ends programs, and is not theirs to end
+        except (Exception, SystemExit) as exc:  # an import must not end the program
             raise PluginError(
                 f"{self.group}: {shown(name)} of {providers[0]} failed to load: {exc!r}", name=name
             ) from exc

@@ -296,7 +296,7 @@ class CameraSettings(BaseModel):
         frozen=True, extra="forbid", arbitrary_types_allowed=True
     )
 
-    address: Address = Field(description="where the camera is")
+    address: Address = Field(description="address of the camera")
     name: Text = Field(
         "", max_length=200, description="name in logs and results; default HOST:PORT"
     )
@@ -318,13 +318,14 @@ class CameraSettings(BaseModel):
         False, description="the camera's y axis points down; turned to y up on the way in"
     )
     lenient: Flag = Field(False, description="any non-zero byte is a true bool")
-    connect_timeout: Seconds = Field(10.0, description="for a session, all attempts together")
+    connect_timeout: Seconds = Field(10.0, description="longest wait for a session, all attempts")
     connect_attempts: Integer = Field(3, ge=1, le=100, description="fresh links tried per dialect")
-    switch_timeout: Seconds = Field(10.0, description="for a switch until the camera is ready")
-    request_timeout: Seconds = Field(5.0, description="for the answer to a request")
-    close_timeout: Seconds = Field(1.0, description="for an orderly end of the link")
+    switch_timeout: Seconds = Field(10.0, description="longest wait for a switch")
+    request_timeout: Seconds = Field(5.0, description="longest wait for the answer to a request")
+    close_timeout: Seconds = Field(1.0, description="longest wait for an orderly end of the link")
     liveness_timeout: Seconds | None = Field(
-        5.0, description="for a sign of life of a camera that is asked for one; None: no end"
+        5.0,
+        description="longest silence of a camera that is asked for a sign of life; None: no end",
     )
     reconnect: InstanceOf[Backoff] | None = Field(
         Backoff(), description="when a lost camera is tried again; None: never"

@@ -102,13 +102,13 @@ class Queue(Generic[T]):
         return bool(self._items)
 
     def share(self, ready: asyncio.Event) -> None:
-        """Set this event where something comes, or it ends; for who reads several."""
+        """Set this event where something comes, or it ends; for readers of several."""
         self._ready = ready
         if self._items or self._ended:
             ready.set()
 
     def keep(self, source: object) -> None:
-        """Refer to where the items come from until the end: who has the stream alone needs it."""
+        """Refer to the items' source until the end, for a program that keeps the stream alone."""
         if not self._ended:
             self._kept = source
 
@@ -190,7 +190,7 @@ class Queue(Generic[T]):
         Args:
             items: the items.
             now: when they came.
-            size: of all of them.
+            size: bytes of all of them.
         """
         queued = self._items
         if (
@@ -364,7 +364,7 @@ class Subscribers(Generic[T]):
         self._in_order: list[weakref.ref[Queue[T]]] | None = None
 
     def add(self, queue: Queue[T]) -> None:
-        """Offer it what comes from now on."""
+        """Offer a subscriber all items from now on."""
         self.references[weakref.ref(queue, self._discard)] = None
         self._in_order = None
 

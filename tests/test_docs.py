@@ -442,6 +442,12 @@ def test_architecture_names_every_module() -> None:
     assert [name for name in modules if name != "py" and f"`{name}`" not in named] == []
 
 
+def test_table_of_modules_says_what_each_one_holds(tables: dict[str, str]) -> None:
+    said = rows(tables["modules"])
+    assert len(said) == len([*(ROOT / "smartcam").rglob("*.py")])
+    assert [row[:2] for row in said if not row[2]] == []
+
+
 def test_drawing_of_the_rooms_is_what_the_imports_say() -> None:
     rooms = module_of("rooms")
     drawn = rooms.DRAWING.read_text(encoding="utf-8")

@@ -111,11 +111,6 @@ def modules() -> dict[str, str]:
     return plain | full
 
 
-def plain_modules() -> set[str]:
-    """Return each module's name below smartcam without the underscores in front of its parts."""
-    return {re.sub(r"(^|\.)_", r"\1", module.removeprefix("smartcam.")) for module in SOURCES}
-
-
 def is_there(name: str) -> bool:
     """Return whether a dotted name of the package is a module, or a name in one."""
     short = name.removeprefix("smartcam.")
@@ -152,29 +147,12 @@ def test_names_on_a_page_are_in_the_package(page: str) -> None:
 
 ELSEWHERE = {
     "docs/architecture/inspection.md": {"TOOL_ok", "smartcam.tools"},  # a field, entry points
-    "docs/architecture/speed.md": {"sock_recv_into"},  # asyncio's
     "docs/decisions/0002-receive-task.md": {"epoll_wait"},  # the system's
     "docs/decisions/0011-recordings.md": {"Writer"},  # the mcap library's
     "docs/decisions/0015-the-house.md": {"smartcam/emulator.py", "smartcam/_emulator/"},  # rejected
     "docs/decisions/0026-the-door.md": {"tls_handshake_timeout_ms"},  # Zenoh's
 }
 """Names by page that are not the package's: other programs' and those that were rejected."""
-
-
-def modules_in_tables(text: str) -> Iterator[str]:
-    """Yield each module in the tables whose first column is ``in``, with the package it is in."""
-    for table in re.findall(r"^\| in \| module \|.*\n((?:\|.*\n)+)", text, re.MULTILINE):
-        package = ""
-        for line in table.splitlines()[1:]:
-            inside, names = (cell.strip() for cell in line.split("|")[1:3])
-            package = inside.strip("`") or package
-            yield from (f"{package}.{name}" for name in QUOTED.findall(names))
-
-
-def test_tables_name_modules_where_they_are() -> None:
-    found = list(modules_in_tables(PAGES["docs/architecture/rooms.md"]))
-    assert len(found) > 100
-    assert [name for name in found if name not in plain_modules()] == []
 
 
 def test_exceptions_are_on_their_pages() -> None:

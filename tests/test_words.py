@@ -10,6 +10,8 @@ import ast
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
+import pytest
+
 from tests.imports import SOURCES
 
 if TYPE_CHECKING:
@@ -84,6 +86,38 @@ def test_attributes_are_explained_by_nouns() -> None:
 
 def test_functions_say_what_they_return_by_a_noun() -> None:
     found = [one for one in docstrings() if CLAUSE.match(one.text)]
+    assert not found, "\n".join(map(str, found))
+
+
+YOUNG = ("smartcam.inspection", "smartcam.outlets", "smartcam.makes")
+"""Rooms whose texts the rules of :data:`HALF` do not reach yet; a room that is mended goes."""
+
+HALF = {
+    "an argument is said by a noun, not by 'of ...'": (entries, r"^(of|for|in|by) (?!ten )"),
+    "'is none' says nothing of what it is not": (
+        docstrings,
+        r"(?<!there) (is|are|was|were) none\b",
+    ),
+    "a first line names its object": (docstrings, r"^(?!Is )[A-Z]\w+ (it|its|them|their)\b"),
+    "'in here' may be a module or a folder": (docstrings, r"\bin here\b"),
+    "'cannot be' what?": (docstrings, r"\b(topic|name|value|URL|domain|range) cannot be[.,;]"),
+    "'who' is no noun": (docstrings, r"\b(of|for|to|by|from|with|at) who\b"),
+}
+"""Ways to say half a thing: what is wrong, where it is looked for, and how it is found."""
+
+IDIOM = re.compile(r" (is|are|was|were) none of\b")
+"""Part of a whole sentence that a pattern of :data:`HALF` finds, too."""
+
+
+@pytest.mark.parametrize("wrong", HALF)
+def test_texts_say_whole_things(wrong: str) -> None:
+    texts, pattern = HALF[wrong]
+    found = [
+        one
+        for one in texts()
+        if not one.module.startswith(YOUNG)
+        and re.search(pattern, IDIOM.sub("", " ".join(one.text.split())))
+    ]
     assert not found, "\n".join(map(str, found))
 
 

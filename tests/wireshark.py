@@ -77,7 +77,7 @@ class Capture:
 
 
 class Shown(NamedTuple):
-    """One message, or bytes that make none, as Wireshark shows it."""
+    """One message, or bytes that make no frame, as Wireshark shows it."""
 
     packet: int  # its packet's number
     transport: str  # of the packet: tcp or udp

@@ -216,7 +216,7 @@ def _only_frames(url: str) -> bool:
 
 @contextlib.asynccontextmanager
 async def _frames_of(pictures: str | None, options: Options) -> AsyncIterator[FrameSource | None]:
-    """Have the source of frames open that ``--pictures`` names, None where it names none.
+    """Open the source of frames that ``--pictures`` names; None where it names no source.
 
     Raises ConfigurationError: the URL is wrong; FrameSourceError: it is not there.
     """

@@ -43,7 +43,7 @@ async def drive(
     """Ask until the wizard's end; return the last view.
 
     ``anew``: begins the wizard anew. ``picture``: the file into which the picture of a step is
-    written. Raises ConfigurationError: a line of input is none, or there is no more.
+    written. Raises ConfigurationError: a line of input is not valid, or there is no more.
     """
     lines = Lines()
     if session.resumed and not options.as_json:

@@ -57,7 +57,7 @@ class SimulatedRobot:
 
     Args:
         scene: the table.
-        seed: of where the table is, and of the noise of the touches.
+        seed: seed of where the table is, and of the noise of the touches.
     """
 
     def __init__(self, scene: TableScene, seed: int) -> None:

@@ -59,7 +59,7 @@ AREA: Final = (0.6, 1.7)
 SIDE_RATIO: Final = (2.2, 3.8)
 """Longer side of a block in the picture over the shorter one, from least to most."""
 
-FULLNESS: Final = 0.8
+MIN_FULLNESS: Final = 0.8
 """Share of its rectangle that a block fills at least."""
 
 RIM: Final = 2
@@ -112,9 +112,9 @@ async def tower(
 
     Args:
         options: how it is told.
-        seed: of where everything lies, and of all noise.
+        seed: seed of where everything lies, and of all noise.
         table: another one; None: one of the seed.
-        colours: of the blocks.
+        colours: colours of the blocks.
         layers: blocks to put onto the tower.
 
     Raises:
@@ -275,7 +275,7 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     level = np.percentile(depth[high.mask], 20)  # the top is more than a fifth of what is seen
     upper = high.mask & (np.abs(depth - level) < EDGE)
     top = find_regions(upper)[0]
-    if not SIDE_RATIO[0] <= top.ratio <= SIDE_RATIO[1] or top.fullness < FULLNESS:
+    if not SIDE_RATIO[0] <= top.ratio <= SIDE_RATIO[1] or top.fullness < MIN_FULLNESS:
         raise FrameFormatError(
             f"{ARM}: expected a block on top of the tower, got {_shape(top)}", source=ARM
         )
@@ -289,7 +289,7 @@ def _regions(sight: TableSight, colours: ColourRange) -> list[ColourRegion]:
         colours.mask(sight.rgb),
         area=_area(sight),
         ratio=SIDE_RATIO,
-        fullness=FULLNESS,
+        fullness=MIN_FULLNESS,
         whole=True,
     )
 

@@ -28,7 +28,7 @@ UP = ("x", "y", "z", "-x", "-y", "-z")
 def _ranges(
     _ctx: click.Context, _param: click.Parameter, values: Sequence[str]
 ) -> list[tuple[str, float, float]]:
-    """Return axis, low and high of ``AXIS:LOW:HIGH``; a limit that is left out is none."""
+    """Return axis, low and high of ``AXIS:LOW:HIGH``; a limit that is left out is no limit."""
     found = []
     for value in values:
         axis, _, limits = value.partition(":")

@@ -60,7 +60,7 @@ async def _serve(site: ColourSite, options: Options) -> None:
 
 
 def _range(text: str | None) -> ColourRange | None:
-    """Return a range of its JSON; ConfigurationError: it is none."""
+    """Return a range of its JSON; ConfigurationError: it is not valid."""
     with from_part("depth", "smartcam frames colours needs"):
         from smartcam.depth import ColourRange
 

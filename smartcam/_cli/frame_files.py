@@ -26,9 +26,9 @@ class Encoding:
 
     Attributes:
         suffix: a key of :data:`SUFFIXES`.
-        quality: of a JPEG, 1 to 100.
+        quality: quality of a JPEG, 1 to 100.
         grey: the brightness alone.
-        eight: of more than 8 bits the upper 8.
+        eight: True for the upper 8 bits of deeper pixels.
     """
 
     suffix: str

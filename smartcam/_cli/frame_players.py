@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 RTSP_USER = "smartcam"
 """Name of the RTSP user where a password is set."""
 
-LONGEST_NAME = 60
+MAX_NAME_LETTERS = 60
 """Letters of a source's name in a URL, before its number."""
 
-LOOK = 0.1
-"""Seconds between two looks whether a source is there."""
+LOOK_INTERVAL = 0.1
+"""Seconds between two looks for a source that is not open yet."""
 
-DESCRIBED = 5.0
-"""Seconds that the first frame is waited for, after which its description has all that helps."""
+DESCRIPTION_TIMEOUT = 5.0
+"""Seconds that the first frame may take: with it the description is complete."""
 
 
 class Players(NamedTuple):
@@ -61,10 +61,12 @@ def address(_context: object, parameter: click.Parameter, text: str | None) -> A
 
 
 def names_of(sources: Sequence[FrameSource]) -> dict[str, FrameSource]:
-    """Return sources by names that a URL can have, each its own."""
+    """Return sources by unique names that fit into a URL."""
     named: dict[str, FrameSource] = {}
     for one in sources:
-        plain = re.sub(r"[^A-Za-z0-9._~-]+", "-", one.name)[:LONGEST_NAME].strip("-._~") or "camera"
+        plain = (
+            re.sub(r"[^A-Za-z0-9._~-]+", "-", one.name)[:MAX_NAME_LETTERS].strip("-._~") or "camera"
+        )
         numbered = (f"{plain}-{number}" for number in range(2, len(sources) + 2))
         named[next(name for name in (plain, *numbered) if name not in named)] = one
     return named
@@ -104,9 +106,9 @@ def rtsp_urls(
 
 
 async def send_rtp(source: FrameSource, players: Players, options: Options) -> None:
-    """Send a source by RTP whenever it is there, until cancelled; tell what a player needs.
+    """Send a source by RTP whenever it is there, until cancelled; print what players need.
 
-    Raises ConfigurationError: the address is none, or the file cannot be written.
+    Raises ConfigurationError: the address is not valid, or the file cannot be written.
     """
     from smartcam.frames import RtpSender
 
@@ -123,7 +125,7 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
                 noted, delays = "", Backoff().delays()
                 await sender.wait()
         except LocalProtocolError:  # the source is not open
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(LOOK_INTERVAL)
             continue
         except FrameSourceError as exc:
             if str(exc) != noted:
@@ -134,10 +136,10 @@ async def send_rtp(source: FrameSource, players: Players, options: Options) -> N
 
 async def _first_frame(sender: RtpSender) -> None:
     """Wait for the first frame, or a while in vain."""
-    for _ in range(round(DESCRIBED / LOOK)):
+    for _ in range(round(DESCRIPTION_TIMEOUT / LOOK_INTERVAL)):
         if sender.statistics().frames:
             return
-        await asyncio.sleep(LOOK)
+        await asyncio.sleep(LOOK_INTERVAL)
 
 
 async def _describe(to: str, sdp: str, file: str | None, options: Options, *, again: bool) -> None:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from smartcam.frames import FrameSource
 
 TIMEOUT = (
-    "Bound of the wait for a frame, and of a device that streams and gives none.  [default: 5]"
+    "Bound of the wait for a frame, and of a device that streams and gives no frame.  [default: 5]"
 )
 
 

@@ -40,17 +40,17 @@ MAX_SHOWN = 4
 """Sources side by side on a page."""
 
 FOR_GOOD = (ConfigurationError, FrameFormatError, UnsupportedError)
-"""Errors of a source that will hardly ever be what was asked for."""
+"""Errors that stay: another try to open the source would fail as well."""
 
-FIRST = 3.0
+FIRST_TRY_TIMEOUT = 3.0
 """Seconds that the first try of each source is waited for, before the others are served."""
 
 PERIOD = 1.0
-"""Seconds between two looks at who looks."""
+"""Seconds between two looks at the viewers."""
 
 
 def _serves(terminated: int) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Give a command what both have; ``terminated``: its exit code after SIGTERM."""
+    """Give a command the options of both commands; ``terminated``: exit code after SIGTERM."""
     parts: list[Any] = [
         click.argument("urls", metavar="URL...", nargs=-1, required=True),
         click.option(
@@ -153,7 +153,7 @@ async def serve_sources(
 ) -> None:
     """Serve sources until cancelled, or for ``--seconds``; one that fails harms no other.
 
-    Raises ConfigurationError, FrameFormatError, UnsupportedError: so it is with all of them;
+    Raises ConfigurationError, FrameFormatError, UnsupportedError: all sources fail by them;
     ConfigurationError: it cannot listen.
     """
     if len(urls) > MAX_SHOWN:
@@ -168,9 +168,9 @@ async def serve_sources(
 
 
 async def _serve(site: FramesSite, tries: _Tries, players: Players, options: Options) -> None:
-    """Serve, once each source was tried, or :data:`FIRST` seconds are over."""
+    """Serve, once each source was tried, or :data:`FIRST_TRY_TIMEOUT` seconds are over."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(FIRST):
+        async with asyncio.timeout(FIRST_TRY_TIMEOUT):
             await tries.check()
     async with contextlib.AsyncExitStack() as stack:
         server: RtspServer | None = None
@@ -217,14 +217,14 @@ class _Tries:
         return len(wrong) == self._count and all(wrong)
 
     async def check(self) -> None:
-        """Wait until each was tried; raise what is wrong with the first, where all are for good."""
+        """Wait until each was tried; raise the first error if all sources have failed for good."""
         await self._done.wait()
         error = self._first[0]
         if error is not None and self._all_for_good():
             raise error
 
     async def watch(self) -> None:
-        """Do so until cancelled."""
+        """Report sources that fail, until cancelled."""
         await self.check()
         await asyncio.Event().wait()
 

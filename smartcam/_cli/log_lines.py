@@ -88,7 +88,7 @@ class LineHandler(logging.Handler):
     """Has a thread write lines to a file; never waits for it.
 
     Args:
-        descriptor: of the file.
+        descriptor: descriptor of the file.
         most: lines that wait.
 
     Attributes:
@@ -163,7 +163,7 @@ def json_log(
     descriptor: int = 2,
     most: int = MAX_WAITING,
 ) -> Iterator[LineHandler]:
-    """Write everything that this process logs, while in here, as lines of JSON."""
+    """Write all that this process logs as lines of JSON, as long as the block runs."""
     root = logging.getLogger()
     handlers, before = root.handlers[:], root.level
     handler = LineHandler(descriptor, most)

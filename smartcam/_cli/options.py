@@ -153,7 +153,7 @@ def runs(
 
 @contextmanager
 def naming(what: str) -> Iterator[None]:
-    """Make what goes wrong with a file in here a ConfigurationError that says whose it is."""
+    """Turn errors of a file in the block into a ConfigurationError that names the file."""
     try:
         yield
     except OSError as exc:
@@ -161,7 +161,7 @@ def naming(what: str) -> Iterator[None]:
 
 
 def from_hex(text: str, where: str) -> bytes:
-    """Return the bytes of hex text (ConfigurationError: it is none); spaces are allowed."""
+    """Return the bytes of hex text (ConfigurationError: it is not hex); spaces are allowed."""
     try:
         return bytes.fromhex(text)
     except ValueError as exc:

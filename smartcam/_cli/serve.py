@@ -74,7 +74,7 @@ async def serve(file: str | None, schema: bool, log: str | None, options: Option
 
 @contextlib.contextmanager
 def _logged(server: FleetServer | None, options: Options) -> Iterator[None]:
-    """Have all that is logged in here written as lines of JSON; an error that ends it, too."""
+    """Have all logs of the block written as lines of JSON, and an error that ends it."""
     section = None if server is None else server.file.operations
     level = logging.getLevelName(
         "DEBUG" if options.debug else section.level.upper() if section else "INFO"
@@ -96,7 +96,7 @@ class Serving:
 
     Args:
         server: the agent.
-        options: of the command.
+        options: options of the command.
         as_lines: what happens is logged, and not printed for people.
         show: says what is there, once it is; None: a line of each camera.
     """
@@ -184,7 +184,7 @@ class Serving:
 
     @contextlib.asynccontextmanager
     async def _watched(self) -> AsyncIterator[None]:
-        """Serve health and numbers in here, where the file says so."""
+        """Serve health and numbers as long as the block runs, where the file says so."""
         section = self._server.file.operations
         if section is None or section.place is None:
             yield
@@ -268,7 +268,7 @@ def _hangup() -> Iterator[asyncio.Event]:
 
 @contextlib.asynccontextmanager
 async def _while_here(work: Any) -> AsyncIterator[None]:
-    """Have something done in a task in here."""
+    """Run a coroutine in a task, as long as the block runs."""
     task = asyncio.get_running_loop().create_task(work)
     try:
         yield

@@ -34,7 +34,7 @@ class Listed(NamedTuple):
     """A command in the list.
 
     Attributes:
-        module: of this package; the command has its name there.
+        module: module of this package that has a function with the command's name.
         summary: the first sentence of its help.
         extra: the extra that brings the module, where smartcam alone does not.
     """

@@ -26,7 +26,7 @@ PROTOCOL = "bvs"
 """The protocol of the emulated cameras, by default."""
 
 SHOWN = 7
-"""The application that runs where a page shows a camera of no scenario."""
+"""The application that runs for a page where no scenario is given."""
 
 _SAID = {
     "scenario": "scenario",
@@ -209,7 +209,7 @@ def _software(
 ) -> Iterator[SoftwareDevice]:
     """Yield the software cameras of a cell file.
 
-    Raises ConfigurationError: the file is wrong, or a camera cannot be so.
+    Raises ConfigurationError: the file is wrong, or an option does not fit a camera.
     """
     with from_part("inspection", "--program needs"):
         from smartcam.inspection import SoftwareDevice, load_cell

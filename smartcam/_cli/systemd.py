@@ -106,7 +106,7 @@ class Notifier:
 
     @contextlib.contextmanager
     def telling(self, status: Callable[[], str]) -> Iterator[None]:
-        """Have the event loop say again and again, while in here, that it runs, and how it is.
+        """Have the event loop report again and again, as long as the block runs.
 
         It says so at half of the watchdog's time. A loop that hangs says nothing, and is killed.
         """

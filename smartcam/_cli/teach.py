@@ -135,7 +135,7 @@ def _show(file: str, found: Inspection, options: Options) -> None:
 def _changed(tools: dict[str, dict[str, Any]], changes: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return the tools with other settings.
 
-    Raises ConfigurationError: a change is none.
+    Raises ConfigurationError: a change is not valid.
     """
     from smartcam.layout._inside import BadYamlError, load
 

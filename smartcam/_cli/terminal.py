@@ -22,7 +22,7 @@ PERIOD = 1.0
 
 
 def tinted(word: str, text: str | None = None) -> str:
-    """Return a word in its colour, or a text in the word's; :func:`click.echo` takes it off a file.
+    """Return a word, or a text, in the word's colour; :func:`click.echo` removes it in files.
 
     Plain where NO_COLOR is set or the terminal is dumb.
     """
@@ -48,14 +48,14 @@ class CountingLine:
         self._width = 0
 
     def clear(self) -> None:
-        """Take it away, before something else is printed."""
+        """Remove the line before something else is printed."""
         if self._width:
             sys.stderr.write(f"\r{'':{self._width}}\r")
             sys.stderr.flush()
             self._width = 0
 
     async def run(self) -> None:
-        """Show it until cancelled."""
+        """Show the line until cancelled."""
         import asyncio
 
         loop = asyncio.get_running_loop()

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from smartcam.models import Localization, Result
 
 
-SIGNIFICANT_DIGITS = 6
+MAX_SIGNIFICANT_DIGITS = 6
 """Significant digits of the largest number in a column that people read."""
 
 SMALLEST, LARGEST = 1e-3, 1e6
@@ -46,7 +46,7 @@ def _column(values: Sequence[object]) -> list[str]:
     largest = max(map(abs, floats), default=0.0)
     if len(floats) < len(values) or not SMALLEST <= largest < LARGEST:
         return [_cell(value) for value in values]
-    decimals = max(0, SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest)))
+    decimals = max(0, MAX_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(largest)))
     if any(0 < abs(value) < 10**-decimals for value in floats):
         return [_cell(value) for value in values]  # one of them would be shown as nothing
     texts = [f"{value:.{decimals}f}" for value in floats]

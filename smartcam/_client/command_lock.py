@@ -198,7 +198,7 @@ class CommandLock:
     def leave(self, before: Before) -> asyncio.Task[None] | None:
         """Go back as soon as the turn is free; in the next session, and None, where there is none.
 
-        Whoever left first is done last: of several that are owed the outermost counts.
+        The block that is left first is done last: of several owed ways back the outermost counts.
         """
         if self._jobs is None or self._waits.end is not None:
             self._owe(before)
@@ -338,7 +338,8 @@ class CommandLock:
     async def _acquire(self) -> None:
         """Take the lock, but behind every job that goes back.
 
-        Who had the turn before may have left such a job behind while this command was in line.
+        The command that had the turn before may have left such a job behind while this command was
+        in line.
         """
         while True:
             await self.settle()

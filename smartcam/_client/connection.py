@@ -65,7 +65,7 @@ class Connection:
     Attributes:
         name: the camera's name.
         link: the last one, None before the first.
-        features: of its protocol.
+        features: features of its protocol.
     """
 
     name: str

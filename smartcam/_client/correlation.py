@@ -50,7 +50,7 @@ MAX_OWED = 1024
 
 
 class TriggerEvidence:
-    """Evidence that the camera took one trigger; this class is for cameras that give none.
+    """Evidence that the camera took one trigger; this class is for cameras that give no evidence.
 
     That is so over UDP, where statuses and their order may be lost, and where commands are done
     one after the other, so that an answer needs no proof (In-Sight).
@@ -209,7 +209,7 @@ class Match:
     Attributes:
         fate: ``triggered``: of the trigger under way; ``late`` or ``streamed``: of one that was
             given up; ``nobody``: of none of ours.
-        extra: of a trigger that has all its results.
+        extra: True for one more result of a trigger that has all its results.
     """
 
     fate: Literal["triggered", "late", "streamed", "nobody"]
@@ -337,7 +337,7 @@ class Correlation:
 
         Args:
             pending: the trigger.
-            fate: of what still comes.
+            fate: fate of the results that still come.
             unread: containers of it that came and could not be interpreted.
         """
         came = pending.came if pending.evidence.proven else 0  # they may be somebody else's

@@ -203,7 +203,7 @@ async def attempt(
         dialects: one, or several that begin a session alike.
         transport: TCP or UDP.
         progress: is told how far it came.
-        name: of the camera, for logs.
+        name: name of the camera, for logs.
         max_length: largest payload accepted, bytes.
         trace: called with every frame.
         disconnect_first: send Disconnect before Connect.
@@ -381,7 +381,7 @@ def _sharer(
     """Return the function that gives each step of an attempt its time, in a round until ``end``.
 
     Only the answer to Connect has to leave time for the dialects that are untried, this one
-    included: no link is none for any of them, and who answered speaks this one.
+    included: no link means that none of them answered, and who answered speaks this one.
     """
     loop = asyncio.get_running_loop()
 

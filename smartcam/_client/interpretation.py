@@ -98,8 +98,8 @@ class Interpretation:
 
     Raises:
         ConfigurationError: the specification is wrong (a layout text with the position), or the
-            calibration is none, or was made with y taken the other way, or cannot apply to what
-            the specification gives.
+            calibration is not valid, or was made with y taken the other way, or cannot apply to
+            what the specification gives.
     """
 
     def __init__(
@@ -372,7 +372,7 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
     """Return the calibration that was given.
 
     Raises:
-        ConfigurationError: it is none, or one that would mirror poses.
+        ConfigurationError: it is not valid, or one that would mirror poses.
     """
     method = getattr(given, "to_robot", None)
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):

@@ -64,14 +64,14 @@ Each step of another link waits for one turn of every link that is flooded.
 """
 
 PASSES = 4
-"""Times that the loop goes round before the next chunk, at most, where other links have it, too: as
-long as they, or whoever else is there, take more than a turn of it."""
+"""Most turns of the loop before the next chunk, where other links share the loop: as
+long as other tasks take longer than one turn."""
 
 links: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, int] = weakref.WeakKeyDictionary()
 """Number of links that are open on each loop."""
 
 MIN_FRAMES_PER_CHUNK = 4
-"""Frames of a chunk that are worth to be cut."""
+"""Fewest frames into which a chunk is cut."""
 
 FIRST_CHUNK = 64
 """Frames of a chunk as long as it is not known how long they take."""
@@ -90,7 +90,7 @@ class Chunk:
     Attributes:
         received_at: loop time when it came.
         events: what it gave, in order.
-        frames: in how many frames the events came; an event may be made of many (In-Sight).
+        frames: number of frames in which the events came; an event may be made of many (In-Sight).
         delivery: number of the delivery on its link, from 1.
     """
 

@@ -3,8 +3,8 @@
 The wire has no correlation: an answer is matched by its kind, at most one request of a kind is
 open, and one that was cancelled leaves an owed answer which the next request of that kind awaits
 first. An answer that never comes leaves the link untrustworthy, so it is given up. But not before
-``request_timeout`` is over (``switch_timeout`` of a switch): who asks may have as little time as he
-likes, and the link is not his alone.
+``request_timeout`` is over (``switch_timeout`` of a switch): one caller may have little time, and
+the link is not its alone.
 
 Every ``deadline`` is loop time. Whose command it is (one at a time) is the command lock's business.
 """
@@ -46,7 +46,7 @@ class Requests:
     _connection: Connection
     _waits: Waits
     _state: CameraState
-    # seconds that an answer may take, however short the deadline of who asks
+    # seconds that an answer may take, however short the caller's deadline is
     patience: float
     _switch_patience: float  # the same of the answer to a switch
 
@@ -184,7 +184,7 @@ class Requests:
     def expect(self, key: type[m.Message] | int, deadline: float) -> asyncio.Future[Answer]:
         """Register for the answer to a request that was just sent, awaited until ``deadline``.
 
-        It may come later: it is due when an answer of its kind has had its usual time, too.
+        It may come later: the link is given up only when ``request_timeout`` is over, too.
         """
         patience = self._switch_patience if key is m.SwitchAnswer else self.patience
         self._due[key] = max(deadline, asyncio.get_running_loop().time() + patience)

@@ -44,7 +44,7 @@ _TELLING = int(
 )  # a change of these may mean that the trigger under way has failed
 
 _CURRENT = {"triggered", "nobody"}
-"""Fates of what is not known to be an older trigger's."""
+"""Fates of containers that do not belong to an older trigger, as far as is known."""
 
 
 @dataclass(slots=True, eq=False)
@@ -59,8 +59,8 @@ class PendingTrigger(SentTrigger):
         triggered_at: time of the wall clock, UTC.
         application: id of the application that is believed to be active, None where any will do.
         results: results received so far.
-        unproven: containers that are its own if it turns out that the camera took it (whose fate is
-            ``triggered``), and what came behind them. They end with it.
+        unproven: containers that wait for proof that the camera took the trigger (those with the
+            fate ``triggered`` are its own then), and the containers behind them.
     """
 
     outcome: asyncio.Future[list[Result]]
@@ -73,7 +73,7 @@ class PendingTrigger(SentTrigger):
     unproven: list[_Unproven] = field(init=False, default_factory=list)
 
     def fail(self, error: Exception) -> None:
-        """Give its caller the reason why there are none."""
+        """End the trigger: its caller gets the error instead of results."""
         self.ended = True
         self.outcome.set_exception(error)
 
@@ -99,7 +99,9 @@ class Results:
         self.correlation: Correlation = Correlation(random.random())  # noqa: S311
         self.input_in_doubt: bool = False
         self._pending: PendingTrigger | None = None
-        self._numbering: Interpretation | None = None  # how to read numbers, once there are ours
+        self._numbering: Interpretation | None = (
+            None  # reads the numbers in results, once triggers had numbers
+        )
         self._warned_extra = self._warned_others = False
         self._lossy = False  # a message may come twice, or not
         self._timer = DeadlineTimer(lambda: self.give_up(TimeoutError()))
@@ -168,7 +170,7 @@ class Results:
             self._release(pending)
 
     def input_sent(self) -> None:
-        """Input data went out with the trigger, and nothing says that it was taken."""
+        """Note that input data went out with the trigger, and may not have been used."""
         self.input_in_doubt = True
 
     # ------------------------------------------------------------------ what comes
@@ -250,13 +252,13 @@ class Results:
             self._fail(pending, error)
 
     def _fail(self, pending: PendingTrigger, error: SmartCamError) -> None:
-        """End the trigger under way; nobody can tell whose what still comes is."""
+        """End the trigger under way; results that still come go to the streams."""
         self.correlation.give_up(pending, "streamed")
         pending.fail(error)
         self._release(pending)
 
     def _release(self, pending: PendingTrigger) -> None:
-        """Hand on what waited for the proof: as the trigger's, or if it has ended an older's."""
+        """Hand on the unproven containers: to the trigger, or as an older one's if it has ended."""
         unproven, pending.unproven = pending.unproven, []
         if not pending.ended:
             pending.came -= sum(fate == "triggered" for _, fate, *_ in unproven)
@@ -287,7 +289,7 @@ class Results:
     def only_streams(self) -> bool:
         """True if results go to streams, and to nobody else, whatever statuses come between.
 
-        None of it can be a trigger's or pay a debt, nor count as an extra result.
+        No result can then belong to a trigger, pay a debt, or count as an extra result.
         """
         correlation = self.correlation
         ours = self._pending or self._numbering or correlation.owed or correlation.satisfied
@@ -296,8 +298,8 @@ class Results:
     def _read_burst(self, burst: ResultBurst, at: datetime) -> list[Result] | None:
         """Return the results of a burst that is only streamed; None where one may be anything else.
 
-        A trigger or a single waiter may want one, a debt be paid, an observer look at each; and
-        what cannot be interpreted is an item of its own.
+        Otherwise a trigger or a single waiter may want one of them, one may pay a debt, an observer
+        may look at each, and one that cannot be interpreted is an item of its own.
         """
         application = burst.application
         if self._pending or self._numbering or self.correlation.owed:
@@ -372,7 +374,7 @@ class Results:
         now: float,
         at: datetime,
     ) -> None:
-        """Count a container and give what is in it to who listens."""
+        """Count a container, and give its result to the trigger and the listeners."""
         counters, listeners = self._counters, self._listeners
         current = fate in _CURRENT
         if owner is None:

@@ -122,8 +122,8 @@ class StatusRequests:
     async def demand(self, deadline: float) -> None:
         """Have the camera say its status, by Get status where there is that.
 
-        Elsewhere Connect brings one (SC manual p. 29, published). A Query goes first: who has lost
-        the session must not take it back by this.
+        Elsewhere Connect brings one (SC manual p. 29, published). A Query goes first: a client that
+        has lost the session must not take it back by this.
         """
         link = self._connection.require_link()
         if self._connection.features.polled:

@@ -438,7 +438,7 @@ class Supervisor:
         return min(FIRST_RETRY_DELAY_OF_TAKEN * 2.0**doubled, MAX_RETRY_DELAY_OF_TAKEN)
 
     def _tell(self) -> None:
-        """Wake who waits for a change of the connection."""
+        """Wake the tasks that wait for a change of the connection."""
         self._changed.set()
         self._changed = asyncio.Event()
 

@@ -69,7 +69,7 @@ OVERTRIGGERED_GRACE = 1.0
 """Seconds that a trigger waits for the Overtriggered of an earlier one to fall. While it is set it
 cannot tell that ours was dropped, so no trigger is sent."""
 
-WAITED_SHARE = 0.5
+MAX_SHARE_WITHOUT_WAIT = 0.5
 """Share of a trigger's timeout below which what is left shows that the trigger had to wait."""
 
 MIN_TIMEOUT_SHARE = 0.01
@@ -151,7 +151,7 @@ class Triggers:
                 took, or than a hundredth of the timeout.
         """
         left = deadline - asyncio.get_running_loop().time()
-        if left >= WAITED_SHARE * timeout:
+        if left >= MAX_SHARE_WITHOUT_WAIT * timeout:
             return
         quickest = self._quickest if self._quickest_of == self._state.active else 0.0
         needed = max(quickest, MIN_TIMEOUT_SHARE * timeout)

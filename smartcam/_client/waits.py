@@ -27,7 +27,7 @@ ErrorT = TypeVar("ErrorT", bound=SmartCamError)
 def told(error: ErrorT) -> ErrorT:
     """Return an error to raise where another one is kept.
 
-    What is raised refers to the frames of who is told, and by them to the client: kept by the
+    A raised error refers to the frames of its caller, and by them to the client: kept by the
     client's own task, it would keep a client alive that nobody has any more.
     """
     made = copy.copy(error)

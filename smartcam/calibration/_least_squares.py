@@ -37,7 +37,7 @@ RANK = 1e-14
 """Singular values of a matrix with a unit diagonal are rounding below this part of the largest."""
 
 
-LARGE = 60
+MAX_UNKNOWNS_BY_SVD = 60
 """Unknowns, beyond which singular values cost too much time to be looked at first."""
 
 
@@ -167,7 +167,7 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
     scale = unit_diagonal(matrix)
     by_row = scale.reshape(-1, *[1] * (right.ndim - 1))
     scaled = matrix / np.outer(scale, scale)
-    if len(matrix) > LARGE:
+    if len(matrix) > MAX_UNKNOWNS_BY_SVD:
         with contextlib.suppress(np.linalg.LinAlgError):
             return np.asarray(np.linalg.solve(scaled, right / by_row) / by_row, dtype=np.float64)
     solution: Array = np.linalg.lstsq(scaled, right / by_row, rcond=RANK)[0] / by_row

@@ -106,8 +106,8 @@ class Charuco:
         square: side of a square, metres.
         marker: side of a marker, metres, less than ``square``.
         dictionary: name of one of OpenCV's, such as ``DICT_5X5_250``.
-        legacy_pattern: as OpenCV before 4.6 prints an even number of rows: a white square at the
-            upper left, where a black one is.
+        legacy_pattern: True to print as OpenCV before 4.6 prints an even number of rows: a white
+            square at the upper left, where a black one is.
     """
 
     kind: ClassVar[str] = "charuco"

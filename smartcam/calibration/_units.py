@@ -52,7 +52,7 @@ def no_unit(what: str) -> CalibrationError:
 
 
 def check_length(metres: float, what: str) -> None:
-    """Raise (UNIT_UNKNOWN) where a length in metres is none that a robot's cell has."""
+    """Raise (UNIT_UNKNOWN) where a length in metres is not one that a robot's cell has."""
     if metres > MAX_UNASKED_M:
         raise Code.UNIT_UNKNOWN.refusal(
             f"{what}: expected at most {MAX_UNASKED_M:g} m, got {metres:g} m; is it in "

@@ -1,8 +1,8 @@
 """Verdicts on what came out: whether it is good, for how many millimetres, and what to do next.
 
 "Good" takes three things: nothing is wrong that has a cure, points that were left out tell the
-error, and twice that error is within what the user allows, or without a word of theirs within
-:data:`PART` of the field. Whoever loads a calibration that is not good is told so in the log.
+error, and twice that error is within what the user allows; the default is :data:`MAX_ERROR_PART`
+of the field. The log warns whoever loads a calibration that is not good.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-PART: Final = 0.01
+MAX_ERROR_PART: Final = 0.01
 """Largest error that is allowed where the user does not say, as a part of the field."""
 
 _WITHIN: Final = 2.0
@@ -49,14 +49,15 @@ class Allowed(NamedTuple):
     @classmethod
     def of(cls, error: float | None, field: float) -> Allowed:
         """Return the allowed error: the user's, or a part of the ``field``, both in metres."""
-        return cls(1e3 * (PART * field if error is None else error), error is not None)
+        return cls(1e3 * (MAX_ERROR_PART * field if error is None else error), error is not None)
 
     @property
     def text(self) -> str:
         """The error that is allowed, and who said so, in words."""
         if self.said:
             return f"{self.error:.3g} mm are allowed"
-        return f"{self.error:.3g} mm are allowed, {100 * PART:g} % of the field, as nobody said"
+        share = f"{100 * MAX_ERROR_PART:g} % of the field"
+        return f"{self.error:.3g} mm are allowed, {share}, as nobody said"
 
 
 _LOOK: Final = ("see the warning", "more")

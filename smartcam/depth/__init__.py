@@ -1,7 +1,7 @@
 """Depth: from two cameras to metres, clouds, and what is done to them.
 
 Distances are metres, in the frame of the left camera after rectification: x right, y down, z ahead.
-A depth of 0 is none. The extra ``depth`` brings OpenCV and small-gicp.
+A depth of 0 means that there is no depth. The extra ``depth`` brings OpenCV and small-gicp.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ MILLIMETRE: Final = 1e-3
 MAX_PASSES: Final = 16
 """Iterations, and pixels that holes are filled over: 8 times as many are still a few seconds."""
 
-SCENE: Final = 0.5
+MIN_NEW_SCENE_SHARE: Final = 0.5
 """Share of the pixels that must change by more than an edge for a new scene."""
 
 
@@ -36,7 +36,8 @@ def as_metres(depth: NDArray[Any], scale: float = MILLIMETRE) -> NDArray[np.floa
 
     Args:
         depth: (H, W): uint16 in steps of ``scale``, or float of any width in metres (or whatever
-            else: disparities are passed on as they are). 0, negative and not finite ones are none.
+            else: disparities are passed on as they are). 0, negative and not finite values stand
+                for no disparity.
         scale: metres of a step of uint16.
 
     Returns:
@@ -144,7 +145,7 @@ class TemporalFilter:
     """Averages the depth maps of a camera that stands still, each pixel for itself.
 
     A pixel that differs from its average by ``delta`` or more begins anew: something moved, or an
-    edge went over it. Where half of the picture does so, or maps of another size come, all of it
+    edge went over it. Where half of the picture jumps, or maps of another size come, all of it
     begins anew. A hole takes no part, and for ``persistence`` maps it shows the average that was
     there before, unless a pixel beside it begins anew.
 
@@ -188,7 +189,7 @@ class TemporalFilter:
         both = there & (average > 0)
         step = new - average
         changed = both & (np.abs(step) >= self.delta)
-        if np.count_nonzero(changed) > SCENE * np.count_nonzero(both):
+        if np.count_nonzero(changed) > MIN_NEW_SCENE_SHARE * np.count_nonzero(both):
             return self._begin(new)
         kept = both & ~changed
         np.add(average, np.float32(self.alpha) * step, out=average, where=kept)

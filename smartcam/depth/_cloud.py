@@ -79,7 +79,7 @@ class Cloud:
         """Return the points of a depth picture, row by row, in the camera's frame.
 
         Args:
-            depth: (H, W) metres along the optical axis; 0 is none, and gives no point.
+            depth: (H, W) metres along the optical axis; 0 means no depth, and gives no point.
             matrix: (3, 3), of a camera without distortion, in pixels; the centre of the first
                 pixel is (0, 0).
             colours: (H, W, 3) uint8, red, green, blue; or (H, W) uint8, grey.

@@ -25,7 +25,7 @@ MOST: Final = {"hue": 179, "saturation": 255, "value": 255}
 HUE_UNITS: Final = 180
 """Hues on the circle of colours in OpenCV's units, two degrees each."""
 
-DULL: Final = 40
+MIN_COLOURFUL: Final = 40
 """Saturation or value below which a hue is nothing but noise."""
 
 
@@ -35,8 +35,8 @@ class ColourRange:
 
     Attributes:
         hue: from, to, each 0 to 179: half degrees on the circle of colours: 0 red, 30 yellow, 60
-            green, 90 cyan, 120 blue, 150 magenta. From more than to goes over 179: ``(170, 10)``
-            is red.
+            green, 90 cyan, 120 blue, 150 magenta. A first hue above the second goes over 179:
+            ``(170, 10)`` is red.
         saturation: from, to, each 0 (grey) to 255.
         value: from, to, each 0 (black) to 255: the largest of red, green and blue.
 
@@ -49,7 +49,7 @@ class ColourRange:
     value: tuple[int, int] = (0, 255)
 
     def __post_init__(self) -> None:
-        """Check it."""
+        """Check the limits."""
         for name, most in MOST.items():
             given: Any = getattr(self, name)
             try:
@@ -118,7 +118,7 @@ class ColourRange:
         return around_hsv(hsv(picture), x, y, radius, margin)
 
     def as_json(self) -> str:
-        """Return it as JSON, of which ``ColourRange(**json.loads(text))`` makes it again."""
+        """Return the range as JSON, of which ``ColourRange(**json.loads(text))`` makes it again."""
         return json.dumps(asdict(self))
 
 
@@ -148,9 +148,9 @@ def around_hsv(picture: NDArray[np.uint8], x: int, y: int, radius: int, margin: 
     near = picture[max(0, y - radius) : y + radius + 1, max(0, x - radius) : x + radius + 1]
     hues, saturations, values = near.reshape(-1, 3).astype(int).T
     saturation, value = _spread(saturations, margin), _spread(values, margin)
-    if np.median(values) < DULL:
+    if np.median(values) < MIN_COLOURFUL:
         return ColourRange(value=(0, value[1]))
-    if np.median(saturations) < DULL:
+    if np.median(saturations) < MIN_COLOURFUL:
         return ColourRange(saturation=(0, saturation[1]), value=value)
     # the hues as seen from their middle, so that red is no two colours
     middle = round(np.angle(np.exp(2j * np.pi * hues / HUE_UNITS).sum()) * HUE_UNITS / (2 * np.pi))
@@ -226,7 +226,7 @@ def find_regions(
         ratio: least and largest ratio of the longer to the shorter side.
         fullness: least part of its rectangle that a region fills, 0 to 1.
         whole: whether one that touches the picture's rim is not wanted: it may be cut off.
-        most: so many of them, the largest.
+        most: number of regions at most; the largest are returned.
 
     Raises:
         ConfigurationError: a range that holds nothing.

@@ -31,7 +31,7 @@ def pass_through(cloud: Cloud, axis: str, low: float = -math.inf, high: float = 
     """Return the points with ``low <= coordinate <= high``, in metres.
 
     Raises:
-        ConfigurationError: the axis is none of x, y, z, or the range is none.
+        ConfigurationError: the axis is none of x, y, z, or the range is not valid.
     """
     if axis not in AXES or len(axis) != 1:
         raise ConfigurationError(f"pass_through: expected x, y or z, got {shown(axis)}")
@@ -61,7 +61,7 @@ def crop_box(cloud: Cloud, low: Sequence[float], high: Sequence[float]) -> Cloud
 
 def _as_points_are(ends: ArrayLike) -> NDArray[np.float32]:
     """Return ends as float32, as points are: 0.1 includes a point that was made of 0.1."""
-    with np.errstate(over="ignore"):  # an end beyond its range is none
+    with np.errstate(over="ignore"):  # an end beyond its range is no limit
         return np.asarray(ends, np.float64).astype(np.float32)
 
 

@@ -75,7 +75,7 @@ class _WordParameter(NamedTuple):
 
     @property
     def default(self) -> str:
-        """Of what nobody said."""
+        """Value that is used where the user gives none."""
         return self.words[0]
 
     def __str__(self) -> str:
@@ -128,7 +128,8 @@ class StereoMatcher:
         disparity.pixels, disparity.sigma
 
     OpenCV's matcher looks from left to right and from right to left; what the two do not agree on
-    is none, as is a speckle. It is then refined by least squares in a window, which also tells its
+    does not count, nor does a speckle. It is then refined by least squares in a window, which also
+    tells its
     sigma: see :attr:`Disparity.sigma` and ``docs/depth.md``. Points near the left border are found,
     too, which OpenCV alone leaves out. Colours are made grey.
 
@@ -139,9 +140,9 @@ class StereoMatcher:
             are OpenCV's sixteenths.
         wls: lambda and sigma of OpenCV's weighted least squares filter, such as (8000, 1.5), which
             makes them smooth between edges and fills holes; None: without.
-        parameters: of OpenCV's matcher, by its names with underscores: ``num_disparities``,
-            ``block_size``, ``P1``, ``uniqueness_ratio``, ``mode="hh"``. ``P1`` and ``P2`` of 0 are
-            8 and 32 times ``block_size`` squared.
+        parameters: parameters of OpenCV's matcher, by its names with underscores:
+            ``num_disparities``, ``block_size``, ``P1``, ``uniqueness_ratio``, ``mode="hh"``. ``P1``
+            and ``P2`` of 0 are 8 and 32 times ``block_size`` squared.
 
     Raises:
         ConfigurationError: no such algorithm, parameter or value; the text lists what there is.
@@ -289,7 +290,8 @@ def _disagreement(
 ) -> NDArray[np.float32]:
     """Return by how much a disparity differs from that of its point in the right picture.
 
-    Sixteenths; infinite where either is none, or the point is outside of the right picture.
+    Sixteenths; infinite where either has no disparity, or the point is outside of the right
+    picture.
     """
     width = there.shape[1]
     column = np.arange(width, dtype=np.int32)[None] - ((there.astype(np.int32) + 8) >> 4)

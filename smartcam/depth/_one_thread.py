@@ -31,7 +31,7 @@ class OneThread:
             await asyncio.wait([self._running])
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Have the thread do something; who is idle first is first.
+        """Have the thread do something, in the order of the calls.
 
         Raises LocalProtocolError: it is closed.
         """

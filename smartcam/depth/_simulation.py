@@ -36,7 +36,7 @@ CAMERA_SIGMA: Final = 2e-4
 GRIP: Final = 5e-3
 """Metres by which the gripper may miss a block and still take it."""
 
-ROOM: Final = 0.01
+MIN_GAP_METRES: Final = 0.01
 """Metres between things on the table at least, for a gripper and for the eye."""
 
 GREY_SIGMA: Final = 3.0
@@ -111,11 +111,11 @@ class TowerTable:
     """The table, what lies on it, and the robot that takes it.
 
     Args:
-        seed: of all noise, and of how far the camera is beside where the robot thinks it is.
+        seed: seed of all noise, and of how far the camera is beside where the robot thinks it is.
 
     Attributes:
         blocks: what lies there; who builds knows nothing of it.
-        random: for all noise.
+        random: generator of all noise.
         held: what the gripper has.
     """
 
@@ -336,7 +336,7 @@ def _anywhere(table: TowerTable, colour: str, size: tuple[float, float, float]) 
             for one in table.blocks
         )
         beside = math.hypot(x - tower.x, y - tower.y)
-        if apart > ROOM and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:
+        if apart > MIN_GAP_METRES and beside > 0.13 and 0.2 < math.hypot(x, y) < 0.47:
             angle = table.random.uniform(-math.pi / 2, math.pi / 2)
             return WoodenBlock(x, y, angle, colour=colour, size=size)
     raise ValueError("the table is full")

@@ -70,11 +70,11 @@ class StereoStatistics:
     """The counts of a pair's frames, and the difference of its clocks.
 
     Attributes:
-        group: of the frames' pairing; its ``skew`` is the largest.
+        group: statistics of the frames' pairing; its ``skew`` is the largest.
         skew: seconds by which the right frames are later: the median of the last pairs; None: no
             pair came yet.
-        drift: by how much the right camera's clock is faster than the left one's, seconds a second;
-            None: not known yet.
+        drift: rate by which the right camera's clock is faster than the left one's, seconds a
+            second; None: not known yet.
         drift_from: ``clocks``: of what the cameras' own clocks said; ``frames``: they have none,
             and it is by how much the right one gives more frames of the same nominal rate; "".
     """
@@ -103,7 +103,7 @@ class StereoDepth:
         left: the left camera, as ``smartcam.frames.open`` or ``camera.frames()`` gives it, not
             open; it belongs to this object from now on.
         right: the right one.
-        calibration: of the pair: ours, that of :func:`read_camera_infos`, or of
+        calibration: calibration of the pair: ours, that of :func:`read_camera_infos`, or of
             ``smartcam.calibration.formats.read_cameras`` with two cameras.
         matcher: None: ``sgbm`` for disparities up to a fifth of the width.
         size: width and height of the rectified pictures, pixels; None: as the left one was
@@ -116,7 +116,7 @@ class StereoDepth:
         timeout: seconds that an iteration waits for a pair; None: as long as it takes.
 
     Raises:
-        ConfigurationError: a value that is none, or no calibration of two cameras.
+        ConfigurationError: a value that is not valid, or no calibration of two cameras.
     """
 
     @takes(size=or_none(a_list), alpha=a_number, colour=check_flag, focal_sigma=a_number)

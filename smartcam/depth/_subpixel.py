@@ -34,7 +34,7 @@ HOLE_MARGIN_PX: Final = 2
 MIN_VARIANCE: Final = 1 / 6
 """Least variance of the difference of two pictures, whose grey levels are whole numbers."""
 
-OUTLIER_SIGMAS: Final = 4.0
+MAX_INLIER_SIGMAS: Final = 4.0
 """Standard deviations of a pixel's noise above which its difference does not count."""
 
 MIDDLE_GREY: Final = 128
@@ -187,7 +187,7 @@ class _Refined(NamedTuple):
 
 def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
     """Return the equations without pixels of another surface, whose disparity is far off."""
-    fits = np.abs(linear.e - fit.expected) <= OUTLIER_SIGMAS * np.sqrt(fit.variance)
+    fits = np.abs(linear.e - fit.expected) <= MAX_INLIER_SIGMAS * np.sqrt(fit.variance)
     return _LinearMatch(*(one * fits for one in linear))
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 ROWS: Final = 1 << 15
 """Points at a time; each has its neighbours in memory."""
 
-SIGNIFICANT: Final = 12.0
+MIN_INFORMATION_FACTOR: Final = 12.0
 """Factor by which a direction's information must exceed that from noise of the normals alone.
 
 Along what planes, edges and corridors leave open it is 0.8 to 1.4, whatever the noise; along what
@@ -88,7 +88,7 @@ def open_directions(arms: Array, planes: SurfacePlanes) -> Array:
     # What rounds float32 is noise, too: a flat cloud without any has no tilts.
     noise += 1e-7 * np.trace(information) * np.eye(6)
     ratios, steps = load("scipy.linalg").eigh(information, noise)
-    basis, _ = np.linalg.qr(steps[:, ratios < SIGNIFICANT])
+    basis, _ = np.linalg.qr(steps[:, ratios < MIN_INFORMATION_FACTOR])
     # Any mixture of open steps is open: turns are told first, and shifts as what has no turn.
     apart, _, _ = np.linalg.svd(basis.T[:, :3])
     found: Array = (apart.T @ basis.T) / np.array([reach] * 3 + [1.0] * 3)

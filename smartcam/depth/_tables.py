@@ -27,7 +27,7 @@ WORDS: Final = 1 << 18
 
 
 class BadTableError(Exception):
-    """Bytes are not what they should be; who knows the file's name says so to its user."""
+    """Error for bytes that do not fit; the caller, which knows the file's name, translates it."""
 
     def __init__(self, expected: str, came: str) -> None:
         super().__init__(f"expected {expected}, got {came}")

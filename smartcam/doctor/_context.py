@@ -136,7 +136,7 @@ class FrameObserver(Observer):
     _trace: Callable[[TraceEntry], None]
 
     def on_frame(self, entry: TraceEntry) -> None:
-        """Give it."""
+        """Pass the frame on."""
         self._trace(entry)
 
 
@@ -256,7 +256,7 @@ class Examination:
     def make_camera(self) -> Camera:
         """Return a client that takes the camera once and never takes it back.
 
-        Raises ConfigurationError: a time-out is none.
+        Raises ConfigurationError: a time-out is not valid.
         """
         asked = self.options
         options: CameraOptions = {

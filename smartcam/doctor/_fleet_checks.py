@@ -51,7 +51,7 @@ def address_of(url: str) -> Address:
     """Return the address of a camera of a fleet.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is not valid.
     """
     address = FleetAddress.parse(url)
     if not address.camera:
@@ -194,7 +194,7 @@ async def find(exam: Examination) -> None:
 
 
 async def _cameras(exam: Examination, address: FleetAddress) -> list[tuple[str, str, str]]:
-    """Return fleet, agent and name of all cameras; that who has just come is there, too."""
+    """Return fleet, agent and name of all cameras; cameras that have just come are there, too."""
     bus, loop = exam.bus, asyncio.get_running_loop()
     if bus is None:
         raise LookupError("there is no bus; what uses it comes behind what reaches it")

@@ -75,7 +75,7 @@ class FoundPort:
 
 
 def tcp_protocols() -> dict[str, Protocol]:
-    """Return the protocols that go over TCP, by name; one that cannot be loaded is none."""
+    """Return the protocols that go over TCP, by name; one that cannot be loaded is left out."""
     found: dict[str, Protocol] = {}
     for info in PROTOCOLS.available():
         try:

@@ -422,7 +422,7 @@ class _StreamSeen:
 
 
 async def _stream(exam: _GigEExamination) -> None:
-    """Have it stream as the URL says, and count."""
+    """Have the camera stream as the URL says, and count."""
     try:
         seen = await _watch(exam)
     except FrameTimeoutError as exc:

@@ -23,7 +23,7 @@ _NAME = re.compile(r"(?=.*[A-Za-z])\w(?:[\w.-]{0,251}\w)?", re.ASCII)
 _NO_HOST = tuple(
     ipaddress.ip_network(one) for one in ("0.0.0.0/8", "224.0.0.0/3", "::/128", "ff00::/8")
 )
-"""Addresses that no host has: of nobody, of groups, of all."""
+"""Addresses that no host has: unspecified, multicast and broadcast ones."""
 
 EXPECTED = (
     "expected a network such as 192.168.0.0/24, a range such as 192.168.0.10-20, an address, or a "
@@ -95,7 +95,7 @@ class AddressSet:
         return same and first.number <= address.number <= last.number
 
     def without(self, others: AddressSet) -> AddressSet:
-        """Return those that are not in another set."""
+        """Return the addresses that are not in another set."""
         left: list[Span] = []
         for first, last in self._spans:
             for away in others._spans:
@@ -126,7 +126,7 @@ def read_span(text: str, *, whole: bool = False) -> Span | None:
     be in a larger one.
 
     Raises:
-        ConfigurationError: it means none, or no host's, or an IPv6 network that is too large.
+        ConfigurationError: it means no address, or no host's, or an IPv6 network that is too large.
     """
     text = text.strip()
     span = _read(text, whole=whole)
@@ -191,7 +191,7 @@ def _address(text: str) -> HostAddress | None:
 
 
 def _hosts(network: ipaddress.IPv4Network | ipaddress.IPv6Network, *, whole: bool) -> Span:
-    """Return a network's hosts: of IPv4 neither its own address nor the one of all."""
+    """Return a network's hosts: of IPv4 without the network's own and its broadcast address."""
     first, last = int(network.network_address), int(network.broadcast_address)
     if network.version == 4 and last - first > 1 and not whole:
         first, last = first + 1, last - 1

@@ -44,8 +44,8 @@ class Application(EmulatorData):
 
     model_config: ClassVar[ConfigDict] = ConfigDict(arbitrary_types_allowed=True)
 
-    id: int = Field(ge=1, le=0xFFFFFFFF, description="what clients switch to; 0 is not allowed")
-    name: str = Field(default="", max_length=200, description="for people")
+    id: int = Field(ge=1, le=0xFFFFFFFF, description="clients switch to this number; not 0")
+    name: str = Field(default="", max_length=200, description="name that people see")
     layout: _LayoutText | None = Field(default=None, description="layout of the result container")
     rate: float | None = Field(
         default=None,
@@ -124,7 +124,7 @@ class Application(EmulatorData):
             turn: runs of this application before this one, since it was loaded.
             time: seconds since the device was made.
             scene: what the camera looks at.
-            values: of the input container.
+            values: values of the input container.
             byte_order: order of the bytes of a number.
 
         Raises:

@@ -89,8 +89,8 @@ class EmulatedCamera(WireCamera):
         quirks: what is not known of real cameras: :class:`Quirks` or a mapping of its fields.
         name: name of the camera in logs.
         active: id of the application that is loaded at first; default the first given, else 1.
-        running: in run mode from the beginning.
-        seed: of all that is left to chance, the scene's noise and the timeline; default 0.
+        running: True for run mode from the beginning.
+        seed: seed of all that is left to chance, the scene's noise and the timeline; default 0.
         builtins: have the built-in applications.
         faults: exact misbehaviour, in order: faults of :mod:`smartcam.emulator.faults`, or mappings
             of their fields with ``kind``. Those that wait for no message happen when it starts.
@@ -99,10 +99,10 @@ class EmulatedCamera(WireCamera):
             They come behind the scenario's.
 
     Attributes:
-        host: as given.
-        transport: as given.
-        dialect: as given.
-        name: as given.
+        host: host that was given.
+        transport: transport that was given.
+        dialect: dialect that was given.
+        name: name that was given.
         scenario: what all that was given comes to.
         clock: clock that the camera runs by.
         device: the camera behind the wire. Its operator's methods (``trigger()``,

@@ -36,7 +36,7 @@ _log = logging.getLogger("smartcam.emulator")
 
 MAX_INPUT = 1 << 16
 """Bytes of payload the camera takes: input data has the container's limit of about 64 kB (HALCON
-script manual p. 35, published for that side)."""
+script manual p. 35, published for the other direction)."""
 
 _ENDED = "connection ended"
 _UNSENT = "not sent"
@@ -116,7 +116,7 @@ class LinkOwner(Protocol):
         ...
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        """Note a frame that a machine saw, or bytes that make none."""
+        """Note a frame that a machine saw, or bytes that make no frame."""
         ...
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:

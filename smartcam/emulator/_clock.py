@@ -71,7 +71,7 @@ class OneTimer:
         self._when: int | None = None
 
     def set(self, when: int | None) -> None:
-        """Set it to an instant, nanoseconds; None: not at all."""
+        """Set the timer to an instant, nanoseconds; None: not at all."""
         if when == self._when:
             return
         if self._handle is not None:

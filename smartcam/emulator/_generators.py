@@ -64,15 +64,15 @@ def wrap_number(field: Field, number: int) -> int:
     return (number - low) % (high - low + 1) + low
 
 
-_FOUND: dict[str, Generator] = {}  # those that were used: a run asks for its generator each time
+_FOUND: dict[str, Generator] = {}  # generators in use, since each run looks up its own
 
 
 def find_generator(name: str) -> Generator:
     """Return the generator of that name.
 
     Raises:
-        ConfigurationError: there is none; the text names those there are.
-        PluginError: a plug-in's failed to load, or is no function.
+        ConfigurationError: no generator has this name; the text lists the known names.
+        PluginError: a plug-in's generator failed to load, or is no function.
     """
     found = _FOUND.get(name)
     if found is not None:

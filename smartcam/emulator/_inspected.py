@@ -68,7 +68,7 @@ class InspectedApplication(Application):
     load_time: Seconds = Field(
         default=0.01, description="seconds that a switch to it takes, in which it is BUSY"
     )
-    inspector: Inspector = Field(description="what inspects the pictures")
+    inspector: Inspector = Field(description="the program that inspects the pictures")
 
     @property
     def period(self) -> int | None:

@@ -147,7 +147,7 @@ class LineCamera(WireCamera):
     has one line under way; the next ones wait. Everything is called in the event loop's thread.
 
     Args:
-        host: address to listen on; nothing but this.
+        host: address to listen on, without a scheme or a port.
         port: port to listen on, 0 for a free one.
         name: name of the camera in logs.
         clock: clock that the camera runs by; a :class:`ManualClock` in tests. Default: real time.
@@ -226,7 +226,7 @@ class LineCamera(WireCamera):
         clock: Clock | None = None,
         seed: int | None = None,
     ) -> Self:
-        """Return a camera of a scenario; what is given beside it goes before it.
+        """Return a camera of a scenario; arguments win over the scenario's fields.
 
         Raises:
             ConfigurationError: something given is wrong, or nothing that such a camera takes.
@@ -292,7 +292,7 @@ class LineCamera(WireCamera):
         """Return the lines it speaks: those of its protocol's first dialect.
 
         Raises:
-            ConfigurationError: that is none of lines.
+            ConfigurationError: that protocol does not speak in lines.
         """
         dialect = next(iter(self.protocol.dialects.values()))
         if not isinstance(dialect, LineDialect):

@@ -54,8 +54,8 @@ class LineCodec:
         line_end: what the camera ends its lines with.
         ends: what ends a client's line.
         max_line: bytes of a client's line, its end not counted.
-        encoding: of characters.
-        split: splits an answer into what it is known by and the text that rows read.
+        encoding: encoding of characters.
+        split: function that splits an answer into its word or ticket and the text that rows read.
     """
 
     def __init__(

@@ -94,7 +94,7 @@ class _TcpLink(ClientLink, asyncio.BufferedProtocol):
             self.heard()
 
     def eof_received(self) -> bool:
-        """Note that the client has closed its side, which waits behind what faults hold back."""
+        """Note that the client has closed its side; bytes that faults hold back are read before."""
         self._end_waits = self._faulty is not None and self._faulty.unheard
         return self._end_waits
 
@@ -212,7 +212,7 @@ class TcpListener(Listener):
     def __init__(self, owner: LinkOwner) -> None:
         super().__init__(owner)
         self.down: bool = True
-        """True if connections that were accepted before are too late."""
+        """True while the camera is down: connections that are still accepted are closed."""
         self._acceptor: Acceptor[ClientLink] = Acceptor(
             lambda: _TcpLink(self, self._owner),
             self.places,
@@ -252,12 +252,12 @@ class TcpListener(Listener):
         self._acceptor.leave(link)
 
     def unseated(self, link: _TcpLink) -> None:
-        """Take that a client has given the session back: it is the last to make room."""
+        """Note that a client has given its session back; it is the last to be closed for room."""
         self._acceptor.move_back(link)
         self._acceptor.expect(link, HANDSHAKE_TIMEOUT, "no session")
 
     def keep(self, link: _TcpLink) -> None:
-        """Have no time limit for a connection that a fault lets hang."""
+        """Lift the time limit of a connection that a fault keeps silent."""
         self._acceptor.expect(link, None, "")
 
 
@@ -351,7 +351,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             transport.abort()
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Pass it to the link of its address; too many links drop the one silent for longest."""
+        """Pass a datagram to its address' link; of too many links drop the longest silent one."""
         if self._transport is None:
             return  # the port is shut, the loop had this one already
         now = asyncio.get_running_loop().time()
@@ -373,7 +373,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
             self.places.leave(link)
 
     def error_received(self, exc: Exception) -> None:
-        """Nobody reads the answers at a peer any more; the camera does not notice."""
+        """Log that a peer is gone; the camera does not notice."""
         _log.debug("! datagram not delivered: %s", exc)
 
     def send(self, frame: bytes, address: Any) -> bool:

@@ -35,7 +35,7 @@ class Port:
         self._handing_over = False  # the loop may be about to watch the socket
 
     async def open(self) -> None:
-        """Open it for the first time.
+        """Open the port for the first time.
 
         Raises:
             OSError, ValueError, OverflowError: it cannot be had.
@@ -52,7 +52,7 @@ class Port:
             raise
 
     def reopen(self) -> None:
-        """Open it again: now if possible, else as soon as it can be had."""
+        """Open the port again: now if possible, else as soon as it can be had."""
         try:
             self._socket = self._bind()
         except OSError:
@@ -62,13 +62,13 @@ class Port:
         )
 
     def close(self) -> None:
-        """Close it; links stay."""
+        """Close the port; links stay."""
         self._stop_opening()
         self._listener.close_port()
         self._close_socket()
 
     def shut(self) -> None:
-        """Close it and every link."""
+        """Close the port and every link."""
         self._stop_opening()
         self._listener.shut()
         self._close_socket()

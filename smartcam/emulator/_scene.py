@@ -54,7 +54,7 @@ _ARM = 0.02
 
 
 MAX_PIXELS = 1e9
-"""Pixels that a scale, an offset and noise may have at most, as a number that is none is found."""
+"""Largest scale, offset and noise, in pixels; more is refused, as NaN and infinity are."""
 
 
 class TableScene:
@@ -65,7 +65,7 @@ class TableScene:
         offset: pixel where the table's origin is seen.
         rotation: radians, of the image against the table.
         pixel_noise: standard deviation of u and v, pixels.
-        seed: of the noise; the same seed gives the same observations.
+        seed: seed of the noise; the same seed gives the same observations.
         y_down: v counts downwards, as in image files.
 
     Raises:

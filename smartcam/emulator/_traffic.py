@@ -41,13 +41,13 @@ Direction = Literal["in", "out"]
 
 
 class LogEntry(NamedTuple):
-    """One frame, or bytes that make none.
+    """One frame, or bytes that make no frame.
 
     Attributes:
-        time: of the emulator's clock, seconds.
+        time: time of the emulator's clock, seconds.
         direction: ``in`` from a client, ``out`` to it.
         peer: address and port of the client.
-        message_id: id of the frame, None for bytes that make none.
+        message_id: id of the frame, None for bytes that make no frame.
         message: what the frame says; None for an unknown id, a body that does not fit, and bytes
             that make no frame.
         hex: the frame's payload, or the first bytes that make no frame.
@@ -107,7 +107,7 @@ class Log(Sequence[LogEntry]):
     counts as full does not depend on it.
 
     Args:
-        dialect: in which frames are decoded.
+        dialect: dialect in which frames are decoded.
         maxlen: entries kept.
         max_bytes: what they hold at most; the last one is kept however large it is.
 
@@ -266,7 +266,7 @@ class TrafficLog:
         fault: str | None = None,
         wire: bytes | None = None,
     ) -> None:
-        """Keep a frame, bytes that make none, or why they are ignored; see :class:`LogEntry`."""
+        """Keep a frame, bytes that make no frame, or why they are ignored (:class:`LogEntry`)."""
         if isinstance(what, RemoteProtocolError):
             # not kept itself: it holds on to the place where it was raised
             data, error = what.data.hex(" "), str(what)

@@ -513,7 +513,7 @@ class WireCamera(Server):
         self._traffic.visits.append(Visit(self.clock.now, link.peer, by, reset))
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
-        """Note a frame that a machine saw, or bytes that make none."""
+        """Note a frame that a machine saw, or bytes that make no frame."""
         self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
         if _log.isEnabledFor(logging.DEBUG):
             self._show_last()

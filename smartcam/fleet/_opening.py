@@ -1,4 +1,4 @@
-"""From a fleet's address or file to what is used: a fleet, an agent, a camera."""
+"""Make a fleet, an agent or a camera from a fleet's address or file."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def open(
 SESSIONS_OWN = frozenset(
     {"connect_attempts", "close_timeout", "liveness_timeout", "restore", "max_length"}
 )
-"""Options of the session with the camera, which is the agent's."""
+"""Options of the session with the camera: the agent has it, and its file says them."""
 
 
 def fleet_camera(

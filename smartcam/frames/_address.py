@@ -21,7 +21,7 @@ class FrameAddress:
     """The URL of a source of frames, taken apart.
 
     Attributes:
-        url: as it was given.
+        url: URL as it was given.
         scheme: part of the URL before ``://``, in small letters; ``file`` for a bare path.
         host: name or address, "" where the URL has none.
         port: port; None: the scheme's own.
@@ -47,7 +47,7 @@ class FrameAddress:
         """Read a URL, or the path of a file.
 
         Raises:
-            ConfigurationError: it is none.
+            ConfigurationError: it is not valid.
         """
         given = check_text(fspath_of(url), "frame source").strip()
         if not given:
@@ -117,7 +117,7 @@ class FrameAddress:
         """Return a parameter's number.
 
         Raises:
-            ConfigurationError: it is none, or not from ``least`` to ``most``.
+            ConfigurationError: it is not valid, or not from ``least`` to ``most``.
         """
         try:
             value = float(text)

@@ -15,7 +15,7 @@ PIECE_DURATION: Final = 0.5
 MIN_EARLY_JUMP_SECONDS: Final = 0.05
 """Seconds by which a frame must come sooner than the clock allows for a jump of the clock."""
 
-SETTLED: Final = 4
+MIN_SURE_INTERVALS: Final = 4
 """Intervals after which such a jump is sure: before, all frames may have been late."""
 
 MIN_DRIFT_DURATION: Final = 4.0
@@ -97,7 +97,7 @@ class DeviceClock:
         late = arrival - device - self._offset(device)
         if self._before_queue is not None:  # frames come without waiting again
             late = max(late, arrival - device - self._before_queue)
-        return late < -MIN_EARLY_JUMP_SECONDS and len(self._lowest) >= SETTLED
+        return late < -MIN_EARLY_JUMP_SECONDS and len(self._lowest) >= MIN_SURE_INTERVALS
 
     def _remember(self, device: float, offset: float) -> None:
         if not self._lowest or device - self._piece_began >= PIECE_DURATION:

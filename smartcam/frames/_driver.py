@@ -24,7 +24,7 @@ class StreamFormat(NamedTuple):
     """The format and size that a source streams, or could.
 
     Attributes:
-        format: of the pixels.
+        format: format of the pixels.
         width: pixels.
         height: pixels.
         rates: frames a second that it can do, the first is the fastest; empty: it does not say.
@@ -47,7 +47,7 @@ class FoundSource:
 
     Attributes:
         url: opens it.
-        name: for people.
+        name: name shown to people.
         formats: what it can stream.
         remark: what keeps it from being opened, or "".
     """
@@ -79,7 +79,7 @@ class FrameSink(ABC):
     def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
         """Take that the picture of the trigger under way will not come."""
 
-    async def taken(self) -> None:  # noqa: B027 - who has no readers waits for none
+    async def taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
         """Return once every reader has taken the last frame: for a recording that is to lose none.
 
         Cancellation: safe.
@@ -178,7 +178,7 @@ class FrameDriver(ABC):
         )
 
     async def trigger_elsewhere(self, timeout: float, *, refuse: bool) -> Frame | None:
-        """Have whoever has the device trigger it, and return the picture that this caused.
+        """Have the device's owner trigger it, and return the picture that this caused.
 
         Args:
             timeout: seconds for everything.
@@ -206,7 +206,7 @@ class FrameDriver(ABC):
 
     @abstractmethod
     async def start(self, sink: FrameSink) -> None:
-        """Have it stream into ``sink``. A device that was lost since is opened anew.
+        """Start the stream into ``sink``. A device that was lost since is opened anew.
 
         Raises:
             FrameSourceError: it does not; nothing streams.
@@ -214,8 +214,8 @@ class FrameDriver(ABC):
 
     @abstractmethod
     async def stop(self) -> None:
-        """Have it stream no longer: nothing runs for it. After that ``sink`` hears nothing."""
+        """Stop the stream and all that runs for it. After that ``sink`` hears nothing."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Give it back. Idempotent, and right after any failure."""
+        """Give the device back. Idempotent, and right after any failure."""

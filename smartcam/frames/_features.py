@@ -313,7 +313,7 @@ def checked_value(value: object) -> FeatureValue:
     """Return a value that a feature may have, as a plain one.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is not valid.
     """
     given = plain(value)
     if isinstance(given, str):

@@ -71,7 +71,7 @@ class Frame:
             chunk data that could not be read.
         chunks: values that the camera sent with the picture, by the name of their feature, such as
             ``ChunkExposureTime``; empty where it sends none.
-        trigger: trigger of :meth:`FrameSource.trigger` that caused the frame; None: it was none.
+        trigger: trigger of :meth:`FrameSource.trigger` that caused the frame; None: no trigger did.
     """
 
     data: bytes | bytearray | memoryview

@@ -36,7 +36,7 @@ class FrameSet:
     """Frames of one moment, one of each camera.
 
     Attributes:
-        frames: by the names that the group gave.
+        frames: frames by the names that the group gave.
         skew: seconds from the first to the last of them, by ``Frame.captured``.
     """
 
@@ -62,7 +62,8 @@ class GroupStatistics:
         delivered: sets that were taken.
         skipped: sets that a newer one came before.
         waiting: 1 where one is there that was not taken.
-        alone: of each camera, frames that found none of the same moment in every other one.
+        alone: number of each camera's frames without one of the same moment from every other
+            camera.
         skew: the largest of any set, seconds.
     """
 
@@ -87,13 +88,13 @@ class FrameGroup:
     on until the group is closed. Each frame is in one set at most.
 
     Args:
-        sources: by name, none of them open; they are the group's from now on.
+        sources: sources by name, not open yet; they are the group's from now on.
         within: largest skew of a set, seconds; None: half of the time between two frames of the
             fastest camera, so that each frame has one partner.
         timeout: seconds that an iteration waits for a set; None: as long as it takes.
 
     Raises:
-        ConfigurationError: no sources, one twice, or times that are none.
+        ConfigurationError: no sources, one twice, or times that are not valid.
     """
 
     def __init__(

@@ -57,7 +57,7 @@ async def discover(scheme: str | None = None) -> list[FoundSource]:
     """Return the sources that are found on this machine and its network.
 
     Args:
-        scheme: of those that are looked for; None: all.
+        scheme: scheme of the sources that are looked for; None: all.
 
     Raises:
         ConfigurationError: no such scheme.

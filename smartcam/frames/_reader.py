@@ -45,8 +45,8 @@ class ReaderStatistics:
 class FrameReader:
     """One reader of a source: an iterator that gives the newest frame, and skips what it missed.
 
-    The device streams while there is a reader. One that is closed, or that nobody holds any
-    longer, is none.
+    The device streams while there is a reader: one that is not closed, and that somebody still
+    refers to.
     """
 
     def __init__(self, source: FrameSource, timeout: float | None) -> None:
@@ -111,7 +111,7 @@ class FrameReader:
             timeout: seconds; None: as long as it takes.
 
         Raises:
-            ConfigurationError: a time that is none.
+            ConfigurationError: a time that is not valid.
             FrameTimeoutError: none came in time.
             FrameSourceError: the source ended.
 
@@ -132,11 +132,11 @@ class FrameReader:
         sure: see :attr:`Frame.began`.
 
         Args:
-            moment: of ``time.monotonic()``.
+            moment: time of ``time.monotonic()``.
             timeout: seconds; None: as long as it takes.
 
         Raises:
-            ConfigurationError: a time that is none.
+            ConfigurationError: a time that is not valid.
             FrameTimeoutError: none came in time.
             FrameSourceError: the source ended.
 
@@ -154,8 +154,8 @@ class FrameReader:
         """Wait until the next frame is one that came since a moment, or it is too late for that.
 
         Args:
-            since: of the loop's clock; a frame that has waited here longer is waited past.
-            until: of the loop's clock; then an older one will do, or none.
+            since: time of the loop's clock; a frame that has waited here longer is waited past.
+            until: time of the loop's clock; then an older one will do, or none.
 
         Cancellation: safe.
         """

@@ -86,7 +86,7 @@ class FrameSource(FrameSink):
     :func:`smartcam.frames.open`.
 
     Args:
-        driver: of the device; it is the source's from now on.
+        driver: driver of the device; it is the source's from now on.
         camera_info: the lens, which every frame gets; None: as the driver has it.
         timeout: seconds that an iteration waits for a frame; None: as long as it takes.
         stall: seconds without a frame after which a streaming device counts as stuck: readers get
@@ -94,7 +94,7 @@ class FrameSource(FrameSink):
         linger: seconds that it goes on streaming after the last reader, for one that comes back.
 
     Raises:
-        ConfigurationError: a time that is none.
+        ConfigurationError: a time that is not valid.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class FrameSource(FrameSink):
             timeout: seconds that an iteration waits for an event; None: as long as it takes.
 
         Raises:
-            ConfigurationError: no name, or a number that is none.
+            ConfigurationError: no name, or a number that is not valid.
         """
         return FrameEvents(self, names, size, timeout)
 
@@ -237,7 +237,7 @@ class FrameSource(FrameSink):
         self._task.add_done_callback(self._stopped)
 
     def _stopped(self, task: asyncio.Task[None]) -> None:
-        """Begin again for who came meanwhile; tell readers where somebody cancelled the task."""
+        """Begin again for readers that came meanwhile; tell readers of a cancelled task."""
         if task is not self._task or self._loop is None:
             return
         self._task = None
@@ -326,8 +326,8 @@ class FrameSource(FrameSink):
     async def newest(self, *, max_age: float = 1.0, timeout: float | None = FRAME_TIMEOUT) -> Frame:
         """Return the newest frame, as :meth:`FrameReader.newest` does for a reader of its own.
 
-        Who asks often keeps a reader, or opens the source with ``linger``: without either the
-        device begins to stream for each.
+        A program that asks often keeps a reader, or opens the source with ``linger``: without
+        either the device begins to stream for each frame.
         """
         max_age = check_age(max_age, "max_age")
         timeout = check_seconds_or_none(timeout, "timeout")

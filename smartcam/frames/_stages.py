@@ -56,7 +56,7 @@ class Undistorter:
         """Return a frame's picture without distortion; 0 where there is no source.
 
         Args:
-            frame: of the lens' size.
+            frame: frame of the lens' size.
             colour: whether its colours are wanted, (H, W, 3); else its brightness, (H, W).
 
         Raises:
@@ -73,9 +73,9 @@ class Rectifier:
 
     Args:
         rectification: what :meth:`~smartcam.calibration.StereoCalibration.rectify` gives.
-        size: of the sources, width and height in pixels.
+        size: size of the sources, width and height in pixels.
         left: name of the left camera in the sets.
-        right: of the right one.
+        right: frame of the right camera.
     """
 
     def __init__(

@@ -195,7 +195,7 @@ def _left(deadline: float) -> float:
 
 @contextlib.asynccontextmanager
 async def _turn(lock: asyncio.Lock, deadline: float) -> AsyncIterator[None]:
-    """Hold the lock in here; raise CameraBusyError where it is not free in time."""
+    """Hold the lock as long as the block runs; raise CameraBusyError if it is not free in time."""
     try:
         async with asyncio.timeout_at(deadline):
             await lock.acquire()

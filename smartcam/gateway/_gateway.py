@@ -41,7 +41,7 @@ class Gateway(Server):
         settings: where it listens and how it writes.
 
     Raises:
-        ConfigurationError: ``interpret_as`` of the camera is none.
+        ConfigurationError: ``interpret_as`` of the camera is not valid.
     """
 
     def __init__(self, camera: Camera, settings: GatewaySettings | None = None) -> None:

@@ -61,10 +61,10 @@ class RobotRequest(NamedTuple):
     """A request of a robot.
 
     Attributes:
-        word: the word, in capitals; "" for what is none.
+        word: the word, in capitals; "" where there is no word.
         application: number behind the word, None without one.
         tag: number before the word, which the answer repeats; None without one.
-        given: what came, for the error.
+        given: text of the request, for errors.
     """
 
     word: str
@@ -77,7 +77,7 @@ class RobotAnswer(NamedTuple):
     """An answer to a robot.
 
     Attributes:
-        code: how it went.
+        code: outcome of the request.
         left: parts of the result that are left after this one.
         values: values of the part, or of the camera's state.
         words: the reason, for people.
@@ -132,7 +132,7 @@ class RequestReader:
         return found
 
     def _end(self, data: bytes, at: int) -> int:
-        """Return the place behind the request that begins at one; 0 if it is not whole."""
+        """Return the place behind the request that begins at ``at``; 0 if it is not whole."""
         begin = _XML_BEGIN.match(data, at) if self._xml else None
         if begin is None:  # a line; whatever it is instead of XML, it is one request
             mark = _LINE_END.search(data, at)

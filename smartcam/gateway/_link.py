@@ -98,7 +98,7 @@ class RobotLink(asyncio.Protocol):
         self._close("the robot closed the connection" if exc is None else str(exc), abort=True)
 
     def turn_away(self, why: str) -> None:
-        """End it at once, for another connection."""
+        """End the link at once, for another connection."""
         self._close(why, abort=True)
 
     # ------------------------------------------------------------------ requests
@@ -193,7 +193,7 @@ class RobotLink(asyncio.Protocol):
             self._transport.close()
 
     async def finish(self) -> None:
-        """Close it, and wait until what was under way has ended."""
+        """Close the link, and wait until its requests have ended."""
         task = self._task
         self._close("the gateway is closed")
         if task is not None:

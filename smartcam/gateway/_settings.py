@@ -95,7 +95,7 @@ class GatewaySettings(BaseModel):
 
     listen: Annotated[str, AfterValidator(_listen)] = Field(
         default=DEFAULT_LISTEN,
-        description="where robots connect, tcp/HOST:PORT; port 0 takes a free one",
+        description="address that robots connect to, tcp/HOST:PORT; port 0 takes a free one",
     )
     robot: Literal["plain", "ur", "kuka", "fanuc", "siemens"] = Field(
         default="plain", description="the make of the controller, which says what is not said below"
@@ -122,7 +122,7 @@ class GatewaySettings(BaseModel):
     width: Annotated[int, Field(ge=0, le=1000)] | None = Field(
         default=None, description="bytes of each answer, filled with blanks; 0: as many as it needs"
     )
-    also: tuple[Also, ...] = Field(default=(), description="what stands behind the pose of a part")
+    also: tuple[Also, ...] = Field(default=(), description="values that follow the pose of a part")
     tool_flip: bool = Field(
         default=False,
         description="turn each pose by half a turn about its x, so that z points into the "

@@ -68,7 +68,7 @@ class Code(enum.StrEnum):
 
     # frames
     NOT_RIGID = "NOT_RIGID"
-    """No rotation: a reflection, a scale, a quaternion that is none."""
+    """No rotation: a reflection, a scale, a quaternion that is not valid."""
     BAD_TIME = "BAD_TIME"
     """A time that is missing, or for which nothing is known."""
     NOT_SIMULTANEOUS = "NOT_SIMULTANEOUS"

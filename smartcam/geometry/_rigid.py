@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Index = NDArray[np.intp] | Sequence[int] | slice | int
 
 SMALL_ANGLE = 1e-4
-"""Radians below which a factor's series is cut after its first term; 1e-9 of it is lost there."""
+"""Radians below which the first term of a series replaces a factor: it is off by 1e-9 of it."""
 
 
 class Rigid(NamedTuple):

@@ -216,7 +216,7 @@ def _checked(kind: Any, data: Any, called: str, **known: Any) -> Any:
 
 
 def refused(called: str, text: str, got: object) -> CalibrationError:
-    """Return the error that says why stored data are none."""
+    """Return the error that says why stored data are not valid."""
     return Code.SHAPE.refusal(f"stored {called}: {text}", got=got)
 
 

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
     from smartcam.geometry._rotations import Array
 
-_ORTHONORMAL: Final = 1e-6
+_MAX_ORTHONORMAL_DEVIATION: Final = 1e-6
 """Largest difference of ``R R^T`` from one: at a metre this is a micrometre."""
 
-_UNIT: Final = 0.01
+_MAX_UNIT_DEVIATION: Final = 0.01
 """Largest difference of a quaternion's length from one; it is made one. Robots print few digits;
 what is farther off is no quaternion, or is in another order."""
 
@@ -88,7 +88,7 @@ class Transform:
             off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
             turn = float(np.linalg.det(rotation))
         far = not np.abs(translation).max() <= MAX_COORDINATE
-        if not (off < _ORTHONORMAL and turn > 0) or far:
+        if not (off < _MAX_ORTHONORMAL_DEVIATION and turn > 0) or far:
             mirror = " (a reflection: one of the frames is left-handed)" if turn < 0 else ""
             raise Code.NOT_RIGID.refusal(
                 f"{self.label}: expected a rotation and a finite translation, got a matrix of "
@@ -128,7 +128,7 @@ class Transform:
         values = _numbers(quaternion, f"T_{target}_{source}: quaternion")
         with np.errstate(all="ignore"):
             length = float(np.linalg.norm(values))
-        if values.shape != (4,) or not abs(length - 1.0) < _UNIT:
+        if values.shape != (4,) or not abs(length - 1.0) < _MAX_UNIT_DEVIATION:
             raise Code.NOT_RIGID.refusal(
                 f"T_{target}_{source}: expected a quaternion x, y, z, w of length 1, got "
                 f"{values.tolist()} of length {length:.6g}",

@@ -217,7 +217,7 @@ class Interpreter(ABC):
     """
 
     default_layout: ClassVar[str | None] = None
-    """Text of the layout that is used where the user gives none."""
+    """Text of the layout that is used where the user gives no layout."""
 
     layout_use: ClassVar[Literal["none", "optional", "required"]] = "optional"
     """Use of a layout: none, one that may be given, or one that must be given."""

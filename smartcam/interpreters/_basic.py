@@ -1,4 +1,4 @@
-"""The interpreters that a layout, or nothing, tells all: raw, record, table, strings50."""
+"""The interpreters that need a layout at most: raw, record, table, strings50."""
 
 from __future__ import annotations
 

@@ -27,9 +27,9 @@ _DEFAULTS: dict[str, Any] = {
     "y": 0.0,
     "theta": 0.0,
 }
-"""The fields that are used beside ``z``, and what stands for those that a layout has not.
+"""Defaults of the fields that are used beside ``z``, for layouts without these fields.
 
-In the order of use, which is that of the default layout.
+The order is that of the default layout.
 """
 
 _QUANTITIES = {
@@ -39,12 +39,12 @@ _QUANTITIES = {
     "z": ("length", "pixels"),
     "theta": ("angle",),
 }
-"""Quantities that a unit may measure, by real field."""
+"""Quantities that a field's unit may measure, by the field's name."""
 
 _POSE = ("x", "y", "z", "theta")
 
-BEST = 1.0 + 1e-6
-"""Largest quality: 1, as a float of 32 bits may be rounded."""
+MAX_QUALITY = 1.0 + 1e-6
+"""Largest quality: 1, with room for the rounding of a 32-bit float."""
 
 MAX_NAMES = 64
 """Names of features that are kept as texts: an application has a handful, a peer could send any."""
@@ -103,7 +103,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         """
         header = _new_tuple(Header, (context.number, context.received_at, context.camera))
         sin, cos, new = math.sin, math.cos, _new_tuple
-        scales, y_down, best, names = self._scales, context.y_down, BEST, self._names
+        scales, y_down, best, names = self._scales, context.y_down, MAX_QUALITY, self._names
         rows: Iterable[Any] = self.layout.wire_records(data, context.byte_order)
         if self._missing is not None:
             rows = map(operator.concat, rows, self._missing)
@@ -156,9 +156,9 @@ class LocalizationsInterpreter(PlainInterpreter):
         return data[begin : begin + self.layout.size] == self._empty
 
     def _check_numbers(self, data: bytes, context: Context) -> None:
-        """Raise for the first number that cannot be; for a bad text or bool before that.
+        """Raise for the first impossible number; for a bad text or bool before it.
 
-        In a pose that is NaN and infinity, as a quality what is not between 0 and 1.
+        Impossible are NaN and infinity in a pose, and a quality that is not between 0 and 1.
         """
         offset = self.layout.head_size
         for number, record in enumerate(self.layout.parse_records(data, context.byte_order)):
@@ -170,10 +170,10 @@ class LocalizationsInterpreter(PlainInterpreter):
 
 
 def _wrong(field: Field, value: float) -> str:
-    """Return the expectation that a number does not meet; "" where it can be."""
+    """Return the expectation that a number does not meet; "" for a possible number."""
     if field.name in _POSE and not math.isfinite(value):
         return "a finite number"
-    if field.name == "quality" and not 0.0 <= value <= BEST:
+    if field.name == "quality" and not 0.0 <= value <= MAX_QUALITY:
         percent = field.unit is None and 1.0 < value <= 100.0
         return "0 to 1" + (" (its unit may be percent)" if percent else "")
     return ""
@@ -183,11 +183,11 @@ class _Use(NamedTuple):
     """The use of each field of a record.
 
     Attributes:
-        missing: what stands for those that it has not; goes behind the others.
-        pick: puts them into the order of use, None where they are in it.
-        z: the place of ``z``, which is rare; None without it.
-        scales: what turns them into SI.
-        checks: what is not used must be a text or a bool nevertheless.
+        missing: defaults of the fields that the record lacks; they go behind its own.
+        pick: function that puts the values into the order of use; None where they are in it.
+        z: place of ``z``, which is rare; None without it.
+        scales: factors that turn the values into SI; None where they are SI.
+        checks: True if unused texts and bools have to be checked, too.
     """
 
     missing: tuple[Any, ...]

@@ -126,7 +126,7 @@ class RecordCodec:
         lenient: take any byte but zero for a true bool.
 
     Attributes:
-        size: of a record, bytes.
+        size: size of a record, bytes.
         unpack_all: gives the values on the wire of all records of a payload; ``struct.error``
             where they do not fill it.
     """

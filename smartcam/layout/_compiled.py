@@ -22,14 +22,14 @@ class CompiledLayout:
         lenient: take any byte but zero for a true bool.
 
     Attributes:
-        spec: as given.
-        text: as given.
-        codecs: of the head and of a record, by byte order.
+        spec: spec that was given.
+        text: text that was given.
+        codecs: codecs of the head and of a record, by byte order.
         fixed: number of records, None where the container tells.
         to_end: records, and nothing else.
         is_list: whether the value is a plain list of records.
         record_word: what an error calls a record, "" where there is one.
-        sequence_index: of the field with the sequence number, None without one.
+        sequence_index: index of the field with the sequence number, None without one.
     """
 
     __slots__ = (

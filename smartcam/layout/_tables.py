@@ -27,7 +27,7 @@ class TableCodec:
     """Reads records into tables.
 
     Args:
-        codec: of the same records.
+        codec: codec of the same records.
         byte_order: order of the bytes of a number.
 
     Attributes:

@@ -52,7 +52,7 @@ class WireType(NamedTuple):
 
     @property
     def is_integer(self) -> bool:
-        """True if the type is one of the integers; a bool is none."""
+        """True if the type is one of the integers; a bool is not."""
         return self.low is not None
 
     @property

@@ -102,7 +102,7 @@ def _pack(field: Field, text: str | None) -> bytes:
 
 
 def _real(text: str) -> float:
-    """Return a number; ValueError: it is none, or too large."""
+    """Return a number; ValueError: it is no number, or too large."""
     if not _NUMBER.fullmatch(text.strip()):
         raise ValueError("no number")
     number = float(text)

@@ -141,7 +141,7 @@ class Dialect(ABC):
     """One wire variant of a protocol: what the client needs to know of it.
 
     Args:
-        name: as in ``?dialect=``.
+        name: name as in ``?dialect=``.
         about: one line for people.
         source: where it is described, with its grade.
         quirks: names of the deviations from the dialect that this one has, as in ``?quirks=``.
@@ -221,7 +221,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for who knows better.
+        """Return any request by its id, for users who know it better than the table.
 
         Raises:
             LocalProtocolError: Connect and Disconnect.
@@ -237,7 +237,7 @@ class Dialect(ABC):
         """
 
     def unsupported(self, message_type: type[Message]) -> UnsupportedError:
-        """Return the error of who asks for a message that it does not have."""
+        """Return the error for a message that the dialect does not have."""
         return UnsupportedError(
             f"dialect {self.name} has no {message_type.__name__}; "
             f"it can: {', '.join(self.capabilities.names)}"

@@ -16,7 +16,7 @@ class LineReader:
     Args:
         ends: what ends a line, one or two bytes.
         max_line: bytes of a line, its end not counted.
-        encoding: of its characters; bytes that are none are replaced.
+        encoding: encoding of its characters; bytes that are not valid are replaced.
     """
 
     def __init__(self, ends: re.Pattern[bytes], *, max_line: int, encoding: str) -> None:
@@ -36,7 +36,7 @@ class LineReader:
         return bytes(self._buffer)
 
     def feed(self, data: bytes) -> None:
-        """Take what came. Whoever feeds it bounds what waits, by :func:`len`."""
+        """Take bytes. The caller bounds what waits, by :func:`len`."""
         self._buffer += data
 
     def next_line(self) -> str | None:

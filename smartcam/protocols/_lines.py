@@ -75,7 +75,7 @@ class LineRow(NamedTuple):
         line: how it asks, with the message's fields in braces: ``"PROGRAM {application}"``.
         answer: what the answer is; None for a request that is not answered.
         read: makes it of the answer's line, or several messages of it; a ValueError or LookupError
-            says that it is none.
+            says that it is no answer.
         word: what its answer is known by, in a dialect that splits answers: by default, and always
             behind the first line of a script, the first word of the line; "" for an answer without
             a word of its own. A dialect with tickets needs none, but for what is said unasked.
@@ -133,7 +133,7 @@ class LineDialect(Dialect):
         ids: the ids that applications may have.
         line_end: ends each line, one or two bytes.
         max_line: bytes of a line, its end not counted; a longer one breaks the protocol.
-        encoding: of its characters.
+        encoding: encoding of its characters.
         split: splits an answer into what it is known by, "" for nothing, and the text that is read;
             None where answers come in order and say nothing of their request.
         tickets: numbers that requests carry, each the next one; ``{ticket}`` in a row's line, or
@@ -203,7 +203,7 @@ class LineDialect(Dialect):
         return f"{type(message).__name__} ({'' if row is None else row.line[:32]})"
 
     def unsupported(self, message_type: type[m.Message]) -> UnsupportedError:
-        """Return the error of who asks for a message that it does not have; it names the make."""
+        """Return the error for a message that the dialect does not have; it names the make."""
         plain = super().unsupported(message_type)
         return UnsupportedError(f"{self.make}: {plain}") if self.make else plain
 

@@ -137,7 +137,7 @@ class LinkMachine(Protocol):
     def filled(self, count: int, now: float) -> bool:
         """Take ``count`` bytes that were written into :meth:`room`; False for no events yet.
 
-        ``now`` is for who bounds the time that a frame may take: seconds since any beginning.
+        ``now`` serves to bound the time that a frame may take: seconds since any beginning.
         """
         ...
 

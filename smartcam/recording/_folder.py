@@ -115,7 +115,7 @@ class RecordingFolder:
         path: the folder.
 
     Attributes:
-        path: as given.
+        path: path that was given.
         files: the recorder's files in it by name, as far as is known.
     """
 

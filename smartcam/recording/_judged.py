@@ -41,7 +41,7 @@ class JudgedResult(NamedTuple):
 
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
-    """Yield each result with its picture; a result waits until later pictures are of later."""
+    """Yield each result with its picture, as soon as no later picture can be the result's."""
     matchers: dict[str, _Matcher] = {}
     for item in items:
         if isinstance(item, (RecordedPicture, Result)):
@@ -64,7 +64,7 @@ class _Matcher:
         self.results: deque[Result[Any]] = deque()
         self._pictures: deque[RecordedPicture] = deque()
         self._bytes = 0
-        self._latest = 0.0  # capture of the last picture that nothing was told of, seconds
+        self._latest = 0.0  # capture of the last picture without a result's number, seconds
 
     def add_picture(self, picture: RecordedPicture) -> None:
         self._pictures.append(picture)

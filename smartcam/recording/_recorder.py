@@ -85,7 +85,7 @@ class Counts(NamedTuple):
     """The counts of what was recorded so far, written or waiting.
 
     Attributes:
-        frames: frames and bytes that make none.
+        frames: frames and bytes that make no frame.
         results: interpreted results.
         events: events of cameras.
         errors: errors.
@@ -144,7 +144,7 @@ class Recorder(Observer):
         overwrite: take the place of a file that is there.
 
     Attributes:
-        path: as given.
+        path: path that was given.
     """
 
     def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
@@ -216,7 +216,7 @@ class Recorder(Observer):
         event loop has other things to do.
 
         Raises:
-            RecordingError: the recording had failed, or does so now.
+            RecordingError: the recording has failed, before or now.
         """
         with self._more:
             self._taking, self._closing = False, True

@@ -76,7 +76,7 @@ async def bridged(
         **said: arguments of :class:`RosFleet` about single cameras.
 
     Raises:
-        ConfigurationError: the URL cannot be.
+        ConfigurationError: the URL is not valid.
         ConnectFailedError: no bus, or no agent with a camera, within the time.
     """
     checked_url(bridge)

@@ -48,7 +48,7 @@ _ALLOWED: Final[Mapping[str, tuple[type, ...]]] = {
 _BYTES: Final = ("uint8", "char")
 _MARK: Final = secrets.token_hex(12)
 _CHUNK: Final = 3 << 16  # a multiple of three: parts of base64 make a whole
-_DEEPEST = 32
+_MAX_LEVELS = 32
 
 
 class Raw:
@@ -129,7 +129,7 @@ def from_json(kind: MessageType, said: Any) -> Any:
         names = RENAMED.get(kind.name, {})
         ordered = [names.get(one.name, one.name) for one in kind.fields]
         said = dict(zip(ordered, said, strict=False))
-    message = kind.new(**_said(kind, said, "", _DEEPEST))
+    message = kind.new(**_said(kind, said, "", _MAX_LEVELS))
     return kind.decode(kind.encode(message))  # as ROS 2 has it: arrays of numpy, bytes
 
 

@@ -28,17 +28,17 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 CONNECT_TIMEOUT = 10.0
 """Seconds until a bridge has answered the handshake."""
-STALLED = 10.0
+STALLED_TIMEOUT = 10.0
 """Seconds that a bridge may take to read one message."""
-GOODBYE = 1.0
+GOODBYE_TIMEOUT = 1.0
 """Seconds that a bridge gets to answer a goodbye."""
 SEND_BUFFER = 1 << 17
 """Bytes that the system keeps for a bridge that is slow: what waits there is not the newest."""
-HEARTBEAT = 10.0
+HEARTBEAT_INTERVAL = 10.0
 """Seconds of silence after which it is asked whether it is there; half of them to answer."""
-LIVED = 5.0
+MIN_LIFETIME = 5.0
 """Seconds that a link must have lived for the next try to come at once."""
-LARGEST = 8 << 20
+MAX_MESSAGE_BYTES = 8 << 20
 """Bytes of a message from a bridge; a longer one ends the link."""
 
 
@@ -95,14 +95,17 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
         OSError, aiohttp.ClientError, TimeoutError: there is none.
     """
     aiohttp = _aiohttp()
-    timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE)
+    timeout = aiohttp.ClientWSTimeout(ws_receive=None, ws_close=GOODBYE_TIMEOUT)
     watching = aiohttp.TraceConfig()
     watching.on_request_redirect.append(_refuse_redirect)
     async with aiohttp.ClientSession(trace_configs=[watching]) as session:
         try:
             async with asyncio.timeout(CONNECT_TIMEOUT):
                 web = await session.ws_connect(
-                    url, timeout=timeout, heartbeat=HEARTBEAT, max_msg_size=LARGEST
+                    url,
+                    timeout=timeout,
+                    heartbeat=HEARTBEAT_INTERVAL,
+                    max_msg_size=MAX_MESSAGE_BYTES,
                 )
         except TimeoutError:
             raise TimeoutError(f"no answer within {CONNECT_TIMEOUT:g} s") from None
@@ -113,7 +116,7 @@ async def web_socket(url: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]
             yield web
         finally:
             try:
-                async with asyncio.timeout(GOODBYE):
+                async with asyncio.timeout(GOODBYE_TIMEOUT):
                     await web.close()
             except link_errors():
                 pass  # it does not read, or is gone
@@ -164,7 +167,7 @@ class BridgeLink:
                 began = clock()
                 reason = await self._try()
                 if await self._tell_lost(reason):
-                    short_lived = 0 if clock() - began > LIVED else short_lived + 1
+                    short_lived = 0 if clock() - began > MIN_LIFETIME else short_lived + 1
                     await asyncio.sleep(delay)
                     break
                 await asyncio.sleep(delay)
@@ -223,10 +226,12 @@ class BridgeLink:
         while True:
             text = await text_of(await self.outbox.take())
             try:
-                async with asyncio.timeout(STALLED):
+                async with asyncio.timeout(STALLED_TIMEOUT):
                     await web.send_str(text)
             except TimeoutError:
-                raise TimeoutError(f"it did not read a message within {STALLED:g} s") from None
+                raise TimeoutError(
+                    f"it did not read a message within {STALLED_TIMEOUT:g} s"
+                ) from None
 
     async def _read(self, web: aiohttp.ClientWebSocketResponse) -> None:
         kinds = _aiohttp().WSMsgType

@@ -21,7 +21,7 @@ class Lane:
     Attributes:
         dropped: messages that were not sent: no bridge, or newer ones came.
         sent: messages that were handed to the WebSocket.
-        waiting_bytes: of those that wait.
+        waiting_bytes: bytes of the messages that wait.
     """
 
     def __init__(self, depth: int, *, latched: bool) -> None:

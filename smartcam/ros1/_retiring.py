@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
-LINKS = 8
+LINK_COUNT = 8
 """Side by side, for a node's services."""
 PER_SERVICE = 2.0
 """Seconds for each, of which the bridge takes one."""
-SPARE = 5.0
+SPARE_SECONDS = 5.0
 """Seconds more, for the link and for a bridge that is busy."""
 KNOWN = "/rosout/get_loggers"
 """A service that every roscore has. Its answer says that what was said before is done."""
@@ -41,10 +41,10 @@ def question(service: str, arguments: dict[str, Any]) -> dict[str, Any]:
 
 async def retire(url: str, services: Sequence[str]) -> None:
     """Have a bridge withdraw services, whoever advertised them; what fails is logged."""
-    shares = [share for start in range(LINKS) if (share := services[start::LINKS])]
+    shares = [share for start in range(LINK_COUNT) if (share := services[start::LINK_COUNT])]
     try:
         async with (
-            asyncio.timeout(SPARE + PER_SERVICE * max(map(len, shares), default=0)),
+            asyncio.timeout(SPARE_SECONDS + PER_SERVICE * max(map(len, shares), default=0)),
             asyncio.TaskGroup() as group,
         ):
             for share in shares:

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
-FLUSH = 1.0
+FLUSH_TIMEOUT = 1.0
 """Seconds at the end for what waits to be sent."""
 ASK_TIMEOUT = 5.0
 """Seconds for the answer to a call of ours."""
-REPEAT = 10.0
+REPEAT_INTERVAL = 10.0
 """Seconds between two sayings of what is latched on a topic that nodes share, such as
 ``/tf_static``: a bridge keeps one message for all of its clients."""
 _LEVELS = {"error": logging.ERROR, "warning": logging.WARNING, "info": logging.INFO}
@@ -59,7 +59,7 @@ class RosbridgeNode(NamedNode):
         on_change: function called in the event loop when the bridge has come or gone.
 
     Raises:
-        ConfigurationError: a name or the URL cannot be.
+        ConfigurationError: a name or the URL is not valid.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -130,12 +130,12 @@ class RosbridgeNode(NamedNode):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open it."""
+        """Open the node."""
         if self._running is None:
             self._running = asyncio.create_task(self._link.run())
 
     async def stop(self) -> None:
-        """Close it: withdraw everything from the bridge, which takes some seconds. Idempotent."""
+        """Withdraw everything from the bridge, which takes some seconds. Idempotent."""
         running, self._running = self._running, None
         if running is None:
             return
@@ -155,7 +155,7 @@ class RosbridgeNode(NamedNode):
 
     async def _withdraw_all(self) -> None:
         with contextlib.suppress(TimeoutError):  # it does not read
-            async with asyncio.timeout(FLUSH):
+            async with asyncio.timeout(FLUSH_TIMEOUT):
                 await self._outbox.flushed()
         for service in tuple(self._services.values()):
             self.forget(service)
@@ -174,7 +174,7 @@ class RosbridgeNode(NamedNode):
                 ``latched`` count.
 
         Raises:
-            ConfigurationError: the topic cannot be, is there already, or there is no such type.
+            ConfigurationError: the topic is not valid, is there already, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._new_name(topic, "topic", self._publishers)
@@ -193,7 +193,7 @@ class RosbridgeNode(NamedNode):
             qos: quality of service, of which ``depth`` counts, for messages that wait for a reader.
 
         Raises:
-            ConfigurationError: the topic cannot be, or there is no such type.
+            ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
@@ -225,7 +225,7 @@ class RosbridgeNode(NamedNode):
             timeout: seconds that the handler may take.
 
         Raises:
-            ConfigurationError: the name cannot be, is there already, or there is no such type.
+            ConfigurationError: the name is not valid, is there already, or there is no such type.
             RosError: the node is not open.
         """
         kind, name = self.types.service(type), self._new_name(service, "service", self._services)
@@ -325,7 +325,7 @@ class RosbridgeNode(NamedNode):
     async def _repeat_shared(self) -> None:
         within = f"{self.full_name}/"
         while True:
-            await asyncio.sleep(REPEAT)
+            await asyncio.sleep(REPEAT_INTERVAL)
             for publisher in self._publishers.values():
                 if publisher.exists and not publisher.name.startswith(within):
                     publisher.lane.say_again()

@@ -22,7 +22,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros1")
 
 MAX_CONCURRENT_CALLS = 64
 """Calls of a service that are carried out at the same time; one beyond is refused."""
-SETTLE = 0.5
+SETTLE_TIME = 0.5
 """Seconds that a bridge gets to hand over a response before its service is withdrawn. One that it
 has not handed over stays, and is then the response to a later call."""
 CLOSE_TIMEOUT = 5.0
@@ -80,7 +80,7 @@ class RosbridgeService:
     # ------------------------------------------------------------------ for the node
 
     def advertise(self) -> None:
-        """Advertise it, where it is not closed."""
+        """Advertise the service, unless it is closed."""
         if self._node.has(self):
             self._say({"op": "advertise_service", "type": ros1_name(self.type.name)})
             self.ready = True
@@ -97,7 +97,7 @@ class RosbridgeService:
             task.cancel()
         if self._tasks:
             await asyncio.wait(tuple(self._tasks), timeout=CLOSE_TIMEOUT)
-        left = self._responded + SETTLE - asyncio.get_running_loop().time()
+        left = self._responded + SETTLE_TIME - asyncio.get_running_loop().time()
         if left > 0:
             await asyncio.sleep(left)
 

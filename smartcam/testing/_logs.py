@@ -45,10 +45,10 @@ ALLOWED_WHILE_BUSY: tuple[type[m.Message], ...] = (
 """Messages that a client may send while the camera is BUSY: they ask for nothing that takes the
 camera's time (inferred)."""
 
-SHOWN = 40
+MAX_SHOWN_ENTRIES = 40
 """Entries of the log that a failure shows: the last ones."""
 
-PAUSE = 0.005
+LOOK_INTERVAL = 0.005
 """Seconds between two looks."""
 
 
@@ -99,7 +99,7 @@ class CameraLog(Sequence["LogEntry"]):
 
     @property
     def received(self) -> list[m.Message]:
-        """Messages that clients have sent; bytes that make none are left out."""
+        """Messages that clients have sent; bytes that make no message are left out."""
         return _messages(self._read(), "in")
 
     @property
@@ -113,7 +113,7 @@ class CameraLog(Sequence["LogEntry"]):
         """See that these messages went over the wire, in this order.
 
         Args:
-            expected: of the client and of the camera; others may stand between them.
+            expected: messages of the client and of the camera; others may stand between them.
             only: the client sent nothing else. What the camera said is not looked at unless it is
                 expected.
             timeout: seconds that they may still take.
@@ -209,7 +209,7 @@ class CameraLog(Sequence["LogEntry"]):
             if time.monotonic() >= end or found is None:
                 reasons = [one for one in (found, missing) if one]
                 raise AssertionError("\n".join([*reasons, _shown(entries)]))
-            time.sleep(PAUSE)
+            time.sleep(LOOK_INTERVAL)
 
 
 def _messages(entries: list[LogEntry], direction: str) -> list[m.Message]:
@@ -305,9 +305,13 @@ def _text(entry: LogEntry) -> str:
 
 def _shown(entries: list[LogEntry]) -> str:
     """Return the log as it stands in a failure."""
-    lines = [f"  ... {len(entries) - SHOWN} before"] if len(entries) > SHOWN else []
+    lines = (
+        [f"  ... {len(entries) - MAX_SHOWN_ENTRIES} before"]
+        if len(entries) > MAX_SHOWN_ENTRIES
+        else []
+    )
     begin = entries[0].time if entries else 0.0
-    for entry in entries[-SHOWN:]:
+    for entry in entries[-MAX_SHOWN_ENTRIES:]:
         mark = "!" if entry.error else "<" if entry.direction == "in" else ">"
         what = entry.error or _text(entry)
         fault = f"  ({entry.fault})" if entry.fault else ""

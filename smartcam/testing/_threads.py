@@ -53,10 +53,10 @@ class _InLoop:
 
     _thread: LoopThread
     _hosted: WireCamera | EmulatedFleet
-    _owns_thread: bool  # it is started and ended with it
+    _owns_thread: bool  # True if the thread starts and ends with this object
 
     def start(self) -> None:
-        """Start it; does nothing if it runs.
+        """Start what lives in the thread; do nothing if it runs.
 
         Raises:
             ConfigurationError: it cannot listen; nothing is started.
@@ -70,7 +70,7 @@ class _InLoop:
             raise
 
     def stop(self) -> None:
-        """Stop it; the log can still be read. Harmless when done twice."""
+        """Stop what lives in the thread; the log can still be read. Harmless when done twice."""
         try:
             self._thread.call(self._hosted.stop, CALL_TIMEOUT)
         except ConfigurationError:
@@ -95,7 +95,7 @@ class _InLoop:
 class ThreadedCamera(_InLoop):
     """An emulated camera in a thread; a context manager.
 
-    What only a BVS camera has (``scene``, ``scenario``, ``wait_received`` of ids) is there for one.
+    ``scene``, ``scenario`` and ``wait_received`` with ids work for a BVS camera only.
 
     Args:
         protocol: name of a protocol that brings an emulated camera.
@@ -247,7 +247,7 @@ class ThreadedCamera(_InLoop):
         self._thread.run(self._emulator.command, name)
 
     def advance(self, seconds: float) -> None:
-        """Move its clock, which must be a manual one; all that falls due has happened then.
+        """Move the camera's manual clock on; all that falls due has happened then.
 
         Raises:
             ConfigurationError: it runs in real time, or the time is negative.
@@ -305,7 +305,7 @@ class ThreadedCamera(_InLoop):
         raise UnsupportedError(f"{self._emulator!r} has no {what}; an EmulatedCamera has")
 
     def _look(self, function: Callable[[], T]) -> T:
-        """Call in the thread; here, where it does not run and nothing changes any more."""
+        """Call in the thread, or in this one where the thread has ended and nothing changes."""
         try:
             return self._thread.run(function)
         except ConfigurationError:

@@ -1,6 +1,6 @@
 """The site of clouds: the newest one, to whoever looks.
 
-Each who looks has a WebSocket, with one cloud on the way at a time: the next one, the newest then,
+Each viewer has a WebSocket, with one cloud on the way at a time: the next one, the newest then,
 goes when the page says that it has shown the last. A cloud crosses as it lies in memory, in parts,
 so that the loop goes on meanwhile. A large one is thinned for the page, which says so.
 """
@@ -35,7 +35,7 @@ MAX_VIEWERS: Final = 8
 PROTOCOL: Final = "smartcam.cloud"
 """Subprotocol of the WebSockets that send clouds."""
 
-PART: Final = 1 << 16
+PART_BYTES: Final = 1 << 16
 """Bytes of a message that are written at a time."""
 
 SLOW: Final = 60.0
@@ -96,7 +96,7 @@ class CloudSite(ThreadedSite):
     def show(self, cloud: Cloud) -> None:
         """Show a cloud in place of the last one, from the event loop's thread.
 
-        Whoever looks gets it as soon as the last one is shown; one that is replaced before is
+        A viewer gets it as soon as the last one is shown; one that is replaced before is
         skipped. It is thinned and packed in a thread.
 
         Raises:
@@ -146,7 +146,7 @@ class CloudSite(ThreadedSite):
 
 def _seen(made: asyncio.Future[_Packed]) -> None:
     if not made.cancelled():
-        made.exception()  # who asked may be gone, and then nobody else asks
+        made.exception()  # the asker may be gone, and then nobody else asks
 
 
 def packed(cloud: Cloud) -> _Packed:
@@ -219,8 +219,8 @@ class CloudViewer(PageSocket):
             self._shown.clear()
             async with asyncio.timeout(SLOW):
                 await self._socket.send_str(json.dumps({"number": number, **cloud.about}))
-                for start in range(0, len(cloud.body), PART):
-                    await self._socket.send_bytes(cloud.body[start : start + PART])
+                for start in range(0, len(cloud.body), PART_BYTES):
+                    await self._socket.send_bytes(cloud.body[start : start + PART_BYTES])
                     await asyncio.sleep(0)
                 await self._shown.wait()
 

@@ -68,18 +68,19 @@ class ColourSite(ThreadedSite):
         source: source that the caller opens and closes. It streams for each picture that is asked
             for; ``linger`` lets it stream on in between.
         colours: range of colours that the page begins with.
-        quality: of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as it is.
+        quality: quality of the JPEGs that are made, 1 to 100. What a camera sends as JPEG stays as
+            it is.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         token: what every call must carry in ``Authorization: Bearer``, as
             :class:`~smartcam.web.LiveSite` has it.
 
     Attributes:
-        source: as given.
-        colours: as given.
+        source: source that was given.
+        colours: colours that were given.
 
     Raises:
-        ConfigurationError: the token cannot be used, or the quality is none.
+        ConfigurationError: the token cannot be used, or the quality is not valid.
         MissingExtraError: the extra ``depth`` is not installed.
     """
 
@@ -203,7 +204,7 @@ class ColourSite(ThreadedSite):
 
     @contextlib.contextmanager
     def _one_more(self) -> Iterator[None]:
-        """Count one who waits for a frame."""
+        """Count a viewer that waits for a frame."""
         if self._looks >= MAX_LOOKS:
             raise RefusedError(503, f"picture {MAX_LOOKS + 1}", f"{MAX_LOOKS} at one time")
         self._looks += 1
@@ -229,10 +230,10 @@ class RangeBody(CallBody):
     value: list[int]
 
     def colours(self) -> ColourRange:
-        """Return it.
+        """Return the range.
 
         Raises:
-            RefusedError: it is none.
+            RefusedError: it is not valid.
         """
         try:
             return ColourRange(**self.model_dump())

@@ -1,7 +1,7 @@
 """The connections of a site: how many there are, and how long each may take for a request.
 
 It is the policy of every port (:mod:`smartcam._accepting`), and holds before a token is looked at.
-What stands for a session is a request that is there in whole, while it is answered.
+A whole request counts as a session while it is answered.
 """
 
 from __future__ import annotations
@@ -95,23 +95,23 @@ class Visitor(asyncio.Protocol):
             self._inner.connection_made(transport)
 
     def data_received(self, data: bytes) -> None:
-        """Pass it on, unless it is a head without end."""
+        """Pass the bytes on, unless they are a head without end."""
         if self._head is not None:
             self._look_at(data, self._head)
         if self._inner is not None and not self._transport.is_closing():
             self._inner.data_received(data)
 
     def eof_received(self) -> bool | None:
-        """Pass it on."""
+        """Pass the end on."""
         return None if self._inner is None else self._inner.eof_received()
 
     def pause_writing(self) -> None:
-        """Pass it on."""
+        """Pass the pause on."""
         if self._inner is not None:
             self._inner.pause_writing()
 
     def resume_writing(self) -> None:
-        """Pass it on."""
+        """Pass the end of a pause on."""
         if self._inner is not None:
             self._inner.resume_writing()
 
@@ -127,7 +127,7 @@ class Visitor(asyncio.Protocol):
 
     @contextlib.contextmanager
     def request(self, request: web.BaseRequest) -> Iterator[None]:
-        """Deal, while in here, with a request whose head is there."""
+        """Mark a request whose head has come, as long as the block runs."""
         self._acceptor.expect(self, None, "")
         self._head = None
         try:
@@ -142,7 +142,7 @@ class Visitor(asyncio.Protocol):
 
     @contextlib.contextmanager
     def answer(self) -> Iterator[None]:
-        """Answer, while in here, a request that is there in whole: the place is safe."""
+        """Mark a whole request as being answered as long as the block runs: it keeps its place."""
         self.settled = True
         try:
             yield

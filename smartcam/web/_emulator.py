@@ -267,7 +267,7 @@ def _application(site: EmulatorSite, call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{_CAMERA}/reboot", body=_RebootBody, optional=True, sample='{"seconds": 0.5}')
 def _reboot(site: EmulatorSite, call: CallRequest) -> object:
-    """Restart it, as by its power switch; without a body as the quirk says."""
+    """Restart the camera, as by its power switch; without a body as the quirk says."""
     wanted: _RebootBody = call.body
     _operator(site, call, "reboot")(wanted.seconds)
     return {"camera": _state(site, call)}

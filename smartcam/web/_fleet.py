@@ -60,7 +60,7 @@ class FleetSite(Site):
 
     Attributes:
         view: view of the fleet that the table shows.
-        control: as given.
+        control: control that was given.
         viewers: sockets of the pages that show the table.
 
     Raises:

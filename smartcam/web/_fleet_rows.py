@@ -270,7 +270,7 @@ class FleetRow:
 
     @property
     def failure(self) -> int:
-        """Number of the failure that the newest result is; 0 where that is none."""
+        """Number of the failure that the newest result is; 0 where that is no failure."""
         behind = self._results is None or self._results.waiting
         return 0 if behind else self.history.last_failure
 

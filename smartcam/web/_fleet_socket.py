@@ -1,4 +1,4 @@
-"""One who looks at the fleet's page: is told what changed of the rows in sight."""
+"""A viewer of the fleet's page, who is told what changed of the rows in sight."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ MAX_ROWS: Final = 120
 MAX_SEARCH: Final = 100
 """Characters of a search text at most."""
 
-LONGEST: Final = 1024
+MAX_MESSAGE_BYTES: Final = 1024
 """Bytes of a message from a page at most."""
 
 ALIVE: Final = 5.0
 """Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
 
-QUICK: Final = 0.05
+QUICK_INTERVAL: Final = 0.05
 """Seconds between two messages at least, to a page that looks here and there."""
 
 AT_ONCE: Final = 10
 """Rows that are made JSON before other tasks of the loop have a turn."""
 
-TOTALS: Final = 1.0
+TOTALS_INTERVAL: Final = 1.0
 """Seconds between two messages with the totals of all cameras."""
 
 
@@ -73,7 +73,7 @@ class FleetSocket(PageSocket):
     """
 
     def __init__(self, view: FleetView, about: dict[str, Any], request: web.Request) -> None:
-        super().__init__(request, PROTOCOL, "row", heartbeat=SLOW, longest=LONGEST)
+        super().__init__(request, PROTOCOL, "row", heartbeat=SLOW, longest=MAX_MESSAGE_BYTES)
         self._view = view
         self._about = about
         self._sight = RowsInSight()
@@ -82,7 +82,7 @@ class FleetSocket(PageSocket):
         self._seen: dict[str, int] = {}  # versions of the rows that the page has
         self._window: tuple[Any, ...] = ()  # that the page has: what is found, and which names
         self._totals: dict[str, Any] = {}
-        self._totals_at = -TOTALS
+        self._totals_at = -TOTALS_INTERVAL
         self._bars = 0  # start of the last bar of outcomes that the page has
 
     def _hear(self, said: str) -> bool:
@@ -103,7 +103,7 @@ class FleetSocket(PageSocket):
             if text or loop.time() - said_at >= ALIVE:
                 await self._send(text or "{}")
                 said_at = loop.time()
-                await asyncio.sleep(QUICK)
+                await asyncio.sleep(QUICK_INTERVAL)
             try:
                 async with asyncio.timeout(PERIOD):
                     await self._moved.wait()
@@ -130,7 +130,7 @@ class FleetSocket(PageSocket):
 
     def _changed_totals(self) -> Iterator[str]:
         now = asyncio.get_running_loop().time()
-        if now - self._totals_at < TOTALS:
+        if now - self._totals_at < TOTALS_INTERVAL:
             return
         totals = self._view.totals()
         if totals != self._totals:

@@ -36,7 +36,7 @@ MAX_GONE: Final = 10_000
 AT_ONCE: Final = 50
 """Rows or results that are handled before other tasks of the loop have a turn."""
 
-SIFTED: Final = 1000
+MAX_SIFTED_ROWS: Final = 1000
 """Rows that are searched before other tasks of the loop have a turn."""
 
 BUCKET: Final = 5
@@ -45,7 +45,7 @@ BUCKET: Final = 5
 SERIES: Final = 600
 """Seconds over which outcomes are kept."""
 
-ORDERED: Final = 1.0
+ORDER_LASTING_TIME: Final = 1.0
 """Seconds that an order stays while what it goes by changes: rows that jump cannot be read."""
 
 MAX_ORDERS: Final = 64
@@ -162,7 +162,7 @@ class FleetView:
     # ------------------------------------------------------------------ who is there
 
     async def _begin(self) -> None:
-        """Learn who is there."""
+        """Learn which agents and cameras are there."""
         if self._events is not None:
             self._events.close()
         self._events = stream = self.fleet.events(max_queue=MAX_EVENTS)
@@ -177,7 +177,7 @@ class FleetView:
         await self._look()
 
     async def _hear(self) -> None:
-        """Hear who came and who went."""
+        """Note cameras that came or went."""
         stream = self._events
         if stream is None:
             return
@@ -340,7 +340,9 @@ class FleetView:
         """
         now = asyncio.get_running_loop().time()
         known = self._orders.get(query)
-        if known is not None and (known.version == self.version or now - known.at < ORDERED):
+        if known is not None and (
+            known.version == self.version or now - known.at < ORDER_LASTING_TIME
+        ):
             self._orders.move_to_end(query)
             return known
         if not self._names:
@@ -361,8 +363,8 @@ class FleetView:
     async def _sorted(self, query: RowQuery) -> list[str]:
         words, found = query.search.lower().split(), list[FleetRow]()
         names = self._names
-        for start in range(0, len(names), SIFTED):
-            rows = map(self.rows.get, names[start : start + SIFTED])
+        for start in range(0, len(names), MAX_SIFTED_ROWS):
+            rows = map(self.rows.get, names[start : start + MAX_SIFTED_ROWS])
             found += [row for row in rows if row is not None and _fits(row, query.filter, words)]
             await asyncio.sleep(0)
         if query.sort in SORTS:

@@ -47,20 +47,20 @@ class FramesSite(Site):
         quality: quality of the JPEGs that are made, 1 to 100. A JPEG from a camera stays as it is.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
-        changes: whether who looks may set features of the devices, execute their commands and
+        changes: whether viewers may set features of the devices, execute their commands and
             trigger them; anybody who can open the page may then.
         token: what every call must carry in ``Authorization: Bearer``, as
             :class:`~smartcam.web.LiveSite` has it. A browser's WebSocket, which can carry none,
             names it among its protocols: ``bearer.TOKEN``.
 
     Attributes:
-        sources: as given.
-        changes: as given.
+        sources: sources that were given.
+        changes: changes that were given.
         failures: reason why a source is not open, by its place in ``sources``; set by whoever
             opens the sources.
 
     Raises:
-        ConfigurationError: the token cannot be used, or the quality is none.
+        ConfigurationError: the token cannot be used, or the quality is not valid.
         MissingExtraError: the extra ``frames`` is not installed.
     """
 

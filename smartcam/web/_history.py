@@ -82,7 +82,7 @@ class ShiftHistory:
         self._failures: collections.deque[Failure] = collections.deque(maxlen=MAX_FAILURES)
         self._pictures: collections.OrderedDict[int, bytes] = collections.OrderedDict()
         self._serial = 0  # of the last failure
-        self._newest = 0  # serial of the failure that the newest result is, 0 where it is none
+        self._newest = 0  # serial of the newest result if it is a failure, else 0
         self._failed = 0
         self._passed = False  # since the last failure
 
@@ -172,7 +172,7 @@ class ShiftHistory:
 
     @property
     def last_failure(self) -> int:
-        """Number of the failure that the newest result is; 0 where that is none."""
+        """Number of the failure that the newest result is; 0 where that is no failure."""
         return self._newest
 
     def picture(self, serial: int) -> bytes | None:
@@ -182,7 +182,7 @@ class ShiftHistory:
     # ------------------------------------------------------------------ for the page
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as the page takes it: bars, and the failures, the oldest first."""
+        """Return the history as the page takes it: bars, and the failures, the oldest first."""
         failures = [
             {**asdict(one), "picture": one.serial in self._pictures} for one in self._failures
         ]

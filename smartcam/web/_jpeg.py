@@ -37,7 +37,7 @@ def jpeg(frame: Frame, quality: int) -> bytes:
         quality: 1 to 100.
 
     Raises:
-        FrameFormatError: its bytes are wrong, or a JPEG cannot be so large.
+        FrameFormatError: its bytes are wrong, or the size is too large for a JPEG.
         MissingExtraError: what reads or makes it is not installed.
     """
     if is_whole_jpeg(frame):

@@ -54,7 +54,7 @@ class LiveSite(Site):
     Attributes:
         view: view of the camera that the page shows.
         frames: frames of the camera, where it has some.
-        control: as given.
+        control: control that was given.
 
     Raises:
         ConfigurationError: the token cannot be used, or a unit is unknown.

@@ -18,7 +18,7 @@ _log = logging.getLogger("smartcam.web")
 JPEG_QUALITY: Final = 80
 """Quality, 1 to 100, of the JPEGs that the agent makes, so that little crosses the bus."""
 
-LOOK: Final = 0.1
+LOOK_INTERVAL: Final = 0.1
 """Seconds between two looks at which camera the page shows, and whether it has frames."""
 
 
@@ -45,7 +45,7 @@ class LiveFrames:
         camera: returns the camera that the page shows now.
 
     Attributes:
-        pictures: of its frames; None where it has none.
+        pictures: pictures of its frames; None where it has none.
     """
 
     def __init__(self, camera: Callable[[], object]) -> None:
@@ -69,10 +69,10 @@ class LiveFrames:
             camera: object = self._camera()
             if isinstance(camera, HasFrames) and camera.has_frames:
                 await self._show(camera)
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(LOOK_INTERVAL)
 
     async def _show(self, camera: HasFrames) -> None:
-        """Have its frames there until the page shows another camera."""
+        """Keep the camera's frames until the page shows another camera."""
         pictures = SitePictures([camera.frame_source("jpeg", JPEG_QUALITY)], JPEG_QUALITY)
         pictures.start()
         keeping = asyncio.create_task(pictures.keep_open(0), name="smartcam.live.source")
@@ -81,7 +81,7 @@ class LiveFrames:
             while (  # noqa: ASYNC110 - nothing tells of it
                 self._camera() is camera and camera.has_frames and not keeping.done()
             ):
-                await asyncio.sleep(LOOK)
+                await asyncio.sleep(LOOK_INTERVAL)
         finally:
             self.pictures = None
             keeping.cancel()

@@ -59,7 +59,7 @@ class ShownResult(NamedTuple):
     layout: Layout | None = None  # that of tables, which know no units
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as the page takes it."""
+        """Return the result as the page takes it."""
         if self.result is None:
             return {"serial": self.serial, "error": self.error}
         result = self.result

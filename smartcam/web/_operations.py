@@ -159,7 +159,7 @@ class OperationsSite(Server):
         }
 
     async def _metrics(self, _request: web.Request) -> web.Response:
-        """Answer with the numbers of now; who asks at the same time gets the same."""
+        """Answer with the numbers of now; requests at the same time get the same answer."""
         if self._making is None or self._making.done():
             self._making = asyncio.get_running_loop().create_task(
                 self._made(), name="smartcam.metrics"

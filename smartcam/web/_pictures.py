@@ -1,9 +1,9 @@
 """The newest frames of some sources, to whoever looks: what pages of pictures have in common.
 
-Each who looks at a source has a reader of it and a WebSocket, with one picture on the way at a
-time: the next one, the newest then, goes when the page says that it has shown the last. So who is
-slow skips, and delays neither the device nor anybody else. With nobody there is no reader, and
-the device does not stream.
+Each viewer of a source has a reader of it and a WebSocket, with one picture on the way at a
+time: the next one, the newest then, goes when the page says that it has shown the last. So a viewer
+who is slow skips, and delays neither the device nor anybody else. With nobody there is no reader,
+and the device does not stream.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class SitePictures:
         quality: quality of the JPEGs that are made. A frame that comes as a JPEG stays as it is.
 
     Attributes:
-        sources: as given.
+        sources: sources that were given.
         failures: reason why a source is not open, by its place in ``sources``.
         viewers: sockets of the pages that show a source.
     """
@@ -144,7 +144,7 @@ class SitePictures:
         """Have a source open until this is cancelled, and try again where it cannot be opened.
 
         Args:
-            place: of the source.
+            place: place of the source.
             tried: is told each time what went wrong, None for nothing.
         """
         for delay in Backoff().delays():
@@ -159,7 +159,7 @@ class SitePictures:
             await asyncio.sleep(delay)
 
     async def view(self, place: int, request: web.Request) -> web.WebSocketResponse:
-        """Show a source to who asks, until the end.
+        """Show a source to a viewer, until the end.
 
         Raises:
             RefusedError: it is no WebSocket, or there are :data:`MAX_VIEWERS` already.
@@ -212,15 +212,15 @@ def _pressed(frame: Frame, quality: int) -> bytes:
 
 def _seen(made: asyncio.Future[bytes]) -> None:
     if not made.cancelled():
-        made.exception()  # who asked may be gone, and then nobody else asks
+        made.exception()  # the asker may be gone, and then nobody else asks
 
 
 class Viewer(PageSocket):
     """The WebSocket of a page that shows a source.
 
     Attributes:
-        place: of the source.
-        address: of who looks.
+        place: place of the source.
+        address: address of the viewer.
         gone: is set when that is over.
     """
 

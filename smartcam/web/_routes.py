@@ -77,7 +77,7 @@ class _Call(Generic[C]):
     sample: str = ""  # a body, for people
 
     async def answer(self, site: C, request: web.Request) -> web.StreamResponse:
-        """Do it for a request.
+        """Answer a request.
 
         Raises:
             RefusedError: it cannot be done.
@@ -186,7 +186,7 @@ class Calls(Generic[C]):
         self._rows.append(dataclasses.replace(row, path=path, handler=handler))
 
     def as_json(self) -> list[dict[str, Any]]:
-        """Return them as JSON-able rows: ``method``, ``path``, ``about``, ``body``."""
+        """Return the calls as JSON-able rows: ``method``, ``path``, ``about``, ``body``."""
         return [
             {"method": c.method, "path": c.path, "about": c.about, "body": c.sample or None}
             for c in self

@@ -32,8 +32,8 @@ MAX_VALUES = 2048
 """Bytes of a result that a list of log entries shows decoded; the entry alone shows any."""
 
 MAX_TOLD = 1 << 18
-"""Bytes of payload that a list tells: of log entries, as far as it shows them, or of faults. More
-end the list; an answer stays a few megabytes of JSON, and no more than its entries is ever made."""
+"""Bytes of payload in a list of log entries, as far as they are shown, or of faults: the list ends
+there, so an answer stays a few megabytes of JSON."""
 
 MAX_LISTED = 1000
 """Faults that a list shows at most."""
@@ -118,7 +118,7 @@ def log_range(emulator: WireCamera) -> dict[str, int]:
 
 
 def log_part(emulator: WireCamera, since: int, limit: int) -> tuple[dict[str, Any], list[LogEntry]]:
-    """Return entries from a serial on as JSON, and themselves: so many, or :data:`MAX_TOLD`.
+    """Return entries from a serial on as JSON and as they are: ``limit``, or :data:`MAX_TOLD`.
 
     ``next`` is the serial to go on with, ``missed`` how many are gone.
     """

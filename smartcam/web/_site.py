@@ -42,11 +42,11 @@ class Site(Server):
         page: name of the page's files in ``smartcam/web/page``: PAGE.html, PAGE.js, PAGE.css, and
             of its row in ``PAGES``. Pages may use ``base.css`` and ``base.js``, too.
         host, port, token: as :class:`~smartcam.web.EmulatorSite` has them.
-        files: of others that the page uses beside these.
+        files: files of other pages that this page uses as well.
         pages: other pages of the site, by their path, as aiohttp's router takes it.
 
     Attributes:
-        host: as given.
+        host: host that was given.
         token: what calls must carry, None for nothing.
         streams: the event streams.
 
@@ -172,7 +172,7 @@ class _Calm(logging.LoggerAdapter[logging.Logger]):
     """Takes what aiohttp logs. It is about what clients send wrong: no errors with tracebacks."""
 
     def log(self, level: int, msg: object, *args: object, **kwargs: Any) -> None:
-        """Log it at INFO at most."""
+        """Log a message at INFO at most."""
         super().log(min(level, logging.INFO), msg, *args, **kwargs)
 
 

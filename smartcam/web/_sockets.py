@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.web")
 
-LONGEST_WORD: Final = 64
+MAX_WORD_BYTES: Final = 64
 """Bytes of what a page may say: that it wants the next one."""
 
 
@@ -54,7 +54,7 @@ class PageSocket(ABC):
         what: str,
         *,
         heartbeat: float | None = None,
-        longest: int = LONGEST_WORD,
+        longest: int = MAX_WORD_BYTES,
     ) -> None:
         self._request = request
         self._what = what

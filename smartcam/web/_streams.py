@@ -40,7 +40,7 @@ class News(NamedTuple):
     serial: int | None = None  # sent as the event's id; None for none
 
     def as_text(self) -> str:
-        """Return it as it stands in the stream."""
+        """Return the event as it stands in the stream."""
         mark = "" if self.serial is None else f"id: {self.serial}\n"
         return f"event: {self.kind}\n{mark}data: {json.dumps(jsonable(self.data))}\n\n"
 

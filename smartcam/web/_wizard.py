@@ -36,14 +36,14 @@ class WizardSite(Site):
             site.url    # http://127.0.0.1:PORT/
 
     Args:
-        service: the calibrations' folder and their wizards; closed by who made it.
+        service: the calibrations' folder and their wizards; closed by its maker.
         host: address to listen on; nothing but this.
         port: port to listen on, 0 for a free one.
         token: what every call must carry in ``Authorization: Bearer``: 16 letters, digits, ``-``
             and ``_`` at least. None: nothing on a loopback address; on any other one is made.
 
     Attributes:
-        service: as given.
+        service: service that was given.
 
     Raises:
         ConfigurationError: the token cannot be used.
@@ -207,7 +207,7 @@ def _repeat(service: CalibrationService, body: _StepToken) -> object:
 
 @_call("POST", "/abort", writes="journal", body=_StepToken, sample='{"token": "..."}')
 def _abort(service: CalibrationService, body: _StepToken) -> object:
-    """End it without a result; what was measured stays in the journal."""
+    """End the wizard without a result; what was measured stays in the journal."""
     return service.session.abort(body.token)
 
 

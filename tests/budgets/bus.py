@@ -29,7 +29,7 @@ from smartcam.recording._mcap import form as _form
 from smartcam.recording._mcap import records as _records
 from smartcam.recording._pictures.messages import picture_message
 from smartcam.ros1._json_messages import from_json
-from smartcam.ros1._link import LARGEST as LARGEST_OPERATION
+from smartcam.ros1._link import MAX_MESSAGE_BYTES as LARGEST_OPERATION
 from smartcam.ros2 import RosTypes
 from smartcam.ros2._node.tokens import Entity
 from smartcam.web._connections import MAX_HEAD, Visitor, Visitors
@@ -440,7 +440,7 @@ BUS: tuple[Parser, ...] = (
         lambda text: from_json(_types().message("a_b/msg/Parts"), json.loads(text)),
         _OPERATIONS,
         LARGEST_OPERATION,
-        "ros1._link.LARGEST",
+        "ros1._link.MAX_MESSAGE_BYTES",
         refuses=(ValueError, RecursionError, SmartCamError),
         needs=("rosbags",),
     ),

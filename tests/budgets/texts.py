@@ -20,7 +20,7 @@ from smartcam.depth import load_cloud
 from smartcam.depth._cloud_files import MAX_FILE_BYTES as MAX_CLOUD
 from smartcam.emulator import load_scenario
 from smartcam.fleet import load_fleet
-from smartcam.frames._codecs.bitmap import MOST as MAX_BITMAP
+from smartcam.frames._codecs.bitmap import MAX_PIXEL_BYTES as MAX_BITMAP
 from smartcam.frames._codecs.jpeg import decode_jpeg
 from smartcam.frames._gige import description as _description
 from smartcam.frames._gige import expressions as _expressions
@@ -643,8 +643,8 @@ TEXTS: tuple[Parser, ...] = (
         "GenICam: descriptions",
         _description.parse,
         _DESCRIPTIONS,
-        _description.LARGEST,
-        "frames._gige.description.LARGEST",
+        _description.MAX_PLAIN_BYTES,
+        "frames._gige.description.MAX_PLAIN_BYTES",
         refused_from={"entries of a structure": 20_000},
     ),
     Parser(
@@ -664,16 +664,16 @@ TEXTS: tuple[Parser, ...] = (
         "GenICam: formulas",
         lambda text: _expressions.evaluate(text, {}, whole=True),
         _FORMULAS,
-        _expressions.LONGEST,
-        "frames._gige.expressions.LONGEST",
+        _expressions.MAX_FORMULA_CHARACTERS,
+        "frames._gige.expressions.MAX_FORMULA_CHARACTERS",
         size=1500,
     ),
     Parser(
         "GenICam: values",
         _features,
         _FEATURES,
-        _description.LARGEST,
-        "frames._gige.description.LARGEST",
+        _description.MAX_PLAIN_BYTES,
+        "frames._gige.description.MAX_PLAIN_BYTES",
         refused_from={"expressions asked for again and again": 30_000},
     ),
     Parser(
@@ -695,7 +695,7 @@ TEXTS: tuple[Parser, ...] = (
         read_bitmap,
         {"grey": _bmp(8), "colours": _bmp(24), "zeros": fill(b"\0", b"BM")},
         MAX_BITMAP,
-        "frames._codecs.bitmap.MOST",
+        "frames._codecs.bitmap.MAX_PIXEL_BYTES",
     ),
     Parser(
         "JPEG",

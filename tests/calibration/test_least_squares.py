@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from smartcam.calibration._least_squares import (
-    LARGE,
+    MAX_UNKNOWNS_BY_SVD,
     Normal,
     inverse_scaled,
     minimize,
@@ -94,8 +94,8 @@ def test_scaled_equations_of_many_units_are_solved() -> None:
 
 
 def test_many_scaled_equations_are_solved_even_where_some_are_missing() -> None:
-    rows = RANDOM.normal(size=(90, LARGE + 10))
-    expected = RANDOM.normal(size=LARGE + 10)
+    rows = RANDOM.normal(size=(90, MAX_UNKNOWNS_BY_SVD + 10))
+    expected = RANDOM.normal(size=MAX_UNKNOWNS_BY_SVD + 10)
     np.testing.assert_allclose(solve_scaled(rows.T @ rows, rows.T @ rows @ expected), expected)
     rows[:, -1] = 0.0
     again = solve_scaled(rows.T @ rows, rows.T @ rows @ expected)

@@ -167,7 +167,7 @@ def test_one_that_takes_long_holds_up_the_page_for_a_while_only(
         raise AssertionError
 
     monkeypatch.setattr(Shelf, "open", open_)
-    monkeypatch.setattr(frames_serve, "FIRST", 0.01)
+    monkeypatch.setattr(frames_serve, "FIRST_TRY_TIMEOUT", 0.01)
     done = run("frames", "serve", "shelf://slow", "shelf://wrong", "--seconds", "0.01")
     assert done.code == 0
     assert done.out.startswith("page: ")

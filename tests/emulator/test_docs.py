@@ -31,7 +31,7 @@ def test_yaml_example_loads(tmp_path: Path) -> None:
     path = tmp_path / "line.yaml"
     path.write_text(text, encoding="utf-8")
     scenario = load_scenario(path)
-    assert [app.id for app in scenario.applications] == [11, 12, 13, 15]
+    assert [app.id for app in scenario.applications] == [11]
 
 
 def test_generator_table_has_every_generator() -> None:

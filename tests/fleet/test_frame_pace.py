@@ -9,7 +9,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from smartcam.fleet._frames.pace import LEAST, PATIENCE, SHARE, FramePace
+from smartcam.fleet._frames.pace import MAX_WAIT_SHARE, MIN_WAIT_SECONDS, PATIENCE, FramePace
 from smartcam.frames import FrameSource
 from tests.frames.drivers import ScriptedDriver, frame
 
@@ -54,7 +54,7 @@ def test_frame_has_hardly_waited_and_the_link_is_used(period: float, way: float)
     went = follow(period, way)[3:]
     assert len(went) == 37
     for came, at in went:
-        assert at - came <= max(LEAST, SHARE * way) + 1e-6
+        assert at - came <= max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way) + 1e-6
     for (_, one), (_, other) in itertools.pairwise(went):
         assert other - one <= way + period + 1e-6
 
@@ -73,7 +73,7 @@ def test_rest_is_held_on_average(rest: float) -> None:
     went = follow(1 / 30, 0.005, rest=rest, frames=60)[2:]
     took = (went[-1][1] - went[0][1]) / (len(went) - 1)
     assert abs(took - rest) <= 0.034 / 20
-    assert all(at - came <= LEAST + 1e-6 for came, at in went)
+    assert all(at - came <= MIN_WAIT_SECONDS + 1e-6 for came, at in went)
 
 
 async def test_reader_waits_past_what_has_waited() -> None:

@@ -17,7 +17,14 @@ from smartcam.fleet._bus.bus import Data, MemoryEnd
 from smartcam.fleet._frames import collector as _frame_collector
 from smartcam.fleet._frames.collector import FrameCollector, Incoming
 from smartcam.fleet._frames.features import feature_fields, read_feature
-from smartcam.fleet._frames.sender import MAX_WAITING_BYTES, PART, SMALL, STALE, WINDOW, FrameSender
+from smartcam.fleet._frames.sender import (
+    MAX_UNCOUNTED_BYTES,
+    MAX_WAITING_BYTES,
+    PART_BYTES,
+    STALE_AFTER,
+    WINDOW_BYTES,
+    FrameSender,
+)
 from smartcam.fleet._frames.wire import MAX_FRAME_BYTES, FramePart, decode_part, encode_part
 from smartcam.fleet._inside import Keys
 from smartcam.frames import Feature
@@ -62,11 +69,13 @@ class Wire(MemoryEnd):
 async def test_no_more_is_under_way_than_the_window() -> None:
     wire = Wire()
     sender = FrameSender(wire, Keys(FLEET))
-    data = noise(1, 3 * WINDOW + 7)
+    data = noise(1, 3 * WINDOW_BYTES + 7)
     sender.send("one", 1, data)
     taken = 0
     while len(wire.said["one"]) > taken:
-        assert wire.bytes_of("one") - sum(len(d) for _, d in wire.said["one"][:taken]) <= WINDOW
+        assert (
+            wire.bytes_of("one") - sum(len(d) for _, d in wire.said["one"][:taken]) <= WINDOW_BYTES
+        )
         part, said = wire.said["one"][taken]
         assert (part.call, part.total) == (1, len(data))
         assert said == data[part.offset : part.offset + len(said)]
@@ -79,13 +88,13 @@ async def test_no_more_is_under_way_than_the_window() -> None:
 async def test_program_that_takes_nothing_holds_up_no_other() -> None:
     wire = Wire()
     sender = FrameSender(wire, Keys(FLEET))
-    data = bytes(2 * WINDOW)
+    data = bytes(2 * WINDOW_BYTES)
     for call in range(200):
         sender.send("dead", call, data)
-    assert wire.bytes_of("dead") <= WINDOW
-    assert sender._windows["dead"].waiting <= MAX_WAITING_BYTES + 2 * WINDOW
-    sender.send("other", 1, bytes(WINDOW))
-    assert wire.bytes_of("other") == WINDOW
+    assert wire.bytes_of("dead") <= WINDOW_BYTES
+    assert sender._windows["dead"].waiting <= MAX_WAITING_BYTES + 2 * WINDOW_BYTES
+    sender.send("other", 1, bytes(WINDOW_BYTES))
+    assert wire.bytes_of("other") == WINDOW_BYTES
     sender.forget("dead")
     assert "dead" not in sender._windows
 
@@ -93,19 +102,19 @@ async def test_program_that_takes_nothing_holds_up_no_other() -> None:
 async def test_frame_that_does_not_move_is_given_up() -> None:
     wire = Wire()
     sender = FrameSender(wire, Keys(FLEET))
-    sender.send("one", 1, bytes(2 * WINDOW))
-    sender.send("one", 2, bytes(PART))
+    sender.send("one", 1, bytes(2 * WINDOW_BYTES))
+    sender.send("one", 2, bytes(PART_BYTES))
     assert {part.call for part, _ in wire.said["one"]} == {1}
-    await asyncio.sleep(STALE + 0.1)
-    sender.send("one", 3, bytes(PART))
+    await asyncio.sleep(STALE_AFTER + 0.1)
+    sender.send("one", 3, bytes(PART_BYTES))
     assert wire.said["one"][-1][0].call == 3
 
 
 async def test_frame_that_is_wanted_no_more_makes_room() -> None:
     wire = Wire()
     sender = FrameSender(wire, Keys(FLEET))
-    sender.send("one", 1, bytes(2 * WINDOW))
-    sender.send("one", 2, bytes(PART))
+    sender.send("one", 1, bytes(2 * WINDOW_BYTES))
+    sender.send("one", 2, bytes(PART_BYTES))
     sender.come("one", 1, None)
     assert wire.said["one"][-1][0].call == 2
     sender.come("one", 9, 5)  # one that nobody has
@@ -118,8 +127,8 @@ async def test_small_frame_is_one_part_that_nobody_counts() -> None:
     wire = Wire()
     sender = FrameSender(wire, Keys(FLEET))
     for call in range(5):
-        sender.send("one", call, bytes(SMALL))
-    assert wire.bytes_of("one") == 5 * SMALL
+        sender.send("one", call, bytes(MAX_UNCOUNTED_BYTES))
+    assert wire.bytes_of("one") == 5 * MAX_UNCOUNTED_BYTES
     assert not sender._windows
 
 
@@ -177,15 +186,15 @@ async def test_frame_comes_whole_or_not_at_all(size: int, each: int, fates: list
 
 
 async def test_rest_that_does_not_come_is_given_up_and_told() -> None:
-    data = bytes(2 * WINDOW)
+    data = bytes(2 * WINDOW_BYTES)
     one, told = incoming()
-    one.take(*parts(data, PART)[0])
+    one.take(*parts(data, PART_BYTES)[0])
     begun = asyncio.get_running_loop().time()
     assert await one.whole(len(data)) is None
     waited = asyncio.get_running_loop().time() - begun
     assert waited == pytest.approx(_frame_collector.PART_TIMEOUT, abs=0.1)
     one.forget()
-    assert told.come_to == [PART, None]
+    assert told.come_to == [PART_BYTES, None]
 
 
 @pytest.mark.parametrize(
@@ -265,7 +274,16 @@ async def test_way_that_loses_all_parts_ends_with_an_error() -> None:
             assert "did not come here whole" in str(await gone(anext(frames)))
 
 
-SIZES = [0, 1, SMALL, SMALL + 1, PART, WINDOW, WINDOW + 1, 5_000_000]
+SIZES = [
+    0,
+    1,
+    MAX_UNCOUNTED_BYTES,
+    MAX_UNCOUNTED_BYTES + 1,
+    PART_BYTES,
+    WINDOW_BYTES,
+    WINDOW_BYTES + 1,
+    5_000_000,
+]
 
 
 @pytest.mark.real_time
@@ -302,7 +320,7 @@ async def test_program_that_ends_without_a_word_stops_its_stream_and_no_other(nu
                 assert (await camera.trigger(timeout=PATIENCE)).value.run
                 triggered += 1
                 theirs = plant.agent._sender._windows.values()
-                assert all(one.under_way <= WINDOW for one in theirs)
+                assert all(one.under_way <= WINDOW_BYTES for one in theirs)
             assert triggered > 1 or number != signal.SIGSTOP  # none had to wait for its end
         await plant.driver.rests()
         viewer.signal(signal.SIGCONT)

@@ -12,7 +12,7 @@ import pytest
 from smartcam import ConfigurationError, FrameFormatError, FrameSourceError
 from smartcam.fleet import FleetFrame
 from smartcam.fleet._frames import collector as _frame_collector
-from smartcam.fleet._frames.video import KEY_EVERY, LATE, SharedVideo, VideoUnit
+from smartcam.fleet._frames.video import KEY_EVERY, LATE_SECONDS, SharedVideo, VideoUnit
 from smartcam.frames import Codecs, Frame, FrameSource, find_format
 from smartcam.frames._inside import entry_point, read_stamp
 from smartcam.frames._synthetic import stripes, write_stamp
@@ -243,7 +243,7 @@ async def test_who_is_too_late_gets_nothing_until_a_key_frame_which_are_few() ->
         assert has(units) == [(2, False), (3, False), (4, False)]
         have = units[-1].number
         assert has(await video.after(0)) == [(1, True), (2, False), (3, False), (4, False)]
-        await give(round(LATE / 0.05) + 2)
+        await give(round(LATE_SECONDS / 0.05) + 2)
         late = asyncio.create_task(video.after(have))
         await asyncio.sleep(0.01)
         assert not late.done()

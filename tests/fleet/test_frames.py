@@ -217,7 +217,7 @@ async def test_program_that_asks_no_more_has_nothing_stream() -> None:
         arguments = {"stream": stream, "encoding": "raw", "quality": None}
         counts = _frame_caller.StreamCounts()
         await camera.frame_caller.ask("next_frame", loop.time() + 1, arguments, counts)
-        await asyncio.sleep(_frame_stream.IDLE - 0.1)
+        await asyncio.sleep(_frame_stream.IDLE_TIMEOUT - 0.1)
         assert plant.driver.sink is not None
         await asyncio.sleep(0.2)
         assert plant.driver.sink is None

@@ -23,7 +23,7 @@ from smartcam import _zenoh
 from smartcam._zenoh import BusLink, with_ports
 from smartcam.exceptions import ConnectFailedError, ConnectionLostError, ReservationLostError
 from smartcam.fleet import FleetCamera
-from smartcam.fleet._bus.zenoh import LONG
+from smartcam.fleet._bus.zenoh import MAX_DIRECT_BYTES
 from smartcam.fleet._inside import ZenohEnd
 from smartcam.models import Connected, Disconnected, Reconnected
 from tests.client.clientkit import gone
@@ -330,7 +330,7 @@ async def test_no_connection_lingers_for_as_long_as_a_lease(
                 await asyncio.sleep(0.05)
 
 
-@pytest.mark.parametrize("size", [0, 1, LONG, LONG + 1, 3 << 20])
+@pytest.mark.parametrize("size", [0, 1, MAX_DIRECT_BYTES, MAX_DIRECT_BYTES + 1, 3 << 20])
 async def test_what_is_said_arrives_however_long_it_is(size: int) -> None:
     payload = os.urandom(size)
     async with two_ends() as ends:

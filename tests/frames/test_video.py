@@ -446,7 +446,7 @@ async def test_bytes_that_never_make_a_picture_are_no_stream() -> None:
     camera.pictures = [jpeg(0), *[b"\xff\xd8\xff no picture at all"] * 10_000]
     url = "http://127.0.0.1:{}/#" + LATER
     async with served(camera.serve) as port, frames.open(url.format(port)) as source:
-        with pytest.raises(FrameFormatError, match=r"got bytes that make none for 2 s"):
+        with pytest.raises(FrameFormatError, match=r"got bytes that make no picture for 2 s"):
             await numbers(source)
 
 

@@ -196,7 +196,7 @@ class Link:
 
 def check(data: bytes) -> None:
     """Drive a machine through the steps of ``data``."""
-    with mock.patch.object(framing, "LARGE", 32):
+    with mock.patch.object(framing, "MIN_OWN_BUFFER_BYTES", 32):
         check_machine(data)
 
 

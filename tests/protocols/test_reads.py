@@ -144,7 +144,7 @@ def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
 def test_written_frames_around_every_limit_come_out_whole(
     dialect: FramedDialect, most: int
 ) -> None:
-    limits = (framing.LARGE, framing.MAX_READ_BYTES, DEFAULT_MAX_LENGTH - 1)
+    limits = (framing.MIN_OWN_BUFFER_BYTES, framing.MAX_READ_BYTES, DEFAULT_MAX_LENGTH - 1)
     sizes = [size + more for size in limits for more in (-13, -12, -1, 0, 1)]
     sizes += [8] * 2000
     frames = [Frame(0x20, payload(size)) for size in sizes]
@@ -160,14 +160,15 @@ def test_written_frames_around_every_limit_come_out_whole(
 
 
 @each_header
-@pytest.mark.parametrize("size", [framing.LARGE - 1, framing.LARGE])
+@pytest.mark.parametrize("size", [framing.MIN_OWN_BUFFER_BYTES - 1, framing.MIN_OWN_BUFFER_BYTES])
 def test_written_large_frame_is_not_copied_and_small_ones_are_at_once(
     dialect: FramedDialect, size: int
 ) -> None:
     framer = Framer(dialect.header)
     for _ in range(2):  # the second read has room for the whole frame
         read_into(framer, dialect.encode_frame(Frame(0x20, payload(size)))[:4096], 1 << 30)
-        assert type(framer.buffer) is (memoryview if size == framing.LARGE else bytes)
+        large = size == framing.MIN_OWN_BUFFER_BYTES
+        assert type(framer.buffer) is (memoryview if large else bytes)
         assert framer.next_frame() is None
         framer.clear()
 

@@ -652,7 +652,7 @@ async def test_a_message_that_is_too_long(bridge: Bridge, node: RosbridgeNode) -
     node.serve("~/trigger", TRIGGER, yes)
     await bridge.until(lambda: bridge.services)
     before = bridge.services["/line1/cam3/trigger"]
-    await bridge.say(" " * (_link.LARGEST + 1))
+    await bridge.say(" " * (_link.MAX_MESSAGE_BYTES + 1))
     await bridge.another("/line1/cam3/trigger", before)
     assert (await bridge.call("/line1/cam3/trigger"))["result"] is True
 

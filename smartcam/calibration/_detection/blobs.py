@@ -28,14 +28,14 @@ MIN_SPOT_PIXELS = 9
 MIN_SPECK, LARGEST_SPECK = 3, 24
 """Pixels of a dot that is too small, or that is said to be small, to be told from others."""
 
-LARGEST_PART = 1 / 16
+MAX_PART_OF_IMAGE = 1 / 16
 """A spot covers at most this part of the image's area: a grid has nine dots or more."""
 
 MIN_ELLIPSE_SHARE = 0.85
 """A dot fills at least this part of its moments' ellipse: rectangles fill 0.955, triangles 0.83."""
 
 MAX_ASPECT_RATIO = 6.0
-"""A dot is at most as many times longer than wide: one that is seen 80 degrees from the front."""
+"""Length over width of a dot at most: one that is seen 80 degrees from the front."""
 
 
 MIN_RECTANGLE_SHARE = 0.2
@@ -61,7 +61,7 @@ class Pieces(NamedTuple):
     def spots(self, most: int) -> Spots:
         """Return the filled, round pieces among the ``most`` largest ones."""
         _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= MIN_SPOT_PIXELS) & (areas <= LARGEST_PART * self.dark.size)
+        chosen = (areas >= MIN_SPOT_PIXELS) & (areas <= MAX_PART_OF_IMAGE * self.dark.size)
         chosen &= areas >= MIN_RECTANGLE_SHARE * wide * high
         chosen[0] = False
         kept = np.flatnonzero(chosen)

@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.image import GreyImage
     from smartcam.geometry._inside import Array
 
-USUAL_SIDE = 800
-"""Longest side, pixels, of the image that is looked at in half of this size first, then in this,
-and then in double size, as far as it is as large."""
+USUAL_SIDE_PX = 800
+"""Longest side, pixels, of a usual image: a board is looked for in half of this size, in this size,
+and in double size, as far as the image is as large."""
 
 NEIGHBOURS = 8
 """Saddles around one among which a board's next ones are: four and what else is near."""
 
-PART = 0.45
+FITTED_SHARE = 0.45
 """Edges at a corner are fitted along this part of a square's side, short of the next edges."""
 
 MIN_FITTED_SHARE = 0.6
@@ -68,7 +68,7 @@ WITHIN_SQUARES = np.array(
 """(16, 2), places in the four squares beside a corner, in parts of the ways to the next ones: those
 of two squares that lie opposite each other, then of the other two."""
 
-SAME_BOARD_PX = 3.0
+MAX_SAME_BOARD_OFF_PX = 3.0
 """Median distance of a board's corners as two sizes of an image show them, at most, pixels."""
 
 MAX_ROUNDS = 4
@@ -106,7 +106,7 @@ class Board(NamedTuple):
     def shows(self, other: Board) -> bool:
         """Return True if this board has most of the corners of another one."""
         tree = load("scipy.spatial").cKDTree(self.points)
-        return bool(np.median(tree.query(other.points)[0]) < SAME_BOARD_PX)
+        return bool(np.median(tree.query(other.points)[0]) < MAX_SAME_BOARD_OFF_PX)
 
     def filled(self) -> Board:
         """Return the board with missing corners put where the others say that they are."""
@@ -139,7 +139,7 @@ def boards(image: GreyImage, count: int, *, most: int) -> Iterator[Board]:
 
     The search in a size ends with the first one of ``count`` corners or more.
     """
-    least = math.ceil(max(image.size) / USUAL_SIDE)
+    least = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for times in dict.fromkeys((2 * least, least, (least + 1) // 2)):
         seen = find_saddles(reduced(image.bytes, times))
         largest: Lattice = {}
@@ -205,7 +205,7 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
     inside[inside] = like_corners(image, points[inside], ways[inside])
     if inside.any():
         lengths = np.linalg.norm(ways[inside], axis=2)
-        part = np.minimum(PART, MAX_REACH / lengths.max(axis=1))[:, None, None]
+        part = np.minimum(FITTED_SHARE, MAX_REACH / lengths.max(axis=1))[:, None, None]
         corners = refine_corners(image, points[inside], part * ways[inside])
         aside = np.linalg.norm(corners.points - points[inside], axis=1)
         step = lengths.min(axis=1)

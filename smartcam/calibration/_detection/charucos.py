@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
     from smartcam.geometry._inside import Array
 
-FEWEST = 4
+MIN_CORNERS = 4
 """Corners that fix a pose at least."""
 
 LARGEST_DOUBLED = 2600
@@ -44,12 +44,12 @@ MIN_QUADRANGLES = 5
 
 MIN_MODULE_PIXELS, MAX_UNREAD_MODULE_PIXELS = 0.6, 2.5
 """Pixels of a module of a marker: with fewer it is not read in double size, either; with more there
-is none, where none was read."""
+is not there, where none was read."""
 
 MAX_SQUARES_OFF = 0.3
 """Sides of a square by which a corner may lie off where the nearest markers see it."""
 
-PART = 0.45
+FITTED_SHARE = 0.45
 """The edges at a corner are fitted along this part of a square's side."""
 
 
@@ -83,13 +83,15 @@ def find_charuco(image: GreyImage, target: Charuco, name: str = "") -> TargetVie
     matrix = fit_homography(flat, found)
     if matrix is None:
         raise _not_found(target, "all in a line", len(ids))
-    ways = local_steps(partial(apply_homography, matrix), flat, PART * target.square)
-    clear = (1 - target.marker / target.square) / 2 / PART - 1 / np.linalg.norm(ways, axis=2)
+    ways = local_steps(partial(apply_homography, matrix), flat, FITTED_SHARE * target.square)
+    clear = (1 - target.marker / target.square) / 2 / FITTED_SHARE - 1 / np.linalg.norm(
+        ways, axis=2
+    )
     corners = refine_corners(image, found, ways, clear)
     row, column = np.divmod(ids, target.columns - 1)
     colours = (1 - 2 * ((row + column) % 2)) * np.sign(corners.gains)
     seen = corners.fitted & (colours * (colours @ corners.fitted) > 0)
-    if seen.sum() < FEWEST:
+    if seen.sum() < MIN_CORNERS:
         raise _not_found(target, "clear enough", int(seen.sum()))
     return TargetView(
         target=target,
@@ -110,19 +112,19 @@ def _numbered(image: GreyImage, target: Charuco) -> _Sighting:
     """
     seen = _detect(image, target)
     count = len(seen.ids)
-    if seen.otherwise >= max(FEWEST, seen.agreeing + 1):
+    if seen.otherwise >= max(MIN_CORNERS, seen.agreeing + 1):
         raise _other_pattern(target, seen)
     check_one_board(seen.agreeing, seen.contrary, _name(target))
-    if 2 * count > max(len(target.points), 4 * FEWEST):
+    if 2 * count > max(len(target.points), 4 * MIN_CORNERS):
         return seen
-    if seen.side and len(_detect(_flipped(image), target).ids) >= max(FEWEST, 2 * count):
+    if seen.side and len(_detect(_flipped(image), target).ids) >= max(MIN_CORNERS, 2 * count):
         raise Code.MIRRORED.refusal(
             f"{_name(target)}: expected an image of the sheet "
             "as one reads it, got one that is mirrored",
             "the sheet as one reads it",
             "its mirror image",
         )
-    if count < FEWEST:
+    if count < MIN_CORNERS:
         read = f"beside {seen.markers} markers of its dictionary"
         if seen.markers:
             read += f", of which {seen.agreeing} stand to each other as on such a board"
@@ -186,7 +188,7 @@ def _detect(image: GreyImage, target: Charuco) -> _Sighting:
 
 def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
     """Return True if all corners were found that should be in the image."""
-    if len(seen.ids) < FEWEST:
+    if len(seen.ids) < MIN_CORNERS:
         return False
     matrix = fit_homography(target.points[seen.ids, :2], seen.points)
     if matrix is None:
@@ -302,8 +304,8 @@ def _side_in_rows(quads: Sequence[Array], board: Any) -> float:
 
 def _not_found(target: Charuco, how: str, count: int) -> CalibrationError:
     return Code.TARGET_NOT_FOUND.refusal(
-        f"charuco: expected at least {FEWEST} corners of a board of {target.columns} x "
+        f"charuco: expected at least {MIN_CORNERS} corners of a board of {target.columns} x "
         f"{target.rows} squares, found {count} {how}",
-        FEWEST,
+        MIN_CORNERS,
         count,
     )

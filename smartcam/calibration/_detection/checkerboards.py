@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from smartcam.calibration._detection.boards import (
+    FITTED_SHARE,
     MIN_FITTED_SHARE,
-    PART,
     boards,
     completed,
     like_corners,
@@ -179,11 +179,11 @@ def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
     some[doubted] = like_corners(image, points[doubted], steps[doubted])
     some &= inside
     if some.all():
-        return refine_corners(image, points, PART * steps)
+        return refine_corners(image, points, FITTED_SHARE * steps)
     covariance = np.tile(UNREFINED**2 * np.eye(2), (len(points), 1, 1))
     corners = Corners(points.copy(), covariance, np.zeros(len(points)), np.zeros_like(some))
     if some.any():
-        found_there = refine_corners(image, points[some], PART * steps[some])
+        found_there = refine_corners(image, points[some], FITTED_SHARE * steps[some])
         for mine, other in zip(corners, found_there, strict=True):
             mine[some] = other
     return corners
@@ -287,7 +287,7 @@ def _number_part(
     """Return the numbering of a part of a board whose mark is seen; None where no mark is seen.
 
     Beside the dark dot at the origin the paper is light: around the dot, and along both of the
-    board's edges that meet there. So a place within the board or on something else is none.
+    board's edges that meet there. So a place within the board or on something else is no corner.
     """
     found = []
     for way in ways:
@@ -335,7 +335,7 @@ class _Shades(NamedTuple):
 
 def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arrangement) -> _Shades:
     grid = corners.points[way.order]
-    squares = sorted(mean_level(image, _near(grid, at + PART * DISC)) for at in SQUARES)
+    squares = sorted(mean_level(image, _near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES)
     area = target.corner_areas[0] / target.square + AREA_PART * AREA_DIAMETER / 2 * DISC
     seen = _near(grid, area)
     inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()

@@ -39,7 +39,7 @@ WIDE, NARROW = 1.0, 0.3
 """Side of the square that a pixel is compared with, in distances between dots of a grid that fills
 the image."""
 
-SMALL_SIDE = 800
+SMALL_SIDE_PX = 800
 """Longest side of the image in which a grid is looked for first, pixels."""
 
 MIN_DOT_SHARE = 0.4
@@ -107,7 +107,7 @@ def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool,
     dots of a few pixels.
     """
     longest = max(image.shape)
-    times, usual = math.ceil(longest / SMALL_SIDE), min(1.0, USUAL_SIZE / longest)
+    times, usual = math.ceil(longest / SMALL_SIDE_PX), min(1.0, USUAL_SIZE / longest)
     most = MORE_SPOTS + 2 * len(target.points)
     if times > 1:
         small = reduced(image, times)

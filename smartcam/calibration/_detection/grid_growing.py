@@ -27,7 +27,7 @@ NEIGHBOURS = 12
 """Dots around one among which those opposite each other are looked for: a grid's eight next ones
 and what may be printed between."""
 
-OPPOSITE = 0.2
+MAX_OPPOSITE_DIFFERENCE = 0.2
 """Steps to two opposite dots differ by less than this part of the shorter step."""
 
 MIN_SINE = 0.5
@@ -38,22 +38,22 @@ NEAR, NEAR_FIRST = 0.3, 0.2
 """A dot is the grid's next one where it lies within this part of a step of the place to which the
 step leads. The second part counts within two steps of the first dot, where steps change less."""
 
-ALIKE = 1.8
+MAX_AREA_RATIO = 1.8
 """A dot has at most as many times the area of its neighbour."""
 
-REGULAR = 0.08
+MAX_MEDIAN_OFF = 0.08
 """The dots of a flat grid lie off their places by less than this part of a step in the median:
 lenses bend a grid of fewer than 20 dots by less."""
 
 MAX_SEEDS_RANKED = 128
-"""Dots with the best two opposite each other, among which those are chosen that have four."""
+"""Dots, ranked by their best pair of opposite neighbours, that are searched for a second pair."""
 
 MAX_SEEDS_TRIED = 4
 """A grid is grown from at most this many dots. A grid's dots stand opposite each other more exactly
 than dots that do so by chance, so the first dot that is tried is the grid's as a rule."""
 
 MIN_DOTS_REACHED = 8
-"""Dots that are reached by two steps from a grid's dot at least, itself among them."""
+"""Dots of a grid that must be within two steps of its first dot, that dot included."""
 
 Place = tuple[int, int]
 
@@ -101,11 +101,11 @@ def lattices(
 
 
 def alike_areas(areas: Array, larger: float = 1.0) -> Alike:
-    """Return a test of dots for like ``areas`` (N,), or for one ``larger`` times the other."""
+    """Return a test that dots' ``areas`` (N,) are alike, or one ``larger`` times the other."""
 
     def alike(one: NDArray[np.intp], other: NDArray[np.intp]) -> NDArray[np.bool_]:
         part = areas[one] / (larger * areas[other])
-        return np.asarray((part < ALIKE) & (part > 1 / ALIKE))
+        return np.asarray((part < MAX_AREA_RATIO) & (part > 1 / MAX_AREA_RATIO))
 
     return alike
 
@@ -138,10 +138,14 @@ class _Grown:
         apart = np.sqrt(np.maximum(apart, 0) / np.minimum(squares[:, :, None], squares[:, None]))
         apart[~(alike[:, :, None] & alike[:, None])] = np.inf
         best = apart.min(axis=(1, 2))
-        ranked = np.argsort(best)[: min(MAX_SEEDS_RANKED, int((best < OPPOSITE).sum()))]
+        ranked = np.argsort(best)[
+            : min(MAX_SEEDS_RANKED, int((best < MAX_OPPOSITE_DIFFERENCE).sum()))
+        ]
         worse = _across(ways[ranked], apart[ranked])
-        for index in ranked[np.argsort(worse)][: int((worse < OPPOSITE).sum())].tolist():
-            ahead, behind = np.nonzero(np.triu(apart[index] < OPPOSITE))
+        for index in ranked[np.argsort(worse)][
+            : int((worse < MAX_OPPOSITE_DIFFERENCE).sum())
+        ].tolist():
+            ahead, behind = np.nonzero(np.triu(apart[index] < MAX_OPPOSITE_DIFFERENCE))
             steps = (ways[index, ahead] - ways[index, behind]) / 2
             steps = steps[np.argsort(np.linalg.norm(steps, axis=1))]
             across, *others = steps
@@ -210,7 +214,7 @@ class _Grown:
     ) -> list[list[list[int]]]:
         """Return for each dot and each of its four sides the dots that may be next there.
 
-        ``limit``: of a step, from where it leads to such a dot at most.
+        ``limit``: largest distance of such a dot from the end of the step, as a part of the step.
         """
         dots = np.array([dot for _, dot, _, _ in reached])
         like = np.array([like for _, _, _, like in reached])
@@ -250,4 +254,4 @@ def _is_regular(points: Array, grid: Lattice) -> bool:
     seen = GridMap(places, found)
     off = np.linalg.norm(seen(places) - found, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
-    return bool(np.median(off / steps) < REGULAR)
+    return bool(np.median(off / steps) < MAX_MEDIAN_OFF)

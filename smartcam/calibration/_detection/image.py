@@ -12,10 +12,10 @@ from smartcam.geometry import Code
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-SMALLEST = 16
+MIN_SIDE = 16
 """Width and height of an image at least, pixels."""
 
-LARGEST = 20_000
+MAX_SIDE = 20_000
 """Width and height of an image at most, pixels."""
 
 USUAL_SIZE = 1600
@@ -66,12 +66,12 @@ def grey_image(image: Any) -> GreyImage:
         isinstance(image, np.ndarray)
         and fits
         and kind in (np.uint8, np.uint16)
-        and all(SMALLEST <= side <= LARGEST for side in shape[:2])
+        and all(MIN_SIDE <= side <= MAX_SIDE for side in shape[:2])
     ):
         what = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
         raise Code.SHAPE.unexpected(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
-            f"{SMALLEST} to {LARGEST} pixels wide and high",
+            f"{MIN_SIDE} to {MAX_SIDE} pixels wide and high",
             "uint8 or uint16, (H, W) or (H, W, 3)",
             what,
         )

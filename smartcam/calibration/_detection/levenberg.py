@@ -36,7 +36,7 @@ MIN_HALF_STEP = 4.0
 MAX_STEPS = 20
 """A fit takes at most this many steps; most fits take four to seven."""
 
-STILL = 1e-3
+MAX_LAST_MOVE_PX = 1e-3
 """Pixels by which a point moves in the last step at most."""
 
 RIDGE = 1e-6
@@ -128,7 +128,7 @@ def _solve(
         better = tried.cost <= best.cost[active]
         best.put(active, tried, better)
         damping[active] *= np.where(better, 0.1, 10.0)
-        still = np.abs(step[:, moving]).max(axis=1) < STILL
+        still = np.abs(step[:, moving]).max(axis=1) < MAX_LAST_MOVE_PX
         settled[active[still]] = True
         windows, active = windows.some(~still), active[~still]
         if not len(active):

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import MarkerGrid
     from smartcam.geometry._inside import Array
 
-PART = 0.9
+FITTED_SHARE = 0.9
 """Part of the black border, or of the white gap beside a corner, that is fitted."""
 
 MAX_MOVED_PX = 1.0
@@ -103,7 +103,7 @@ def _read(bytes_: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Marker
 
 
 def _refined(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points: Array) -> Corners:
-    """Return corners of markers, which four squares meet at, or the marker's one alone."""
+    """Return corners of markers; four squares meet at one, or it is the marker's alone."""
     flat = target.points[ids, :2]
     matrix = fit_homography(flat, points)
     if matrix is None:
@@ -111,7 +111,7 @@ def _refined(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points
             f"{target.kind}: expected corners that are not all in a line"
         )
     modules = marker_dictionary(target.dictionary, 0, target.kind).markerSize + 2 * target.border
-    clear = PART * min(target.border * target.marker / modules, target.gap)
+    clear = FITTED_SHARE * min(target.border * target.marker / modules, target.gap)
     ways = local_steps(partial(apply_homography, matrix), flat, clear)
     if target.kalibr:
         return refine_corners(image, points, ways)

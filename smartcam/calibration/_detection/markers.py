@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from smartcam.geometry._inside import Array
 
-NEIGHBOUR_PITCHES = 2.9
+MAX_NEIGHBOUR_PITCHES = 2.9
 """Distance on the board, in distances of next neighbours, up to which two markers are compared."""
 
 MAX_ASIDE = 0.15
@@ -58,7 +58,7 @@ class Markers(NamedTuple):
     ids: NDArray[np.intp]  # (N,)
 
     def some(self, which: NDArray[np.bool_]) -> Markers:
-        """Return some of them."""
+        """Return some of the markers."""
         return Markers(self.quads[which], self.ids[which])
 
 
@@ -106,7 +106,7 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     flat = board[ids]
     seen, mapped, slopes = quads.mean(axis=1), flat.mean(axis=1), _slopes(quads, flat)
     pitch = _pitch(board.mean(axis=1))
-    groups = _hanging_together(_agreements(slopes, seen, mapped, NEIGHBOUR_PITCHES * pitch))
+    groups = _hanging_together(_agreements(slopes, seen, mapped, MAX_NEIGHBOUR_PITCHES * pitch))
     largest = groups == np.bincount(groups).argmax()
     matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
     if largest.sum() < MIN_AGREEING or matrix is None:

@@ -18,12 +18,12 @@ LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
 """Pixels beside a chart, above it, below it, and on the right."""
 
 ADVANCE: Final = 7.5
-"""Width of a letter, about, pixels."""
+"""Approximate width of a letter, pixels."""
 
 CUT: Final = 3.0
-"""Bars that are higher than the highest of a used view by more are cut, with their number."""
+"""Multiple of the highest bar of a used view beyond which a bar is cut, with its number."""
 
-LINES: Final = 5
+MAX_LINES: Final = 5
 """Horizontal lines of a chart at most."""
 
 DIGITS: Final = "0123456789"
@@ -79,7 +79,7 @@ def _common(names: Sequence[str]) -> str:
 def _chart(chart: Chart, top: float) -> Iterator[str]:
     largest = _largest(chart)
     step = round_down(largest / 2)
-    step *= next(factor for factor in (1, 2, 5, 10) if largest / (step * factor) <= LINES - 1)
+    step *= next(factor for factor in (1, 2, 5, 10) if largest / (step * factor) <= MAX_LINES - 1)
     foot = top + HEAD + HEIGHT
     zoom = HEIGHT / (1.08 * largest)
     yield from _legend(chart, top + 24)

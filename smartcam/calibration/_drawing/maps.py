@@ -30,9 +30,9 @@ Source: S. van der Walt and N. Smith, viridis (public domain).
 """
 
 STEPS: Final = 24
-"""Colours of a map: neighbours in one merge into one rectangle."""
+"""Colours of a map: neighbours of one colour merge into one rectangle."""
 
-DECADES: Final = 3.0
+MAX_DECADES: Final = 3.0
 """A map's colours span this many powers of ten at most; smaller values have the first colour."""
 
 TICKS: Final = 5
@@ -54,7 +54,7 @@ def draw_maps(maps: Sequence[Map], title: str, unit: str) -> str:
     positive = known[known > 0.0]
     most = float(positive.max()) if len(positive) else 1.0
     least = float(positive.min()) if len(positive) else 0.1
-    least = max(min(least, 0.999 * most), most / 10.0**DECADES)
+    least = max(min(least, 0.999 * most), most / 10.0**MAX_DECADES)
     tall = max(WIDTH * one.size[1] / one.size[0] for one in maps)
     parts = [text((BORDER, 28), title, "title")] if title else []
     for number, one in enumerate(maps):

@@ -114,7 +114,7 @@ class SavedCalibration(Stored):
     """Name of the calibration's kind of file in the store."""
 
     def save(self, path: str | Path) -> None:
-        """Write it to a file, whole or not at all; see :mod:`smartcam.calibration._files.store`."""
+        """Write the calibration to a file, whole or not at all, as the store does."""
         store.write(path, self.kind, self.to_data())
 
     @classmethod

@@ -46,7 +46,7 @@ def is_in_hand(setup: object, what: str) -> bool:
     return setup == "eye-in-hand"
 
 
-SMALLEST_GAIN = 1e-11
+MIN_GAIN = 1e-11
 """The last step gains less than this part of the cost, where the result is given out."""
 
 ROUGH_GAIN = 1e-7
@@ -367,7 +367,7 @@ def adjust(
     start: Solution,
     noise: RobotNoise | None = None,
     *,
-    gain: float = SMALLEST_GAIN,
+    gain: float = MIN_GAIN,
 ) -> Solution:
     """Minimise the weighted squares by Levenberg and Marquardt's steps.
 

@@ -47,7 +47,7 @@ nothing."""
 COARSE = 5
 """Values of each standard deviation that are tried at first."""
 
-ROUNDS = 4
+MAX_ROUNDS = 4
 """Rounds of adjusting and estimating at most; the estimate hardly changes after two."""
 
 SETTLED = 0.02
@@ -61,7 +61,7 @@ def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solu
     """
     noise = start.noise or RobotNoise(FIRST, FIRST_SHARED)
     found = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
-    for number in range(ROUNDS):
+    for number in range(MAX_ROUNDS):
         if not math.isfinite(found.cost):
             break
         before = noise

@@ -40,7 +40,7 @@ FOLDS = 20
 MIN_VIEWS_FOR_OFFSET = 10
 """Views that an offset takes: it is one unknown more, of which each view tells a little."""
 
-TOLD = 0.25
+MAX_TOLD_SIGMA = 0.25
 """Largest sigma of an offset that is told, as a part of the range."""
 
 
@@ -99,7 +99,7 @@ def estimate_time_offset(
     others = [fit.refined(everything[part != fold], found) for fold in folds]
     scatter = math.sqrt(float(jackknife(np.array(others)[:, None])[0, 0]))
     sigma = max(scatter, fit.least_sigma(found, everything))
-    if abs(found) > 0.99 * most or sigma > TOLD * most:
+    if abs(found) > 0.99 * most or sigma > MAX_TOLD_SIGMA * most:
         raise Code.BAD_TIME.refusal(
             f"time offset: expected views that tell one within {most:g} s, got {found:.3g} s with "
             f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",

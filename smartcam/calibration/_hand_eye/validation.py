@@ -1,7 +1,7 @@
 """Check whether a robot's poses and the views belong together, and which of them do not.
 
-Some of the poses tell where camera and target are by a closed form; what most of the poses agree
-with is taken. So a few poses that belong to other views do not spoil the rest.
+A closed form finds camera and target from each of many small groups of poses. The answer with which
+most of all poses agree is taken, so a few poses that belong to other views do not spoil the rest.
 """
 
 from __future__ import annotations
@@ -36,33 +36,33 @@ if TYPE_CHECKING:
     from smartcam.geometry import Transform
     from smartcam.geometry._inside import Array
 
-CLOSED: Final = ("park", "shah")
-"""Closed forms that are tried, of unlike kinds: one stands where the other fails."""
+CLOSED_FORMS: Final = ("park", "shah")
+"""Closed forms that are tried. They are of different kinds: where one fails, the other works."""
 
-PART: Final = 4
-"""Poses of a part: one more than have to be."""
+POSES_OF_PART: Final = 4
+"""Poses in one group: one more than a closed form needs."""
 
-PARTS: Final = 60
-"""Parts that are tried: where a third of the poses is wrong, one in six parts is right."""
+MAX_PARTS: Final = 60
+"""Groups that are tried: where a third of the poses is wrong, one group in six is all right."""
 
-GROSS: Final = 10.0
-"""A pose that is more times the median off belongs to another view, if it is nowhere near, too."""
+GROSS_MEDIANS: Final = 10.0
+"""Multiple of the median error beyond which a pose belongs to another view."""
 
 OTHER_WAY: Final = 5.0
-"""Poses that fit as many times better when inverted, or a view numbered from the target's other
-end, are taken for given so."""
+"""Factor by which poses must fit better when inverted, or a view when numbered from the target's
+other end, to be taken as given that way."""
 
 OTHERWISE: Final = 20.0
-"""Poses that fit as many times better when transposed, mirrored or in another unit of length are
-taken for given so: these readings are rarer than one pose too many of another view."""
+"""Factor by which poses must fit better when transposed, mirrored or in another unit of length, to
+be taken as given that way: such mistakes are rarer than a pose of another view."""
 
-POOREST: Final = RobotSigmas(math.radians(2.0), 0.01)
+WORST_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
 """Largest noise of a robot that is any good: 2 degrees and 10 mm."""
 
 MILLI: Final = 1e-3
 
-MIRROR: Final = np.diag([-1.0, 1.0, 1.0])
-"""Mirror of one axis; any does, as mirrors differ by turns that base and flange make up for."""
+X_MIRROR: Final = np.diag([-1.0, 1.0, 1.0])
+"""Mirror of the x axis: mirrors of other axes differ by rotations of base and flange only."""
 
 
 class Agreed(NamedTuple):
@@ -78,8 +78,8 @@ class Agreed(NamedTuple):
         return float(np.median(self.off))
 
     def gross(self, limit: float) -> NDArray[np.intp]:
-        """Return the poses that are more than ``limit`` off, and far more than the others."""
-        return np.flatnonzero(self.off > max(limit, GROSS * self.median))
+        """Return the indices of poses that are off by more than ``limit``, far more than others."""
+        return np.flatnonzero(self.off > max(limit, GROSS_MEDIANS * self.median))
 
 
 def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
@@ -102,9 +102,9 @@ def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
 
 
 def extent(problem: Problem) -> float:
-    """Return the error at which a calibration says nothing, metres.
+    """Return the error from which on a calibration is meaningless, metres.
 
-    That is the target's extent, or without views half of its distance.
+    It is the target's extent; without views it is half of the target's distance.
     """
     if isinstance(problem.seen, PixelObservations):
         return float(np.ptp(problem.seen.points.reshape(-1, 3), axis=0).max())
@@ -122,7 +122,7 @@ def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
 
 def most_error(problem: Problem) -> float:
     """Return the error beyond which poses and views do not belong together, metres."""
-    return min(extent(problem), expected_error(problem, POOREST))
+    return min(extent(problem), expected_error(problem, WORST_ROBOT))
 
 
 def agreement(problem: Problem) -> Agreed | None:
@@ -140,19 +140,19 @@ def agreement(problem: Problem) -> Agreed | None:
 
 
 def _parts(count: int) -> Iterator[NDArray[np.intp]]:
-    """Return all poses, and parts of them; always the same ones."""
+    """Yield the numbers of all poses, and of groups of them; always the same groups."""
     yield np.arange(count)
-    if count > PART:
+    if count > POSES_OF_PART:
         random = np.random.default_rng(count)
-        for _ in range(PARTS):
-            yield np.sort(random.choice(count, PART, replace=False))
+        for _ in range(MAX_PARTS):
+            yield np.sort(random.choice(count, POSES_OF_PART, replace=False))
 
 
 def _better(
     problem: Problem, numbers: NDArray[np.intp], arm: float, best: Agreed | None
 ) -> Agreed | None:
-    """Return the motion by some of the poses if all of them agree with it better."""
-    for name in CLOSED:
+    """Return the motion of these poses if all poses agree with it better than with ``best``."""
+    for name in CLOSED_FORMS:
         found = solve_linear(name, problem.robot.taken(numbers), problem.poses.taken(numbers))
         if found is None:
             continue
@@ -177,7 +177,7 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
     the origin: the robot's motions tell. ``arm``: the target's extent, metres.
     """
     least, other = math.inf, np.zeros(poses.size, dtype=np.bool_)
-    for numbers, name in itertools.product(_parts(poses.size), CLOSED):
+    for numbers, name in itertools.product(_parts(poses.size), CLOSED_FORMS):
         found = solve_linear(name, robot.taken(numbers), poses.taken(numbers))
         if found is None:
             continue
@@ -190,10 +190,10 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
 
 
 def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]]:
-    """Yield ways in which poses may have been meant.
+    """Yield other readings of the poses.
 
-    The poses when read so, how many times better they must fit then, the error's code, and how it
-    reads and what is wrong then.
+    Each is the poses in this reading, the factor by which they must fit better, the error's code,
+    and words for the reading and the mistake.
     """
     poses, in_hand = robot.poses, robot.in_hand
     how = "the other way round: they are inverted, or the camera is on the other side"
@@ -201,7 +201,7 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
     turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
     how = "with rotations transposed: their matrices or quaternions are those of the way back"
     yield RobotPoses(turned, in_hand), OTHERWISE, Code.WRONG_FRAME, how
-    mirrored = Rigid(MIRROR @ poses.rotation @ MIRROR, poses.translation @ MIRROR)
+    mirrored = Rigid(X_MIRROR @ poses.rotation @ X_MIRROR, poses.translation @ X_MIRROR)
     how = "in a left-handed base: expected axes x, y, z of a right hand"
     yield RobotPoses(mirrored, in_hand), OTHERWISE, Code.MIRRORED, how
     how = "as millimetres: expected metres"
@@ -240,9 +240,10 @@ def check_poses(problem: Problem) -> Agreed:
 
 
 def poor_fit(what: str, off: float | None) -> CalibrationError:
-    """Return the error that poses and views do not belong together; ``what`` was got instead.
+    """Return the error for poses and views that do not belong together.
 
-    ``off``: by how much the target is off, metres; None where that is not known.
+    ``what``: description of what came instead. ``off``: error of the target, metres; None where it
+    is not known.
     """
     return Code.POOR_FIT.refusal(
         f"hand-eye: expected a camera that sees the target where it is, got {what}: are the poses "

@@ -43,10 +43,10 @@ no view tells, in parts of a point's distance to the next."""
 ANEW: Final = 1e-5
 """Part of the weighted squares by which the last step lowers them, in a fit without a pose."""
 
-FEW: Final = 5
+MAX_FEW_POSES: Final = 5
 """Poses up to which a fit without one of them is no small step away."""
 
-BENT: Final = 1.2
+MAX_BEND: Final = 1.2
 """Squares of a pose that was left out over those that one step foretells, beyond which the way is
 too bent for one step: lenses whose coefficients make up for each other."""
 
@@ -269,7 +269,7 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
         without = whole.moved(shared, part[3] - part[2] @ shared)
         squares = at.cost - float((at.own_right * part[3]).sum()) - 2.0 * part[1] @ shared
         squares += float(shared @ part[0] @ shared)
-        if len(poses) <= FEW or not equations.normal(without).cost <= BENT * squares:
+        if len(poses) <= MAX_FEW_POSES or not equations.normal(without).cost <= MAX_BEND * squares:
             without = _fitted_without(adjusted, sights, pose, own)
         found.append(LeftOut(pose, without, residuals(without, own), by_noise[:count]))
     return found

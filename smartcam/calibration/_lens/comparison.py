@@ -10,7 +10,7 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, an_integer, each, or_none, takes
 from smartcam.calibration._lens.field import (
-    LEAST,
+    MIN_MOTION_PLACES,
     SHAPE,
     check_distance,
     known_points,
@@ -33,16 +33,16 @@ CELLS: Final = (6, 8)
 LEVEL: Final = 0.01
 """Probability with which noise alone may make two calibrations differ as much."""
 
-SMALLEST: Final = 1e-9
+MIN_CHANCE: Final = 1e-9
 """A chance that is less is not told: the noise is not as normal as that."""
 
-STEPS: Final = 50
+MAX_STEPS: Final = 50
 """The fit of the motion takes at most this many steps; it usually takes five."""
 
 SETTLED: Final = 1e-9
 """Pixels: a step that moves nothing by more is the last."""
 
-TINY: Final = 1e-3
+MIN_DIFFERENCE_PX: Final = 1e-3
 """Pixels: what moves places by less does not count as a difference."""
 
 
@@ -130,7 +130,7 @@ class LensComparison:
         """The same in words."""
         if self.chance is None or self.ratio is None:
             return "no verdict: it takes the noise of both, as two calibrations with views have it"
-        chance = f"{self.chance:.2g}" if self.chance > SMALLEST else f"below {SMALLEST:g}"
+        chance = f"{self.chance:.2g}" if self.chance > MIN_CHANCE else f"below {MIN_CHANCE:g}"
         noise = f"{self.ratio:.2f} times what noise leads to, chance {chance}"
         if self.same:
             return f"the same within their noise: {noise}"
@@ -244,7 +244,7 @@ def _gauge(a: Lens, b: Lens, distance: float | None) -> tuple[Array, bool]:
     common = set(cells[0]).intersection(*cells)
     both = np.concatenate([points for _, points in known])
     shared = both[np.isin(np.concatenate(cells), list(common))]
-    return known_points(shared if len(common) >= LEAST else both), False
+    return known_points(shared if len(common) >= MIN_MOTION_PLACES else both), False
 
 
 def _cells(camera: CameraModel, points: Array) -> list[int]:
@@ -261,7 +261,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
     ``far``: they are directions, so it is a turn. Gauss and Newton.
     """
     seen, motion = first.project(gauge), IDENTITY
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         moved = gauge @ motion.rotation.T + motion.translation
         by_motion = sensitivity(second, moved, far=far).by_motion.reshape(-1, 6)
         off = (seen - _project(second, moved)).reshape(-1)
@@ -312,7 +312,7 @@ def _judged(difference: Array, spread: Array, views: int) -> tuple[float, float]
             "compare: expected lenses that reach the same places of the image, got none", got=0
         )
     off, moves = difference[known], spread[known]
-    back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + TINY**2 * np.eye(2))
+    back = np.linalg.inv(moves @ moves.swapaxes(1, 2) + MIN_DIFFERENCE_PX**2 * np.eye(2))
     squares = float(np.einsum("ni,nij,nj->", off, back, off)) / (2 * len(off))
     gram = np.einsum("nip,nij,njq->pq", moves, back, moves)
     total, power = float(np.trace(gram)), float((gram**2).sum())

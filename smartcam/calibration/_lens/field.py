@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 SHAPE: Final = (25, 33)
 """Rows and columns of a map: odd numbers, so that the middle is one of its places."""
 
-MOST: Final = 500
+MAX_MAP_SIDE: Final = 500
 """Rows, and columns, of a map at most."""
 
-SAME: Final = 1e-3
+MAX_ROUND_TRIP_PX: Final = 1e-3
 """Pixels by which a pixel may be off when its direction is projected again."""
 
-LEAST: Final = 6
+MIN_MOTION_PLACES: Final = 6
 """Places that a motion is fitted to at least: three tell it."""
 
 
@@ -58,7 +58,7 @@ class Sensitivity(NamedTuple):
 
 
 def check_distance(distance: float | None) -> None:
-    """Refuse a distance that is none; None means infinity. Raises ``NOT_FINITE``."""
+    """Refuse a distance that is not valid; None means infinity. Raises ``NOT_FINITE``."""
     if distance is not None and not (math.isfinite(distance) and distance > 0.0):
         raise Code.NOT_FINITE.unexpected(
             "distance: expected a positive number of metres, or None for infinity",
@@ -72,9 +72,11 @@ def places(size: tuple[int, int], shape: tuple[int, int]) -> Array:
 
     Raises ``SHAPE``: fewer than 2 rows or columns, or more than 500.
     """
-    if len(shape) != 2 or not all(2 <= one <= MOST for one in shape):
+    if len(shape) != 2 or not all(2 <= one <= MAX_MAP_SIDE for one in shape):
         raise Code.SHAPE.unexpected(
-            f"shape of a map: expected rows and columns, each from 2 to {MOST}", (2, MOST), shape
+            f"shape of a map: expected rows and columns, each from 2 to {MAX_MAP_SIDE}",
+            (2, MAX_MAP_SIDE),
+            shape,
         )
     rows, columns = (
         np.linspace(0.0, side - 1.0, count) for side, count in zip(size[::-1], shape, strict=True)
@@ -92,7 +94,7 @@ def points_at(camera: CameraModel, pixels: Array, distance: float | None) -> Arr
     ahead[~np.isfinite(ahead).all(axis=1)] = [0.0, 0.0, 1.0]
     off = np.linalg.norm(camera.project(ahead) - pixels, axis=1)
     points: Array = ahead / np.linalg.norm(ahead, axis=1, keepdims=True) * (distance or 1.0)
-    points[~(off < SAME)] = np.nan
+    points[~(off < MAX_ROUND_TRIP_PX)] = np.nan
     return points
 
 
@@ -114,11 +116,11 @@ def sensitivity(camera: CameraModel, points: Array, *, far: bool = False) -> Sen
 def known_points(points: Array) -> Array:
     """Return the points of (N, 3) that a motion may be fitted to; ``OUT_OF_FIELD``: too few."""
     known = points[np.isfinite(points).all(axis=1)]
-    if len(known) < LEAST:
+    if len(known) < MIN_MOTION_PLACES:
         raise Code.OUT_OF_FIELD.refusal(
-            f"field of the lens: expected {LEAST} places or more that its model reaches, "
-            f"got {len(known)} of {len(points)}",
-            LEAST,
+            f"field of the lens: expected {MIN_MOTION_PLACES} places or more that its model "
+            f"reaches, got {len(known)} of {len(points)}",
+            MIN_MOTION_PLACES,
             len(known),
         )
     return known

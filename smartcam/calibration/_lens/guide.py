@@ -61,7 +61,7 @@ TURNS: Final = 12
 MAP: Final = (9, 12)
 """Rows and columns of the field over which the uncertainty is counted."""
 
-SAME_RAY: Final = 1e-3
+MAX_SAME_RAY_ANGLE: Final = 1e-3
 """Angle between a point and the ray of its pixel, radians, beyond which the lens' model folds."""
 
 
@@ -269,7 +269,7 @@ def _visible(camera: CameraModel, points: Array) -> Mask:
     back = points_at(camera, np.where(inside, seen, 0.0), None)
     ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
     off = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
-    good: Mask = off.max(axis=1) < SAME_RAY
+    good: Mask = off.max(axis=1) < MAX_SAME_RAY_ANGLE
     return good
 
 

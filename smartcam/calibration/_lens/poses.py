@@ -45,13 +45,13 @@ MIN_AGREEMENT: Final = 0.5
 """A view's agreement with its target must be below minus this; above plus this the view shows the
 sheet in a mirror. Views of steep sheets and of fisheyes have -0.8."""
 
-NUDGE: Final = 1e-9
+MAX_NUDGE: Final = 1e-9
 """Rays are moved by at most this part of the focal length to keep a solver from rounding errors."""
 
-UNSURE: Final = 4.0
+MAX_UNSURE_RATIO: Final = 4.0
 """Squares of residuals of one pose over those of the other, up to which both are refined first."""
 
-SAME: Final = 1e-3
+MAX_SAME_TURN: Final = 1e-3
 """Turn between two poses, rad, up to which both are the same minimum."""
 
 
@@ -115,7 +115,9 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
     if more:
         found = [adjust(one.bundle, sights, more) for one in found]
     best, pose = found[0], found[0].bundle.poses
-    other = next((one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > SAME), None)
+    other = next(
+        (one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > MAX_SAME_TURN), None
+    )
     rms = view_rms(best.residuals[0])
     return TargetPose(
         transform=_transform(best),
@@ -227,7 +229,7 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     rays = camera.directions(view.points)
     found = _ippe(view.object_points, rays)
     if not found:  # on exact rays OpenCV takes the root of a negative rounding error
-        found = _ippe(view.object_points, rays + NUDGE * np.sin(np.arange(len(rays)))[:, None])
+        found = _ippe(view.object_points, rays + MAX_NUDGE * np.sin(np.arange(len(rays)))[:, None])
     return found
 
 
@@ -244,7 +246,7 @@ def _likeliest(view: TargetView, camera: CameraModel) -> Rigid:
     off = (camera.project(one.apply(view.object_points)) - view.points for one in found)
     squares = [float(np.nan_to_num((one**2).sum(), nan=math.inf)) for one in off]
     best, second, *_ = [*sorted(squares), math.inf, math.inf]
-    if math.isfinite(best) and second > UNSURE * best:
+    if math.isfinite(best) and second > MAX_UNSURE_RATIO * best:
         return found[squares.index(best)]
     return locate(view, camera).transform.rigid
 

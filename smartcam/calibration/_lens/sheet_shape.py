@@ -31,7 +31,7 @@ Sheet: TypeAlias = Literal["auto", "exact", "free"]
 """Assumption about a sheet's points: where they were meant to be, free, or chosen by the fit."""
 
 MIN_POSES: Final = 4
-"""Fewest views of which one can be left out, and the others still tell of chance."""
+"""Fewest views with which leaving one out still shows what chance does."""
 
 MAX_FREE_POINTS: Final = 1000
 """A target with free points has at most this many: the equations of more take gigabytes."""

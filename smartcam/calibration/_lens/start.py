@@ -30,10 +30,10 @@ FOCAL_LENGTHS: Final = (None, 1.0, 0.4, 2.0, 0.65, 4.0)
 """Focal lengths that OpenCV begins with, in parts of the image's longer side: None where its own
 closed form says, then fields of view of 53, 103, 28, 75 and 14 degrees."""
 
-ENOUGH: Final = 20
+MAX_VIEWS_OF_OPENCV: Final = 20
 """Views that OpenCV is given; all are adjusted afterwards."""
 
-GOOD: Final = 0.5
+MAX_GOOD_RMS_PX: Final = 0.5
 """Pixels rms, up to which no other beginning is tried."""
 
 
@@ -84,7 +84,7 @@ def fit_lens(
             found.append(_fit(views, model, basis, length))
         except (CalibrationError, load("cv2").error):
             continue
-        if found[-1].rms <= GOOD:
+        if found[-1].rms <= MAX_GOOD_RMS_PX:
             break
     if not found:
         raise Code.POOR_FIT.refusal(
@@ -98,7 +98,7 @@ def fit_lens(
 def _fit(
     views: Sequence[TargetView], model: DistortionModel, basis: Array, length: float | None
 ) -> AdjustedBundle:
-    guess = _first(views[:: -(-len(views) // ENOUGH)], model, length)
+    guess = _first(views[:: -(-len(views) // MAX_VIEWS_OF_OPENCV)], model, length)
     # what stays 0 is 0, and fx is fy where they are one
     lens = with_lens(guess, basis @ np.linalg.pinv(basis) @ lens_values(guess))
     sights = [Sight(0, number, view) for number, view in enumerate(views)]

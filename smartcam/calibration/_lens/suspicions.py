@@ -54,21 +54,21 @@ MIN_POINTS_KEPT: Final = 8
 MEDIAN: Final = 2.0 * math.log(2.0)
 """Median of the squared length of two independent normal numbers with a variance of 1."""
 
-NAMED: Final = 5
+MAX_NAMED: Final = 5
 """Points that a text names at most."""
 
-WORST: Final = 10.0
+MAX_RMS_PX: Final = 10.0
 """Pixels rms, beyond which points are not those of the target: a lens' wrong model leaves less."""
 
 WORST_PART: Final = 0.015
 """Residuals, rms, beyond which the points are not those of the target, as a part of the longer side
-of the image: it counts where it is more pixels than WORST."""
+of the image: it counts where it is more pixels than MAX_RMS_PX."""
 
 WORST_SIGMAS: Final = 20.0
 """Residuals, rms, beyond which the points are not those of the target, as a multiple of the points'
-standard deviation: it counts where it is more pixels than WORST."""
+standard deviation: it counts where it is more pixels than MAX_RMS_PX."""
 
-LONGEST: Final = 20.0
+MAX_TARGET_METRES: Final = 20.0
 """Metres that no target is long: a board in millimetres is 200."""
 
 OFF_MIDDLE: Final = 0.2
@@ -94,7 +94,7 @@ def strays(
 
     ``more``: variance beside the points' own, pixels^2. ``used``: the views that it is of; of the
     others, a view may be bad for a few of its points. ``lens``: whether the lens is fitted to the
-    views; else a point is none that one that fits the other points brings to its place.
+    views; else a point is not a stray if a camera that fits the other points brings to its place.
     """
     equations = [one.equations(more) for one in fitted]
     off = _stray_squares(equations, used)
@@ -187,10 +187,10 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
     rest = [one for one in found if one.ident not in often]
     if rest:
         each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
-        more = f", and {len(each) - NAMED} more" if len(each) > NAMED else ""
+        more = f", and {len(each) - MAX_NAMED} more" if len(each) > MAX_NAMED else ""
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{', '.join(each[:NAMED])}{more}: each {done}"
+            f"{', '.join(each[:MAX_NAMED])}{more}: each {done}"
         )
 
 
@@ -255,16 +255,16 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
     copies = [", ".join(one) for one in groups.values() if len(one) > 1]
     if copies:
-        more = f", and {len(copies) - NAMED} more" if len(copies) > NAMED else ""
+        more = f", and {len(copies) - MAX_NAMED} more" if len(copies) > MAX_NAMED else ""
         yield Code.COINCIDENT.remark(
-            f"views that are the same to the last digit: {'; '.join(copies[:NAMED])}{more}: they "
-            "count as often as they are there, and errors come out too small"
+            f"views that are the same to the last digit: {'; '.join(copies[:MAX_NAMED])}{more}: "
+            "they count as often as they are there, and errors come out too small"
         )
     length = float(np.ptp(views[0].target.points, axis=0).max())
-    if length > LONGEST:
+    if length > MAX_TARGET_METRES:
         yield Code.SCALE_MISMATCH.remark(
-            f"expected a target of {LONGEST:g} m at most, got one of {length:g} m: are its lengths "
-            "in metres? All lengths that are found are in proportion"
+            f"expected a target of {MAX_TARGET_METRES:g} m at most, got one of {length:g} m: are "
+            "its lengths in metres? All lengths that are found are in proportion"
         )
 
 
@@ -293,8 +293,10 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
         )
 
 
-def most_rms(views: Sequence[TargetView], worst: float = WORST, part: float = WORST_PART) -> float:
-    """Return the residuals, rms of a coordinate in pixels, beyond which views cannot be so."""
+def most_rms(
+    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = WORST_PART
+) -> float:
+    """Return the residuals, rms of a coordinate in pixels, beyond which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)
     return max(worst, part * longer, WORST_SIGMAS * noise)

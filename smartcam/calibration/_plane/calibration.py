@@ -76,7 +76,7 @@ TOUCHES_APART = 4.0
 """Sigmas of a touch from the mean of the touches of its point: noise does it once in a thousand."""
 
 MIN_DIRECTION_LENGTH = 1e-9
-"""Length of a direction below which it is none."""
+"""Length of a direction below which a direction is not one."""
 
 STALE_LEVEL = 0.01
 """Probability with which a calibration that still holds is called stale."""
@@ -119,7 +119,7 @@ class PlaneCalibration(storage.SavedCalibration):
         residuals: (N, 3), robot minus mapped, metres. They are smaller than the error, except of
             points left out.
         leave_one_out: (N, 3), robot minus what a calibration from the other points says, metres;
-            NaN where the others alone give none. The point's own touch is part of it. Of a point
+            NaN where the others alone give no fit. The point's own touch is part of it. Of a point
             left out it is the residual.
         freedom: coordinates of the points that count, minus parameters.
         touch_sigma: sigma of one coordinate of a touch of weight 1, metres: as given or, where

@@ -33,7 +33,7 @@ LEVEL = 0.01
 SCALE_TOLERANCE = 0.005
 """A scale may be off the nominal one by this part, as printers and heights of parts make it."""
 
-SCALE_LIMIT = 0.1
+MAX_SCALE_OFF = 0.1
 """A scale off the nominal one by more than this part comes of mixed-up units or sheets."""
 
 MIN_TOOL_COSINE = 0.17
@@ -136,7 +136,7 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     percent = f"{100 * off:+.2g}" if abs(off) < 0.1 else f"{100 * off:+.0f}"
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
-    if exact or abs(off) > SCALE_LIMIT:
+    if exact or abs(off) > MAX_SCALE_OFF:
         raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
     return text
 

@@ -30,7 +30,7 @@ FOOT: Final = 130.0
 MARGIN: Final = 0.15
 """A margin of this part of the extent of what is shown stays free around it."""
 
-COLUMNS: Final = 30
+MAX_COLUMNS: Final = 30
 """Cells of the heat map across; as many down as make them square, at most twice that."""
 
 ELLIPSE: Final = math.sqrt(-2.0 * math.log(0.05))
@@ -158,10 +158,10 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the predicted error as coloured cells."""
     if calibration.touch_sigma is None:
         return
-    cell = WIDTH / COLUMNS
-    rows = min(2 * COLUMNS, max(1, round(field.height / cell)))
+    cell = WIDTH / MAX_COLUMNS
+    rows = min(2 * MAX_COLUMNS, max(1, round(field.height / cell)))
     tall = field.height / rows
-    corners = [[x * cell, y * tall] for y in range(rows) for x in range(COLUMNS)]
+    corners = [[x * cell, y * tall] for y in range(rows) for x in range(MAX_COLUMNS)]
     middles = np.array(corners) + np.array([cell / 2, tall / 2])
     seen = field.low + np.column_stack([middles[:, 0], field.height - middles[:, 1]]) / field.zoom
     errors = calibration.predicted_error(seen)

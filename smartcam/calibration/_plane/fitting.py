@@ -44,11 +44,11 @@ MAX_HALVINGS = 20
 """A step that makes the sum of squares larger is tried in at most this many sizes, each half of the
 one before; after them the sum is as small as rounding lets it be."""
 
-SMALLEST_STEP = 1e-13
+MIN_STEP = 1e-13
 """The refinement ends where a step changes the matrix' elements, which are about 1, by less than
 this; the next step would be a thousand times smaller."""
 
-FULL_REFITS = 200
+MAX_FULL_REFITS = 200
 """Points up to which a homography is fitted anew without each of them.
 
 Above it the residuals are corrected by their leverage, which is off by the square of a leverage
@@ -178,7 +178,7 @@ def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
         return np.full_like(pairs.robot, np.nan)
     if fitted.model in {"rigid", "similarity"}:
         return _held_out_of_sums(pairs, scale if fitted.model == "rigid" else None)
-    if fitted.model == "homography" and len(pairs.camera) <= FULL_REFITS:
+    if fitted.model == "homography" and len(pairs.camera) <= MAX_FULL_REFITS:
         return np.stack([_held_out_anew(fitted, pairs, i) for i in range(len(pairs.camera))])
     return _held_out_by_leverage(fitted, pairs)
 
@@ -278,7 +278,7 @@ def _solve_homography(pairs: Pairs, scale: float) -> Array:
         else:
             return matrix
         matrix, residuals = following, after
-        if np.abs(step).max() < SMALLEST_STEP:
+        if np.abs(step).max() < MIN_STEP:
             return matrix
     return matrix
 

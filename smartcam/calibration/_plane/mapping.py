@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
     from smartcam.geometry._inside import Array
 
-FEW = 512
+MAX_POINTS_OF_NUMPY = 512
 """Points up to which numpy is faster than calling OpenCV, and no second library is loaded."""
 
 BLOCK = 65_536
@@ -91,7 +91,7 @@ class PlaneMap:
         if given.ndim != 2 or given.shape[1] not in {2, 3}:
             given = as_points(points, 2, "camera points")
         result = np.empty((len(given), 3)) if out is None else _checked(out, len(given))
-        if len(given) <= FEW:
+        if len(given) <= MAX_POINTS_OF_NUMPY:
             self._check_horizon(given)
             with np.errstate(all="ignore"):
                 mapped = given[:, :2] @ self.matrix[:, :2].T + self.matrix[:, 2]

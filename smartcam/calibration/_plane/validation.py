@@ -36,7 +36,7 @@ NEAR = 0.01
 SAME = 1e-9
 """Points that are closer together than this part of the extent of all points count as the same."""
 
-SMALLEST = 1e-100
+MIN_DIFFERENCE = 1e-100
 """Difference of two coordinates below which they are the same: the square of it is a number."""
 
 
@@ -196,7 +196,7 @@ def _extents(points: Array) -> Array:
 def _check_distinct(points: Array, what: str, least: int) -> None:
     extent = float(np.ptp(points, axis=0).max())
     rounding = np.finfo(np.float64).eps * float(np.abs(points).max())
-    grain = max(SAME * extent, 4.0 * rounding, SMALLEST)
+    grain = max(SAME * extent, 4.0 * rounding, MIN_DIFFERENCE)
     distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
     if distinct < least:
         raise Code.COINCIDENT.unexpected(

@@ -24,21 +24,21 @@ RULER: Final = 100.0
 BORDER: Final = 5.0
 """Border of the page: many printers leave it white."""
 
-MOVE: Final = 5.0
+MAX_MOVE_MM: Final = 5.0
 """Distance of a target from the border where there is space; the rest is left to the rays."""
 
-QUIET: Final = 0.2
+MARGIN_OF_PITCH: Final = 0.2
 """White around a target, of a square's side or of the distance of two dots."""
 MIN_MARGIN_SQUARES, MAX_MARGIN_SQUARES = 2.0, 6.0
 """Bounds of the white around a target."""
 
-SHORTEST_RAY: Final = 8.0
+MIN_RAY_MM: Final = 8.0
 RAY_WIDTH: Final = 0.4
 HEAD: Final = (4.0, 1.5)
 """Length of a ray's head and half its width."""
 NOTCH: Final = 0.65
 """Depth of the notch in a head's back, of its length: a search takes a solid head for a dot."""
-LETTER: Final = 4.0
+LETTER_MM: Final = 4.0
 """Size of the letters of the rays."""
 
 TICK: Final = (0.3, 3.0)
@@ -48,13 +48,13 @@ RULER_SPAN: Final = RULER + 12.0
 
 TEXT, LINE = 2.6, 3.4
 """Size of a text and distance of its lines."""
-RULE: Final = 0.2
-"""Thickness of the line that a text stands on: letters that hang together are no dots either."""
-TEXT_LEFT: Final = HEAD[1] + LETTER + 2
+RULE_MM: Final = 0.2
+"""Thickness of the line under a text: joined to a line, letters are not taken for dots."""
+TEXT_LEFT: Final = HEAD[1] + LETTER_MM + 2
 """Distance from the ray B to the texts right of its letter."""
-FEWEST_LETTERS: Final = 20
+MIN_LETTERS: Final = 20
 """Letters of a line at least, on however small a page."""
-GLYPH: Final = 0.6
+GLYPH_WIDTH: Final = 0.6
 """Width of a letter, of its size: more than a line of Helvetica or Arial has on the average."""
 
 AREA_REACH: Final = AREA_DISTANCE + AREA_DIAMETER / 2
@@ -95,13 +95,13 @@ class PageLayout:
         self._box = box
         self.width = width
         self.height = height
-        self._quiet = min(max(QUIET * pitch, MIN_MARGIN_SQUARES), MAX_MARGIN_SQUARES)
+        self._quiet = min(max(MARGIN_OF_PITCH * pitch, MIN_MARGIN_SQUARES), MAX_MARGIN_SQUARES)
         self._areas = areas
-        ray = max(self._quiet + SHORTEST_RAY, self._areas)
+        ray = max(self._quiet + MIN_RAY_MM, self._areas)
         x, needed_width = _along((box.left, box.right), (self._ruler_band(box.high), ray), width)
-        letters = max(int((width - BORDER - x - TEXT_LEFT) / (GLYPH * TEXT)), FEWEST_LETTERS)
+        letters = max(int((width - BORDER - x - TEXT_LEFT) / (GLYPH_WIDTH * TEXT)), MIN_LETTERS)
         self._lines = [line for text in texts for line in textwrap.wrap(text, letters)]
-        self._longest = max(map(len, self._lines)) * GLYPH * TEXT
+        self._longest = max(map(len, self._lines)) * GLYPH_WIDTH * TEXT
         text = self._clear(TEXT_LEFT + self._longest, box.right) + LINE * len(self._lines)
         y, needed_height = _along(
             (box.low, box.high), (self._ruler_band(box.right), max(ray, text)), height
@@ -123,7 +123,7 @@ class PageLayout:
 
     @property
     def excess(self) -> float:
-        """By how much it does not fit: zero where it does."""
+        """Length by which the layout is too large for the page; zero where it fits."""
         return max(self.needed_width - self.width, 0.0) + max(self.needed_height - self.height, 0.0)
 
     def furniture(self) -> Iterator[Shape]:
@@ -140,7 +140,7 @@ class PageLayout:
         yield from map(_upright, _ruler(y, beside))
         for number, line in enumerate(self._lines):
             low = top - TEXT - LINE * number
-            yield rectangle(x + TEXT_LEFT, low, self._longest, RULE)
+            yield rectangle(x + TEXT_LEFT, low, self._longest, RULE_MM)
             yield Label((x + TEXT_LEFT, low), line, TEXT)
 
 
@@ -149,12 +149,12 @@ def _along(
 ) -> tuple[float, float]:
     """Return the origin's place along a side of the page, and the length which that side needs.
 
-    ``pattern``: from where to where it reaches, from its origin. ``bands``: what is needed before
-    and behind it.
+    ``pattern``: begin and end of the pattern, from its origin. ``bands``: space that is needed
+    before and behind it.
     """
     low, high = pattern
     needed = 2 * BORDER + bands[0] + max(high - low + bands[1], RULER_SPAN - low)
-    spare = min(max(side - needed, 0.0) / 2, MOVE)
+    spare = min(max(side - needed, 0.0) / 2, MAX_MOVE_MM)
     return BORDER + spare + bands[0] - low, needed
 
 
@@ -166,7 +166,7 @@ def _ray(start: float, across: float, length: float, letter: str) -> Iterator[Po
     yield Polygon(
         ((neck, across - HEAD[1]), (tip, across), (neck, across + HEAD[1]), (notch, across))
     )
-    yield Label((neck, across + HEAD[1] + 1), letter, LETTER)
+    yield Label((neck, across + HEAD[1] + 1), letter, LETTER_MM)
 
 
 def _ruler(start: float, low: float) -> Iterator[Polygon | Label]:
@@ -176,7 +176,7 @@ def _ruler(start: float, low: float) -> Iterator[Polygon | Label]:
     for tick in range(11):
         middle = min(max(RULER / 10 * tick, thick / 2), RULER - thick / 2)
         yield rectangle(start + middle - thick / 2, low + thick, thick, high - thick)
-    yield rectangle(start + RULER + 1, low, RULER_SPAN - RULER - 1, RULE)
+    yield rectangle(start + RULER + 1, low, RULER_SPAN - RULER - 1, RULE_MM)
     yield Label((start + RULER + 1, low), f"{RULER:g} mm", TEXT)
 
 

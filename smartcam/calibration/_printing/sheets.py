@@ -67,10 +67,10 @@ PAGES: Final[Mapping[str, tuple[float, float]]] = {
 MAX_PAGE: Final = 3000.0
 """Longest side of a page, mm."""
 
-LARGEST_CHANGE: Final = 0.05
+MAX_SCALE_CHANGE: Final = 0.05
 """Largest deviation of a printer's scale."""
 
-UNEQUAL: Final = 0.005
+MAX_UNEQUAL_SCALES: Final = 0.005
 """Largest difference of the scales along x and y: about that of a ruler that is read twice."""
 
 DIGITS: Final = 9
@@ -243,7 +243,7 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     Args:
         target: the target as it was to be printed.
         measured_ruler: how long the printed rulers along x and along y are, mm. A target has one
-            scale, the mean of both: what makes them differ by more than half a percent is no
+            scale, the mean of both. Rulers that differ by more than half a percent show no
             scale, but a printer that pulls the paper unevenly.
 
     Raises:
@@ -252,19 +252,19 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     """
     factors = [length / RULER for length in measured_ruler]
     for axis, factor in zip("xy", factors, strict=True):
-        if not abs(factor - 1) <= LARGEST_CHANGE:
+        if not abs(factor - 1) <= MAX_SCALE_CHANGE:
             raise Code.SCALE_MISMATCH.refusal(
-                f"ruler along {axis}: expected {RULER:g} mm within {LARGEST_CHANGE:.0%}, "
+                f"ruler along {axis}: expected {RULER:g} mm within {MAX_SCALE_CHANGE:.0%}, "
                 f"got {RULER * factor:g} mm; print at 100 %, not fitted to the page",
                 RULER,
                 RULER * factor,
             )
-    if abs(factors[0] - factors[1]) > UNEQUAL:
+    if abs(factors[0] - factors[1]) > MAX_UNEQUAL_SCALES:
         raise Code.SCALE_MISMATCH.refusal(
-            f"rulers: expected the same length along x and y within {UNEQUAL:.1%}, "
+            f"rulers: expected the same length along x and y within {MAX_UNEQUAL_SCALES:.1%}, "
             f"got {measured_ruler[0]:g} and {measured_ruler[1]:g} mm; measure again, or print "
             "with another printer",
-            UNEQUAL,
+            MAX_UNEQUAL_SCALES,
             tuple(measured_ruler),
         )
     return resized(target, sum(factors) / 2, DIGITS)

@@ -42,11 +42,11 @@ KIND = "sheet"
 """Name of these calibrations' files in the store."""
 
 UNEXPLAINED = {True: 0.3, False: 0.1}
-"""Pixels beside the points' noise from which on it is told, with a lens and without: what print,
-edges and a lens' own errors add, and a tenth of what a lens of usual distortion would."""
+"""Residual in pixels, beyond the points' noise, from which on a remark says so: with a lens, the
+errors of print, edges and lens; without, a tenth of what usual distortion adds."""
 
 ONE_SCALE = frozenset({"rigid", "similarity", "touches"})
-"""Models of a plane that leave a sheet the shape that it has."""
+"""Models of a plane that keep the shape of a sheet."""
 
 
 PLANE = storage.Form(
@@ -68,7 +68,7 @@ class SheetCalibration(storage.SavedCalibration):
         view: the target as the camera saw it.
         sheet: map from pixels to the sheet.
         plane: map from the sheet's metres to the robot.
-        rms: standard deviation of a coordinate of the view's points about the sheet's, pixels.
+        rms: standard deviation of a coordinate of the view's points from the fit, pixels.
         camera_frame: name of the frame that localizations must come in; None for any.
         remarks: what one should know of the view.
     """
@@ -143,7 +143,7 @@ class SheetCalibration(storage.SavedCalibration):
 
     @cached_property
     def chain(self) -> Chain:
-        """The same as solvers; it takes localizations with y turned up."""
+        """This calibration as a chain of solvers; it takes localizations with y turned up."""
         chain = Chain(
             [self.sheet],
             frame=self.robot_frame,
@@ -171,7 +171,7 @@ class SheetCalibration(storage.SavedCalibration):
         """Map points of the robot's space to the camera's.
 
         Args:
-            points: (N, 3), metres; of a point beside the plane its foot counts.
+            points: (N, 3), metres; a point beside the plane is projected onto it.
 
         Returns:
             (N, 2), pixels, v down; NaN for what lies behind the camera.
@@ -307,12 +307,12 @@ def fit_corners(
 ) -> PlaneCalibration:
     """Return the way from a sheet's metres to the robot, by touches of points of its target.
 
-    A sheet that lies flat has its own shape: where touches ask for more than a scale, it is told
-    by a warning (NOT_SIMILAR) and not followed. So is a scale that is not the target's
-    (SCALE_MISMATCH), which is followed: rulers that were measured wrong, or not at all.
+    A sheet that lies flat keeps its shape. Touches that ask for more than a scale give a warning
+    (NOT_SIMILAR), and the shape stays. A scale that is not the target's gives a warning, too
+    (SCALE_MISMATCH), and is taken: the rulers were measured wrong, or not at all.
 
     Args:
-        target: with the lengths that it has on paper.
+        target: target with the lengths that it has on paper.
         ids: (N,), numbers of the target's points that were touched, three at least.
         touches: (N, 3), where the robot's tip was, metres.
         touch_sigma: standard deviation of one coordinate of a touch, metres, as in

@@ -65,7 +65,7 @@ class PairFit(storage.Stored):
         left: view of the left camera, as it was given.
         right: view of the right camera, as it was given; numbered from the other end where the
             target looks the same when turned.
-        used: for each side, True if the cameras are fitted to it; False for a bad or missing view.
+        used: True, for each side, if the cameras are fitted to it; False for a bad or missing view.
         transform: ``T_left_target``; None where neither view is used.
         rms: rms of each side's residuals, a coordinate, pixels; NaN where it is not used.
         held_out: rms, for cameras that were fitted without this pair, of the distances between
@@ -324,8 +324,8 @@ def calibrate_stereo(
 
     Raises:
         CalibrationError: ``TOO_FEW``: less than 3 pairs, 2 where both lenses are known;
-            ``SHAPE``: lists of different lengths, a coefficient that is none, or too many points to
-            be free; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``;
+            ``SHAPE``: lists of different lengths, a coefficient that is not valid, or too many
+            points to be free; ``WRONG_SIZE``, ``DIFFERENT_TARGETS``, ``COLLINEAR``, ``NOT_FINITE``;
             ``POOR_FIT``: no lens or no transform shows the views, as where those of many pairs are
             of different moments; ``INSUFFICIENT_ROTATION``: the target was not tilted;
             ``MIRRORED`` pictures; ``COINCIDENT``: both sides are of one camera;

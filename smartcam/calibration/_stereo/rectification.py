@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Image: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]"
 
-ACROSS: Final = 0.1
+MIN_ACROSS_COSINE: Final = 0.1
 """Cosine of the angle by which a camera's viewing direction is turned, at least.
 
 With less, a camera looks along the line to the other one: rows would meet inside of its image.
@@ -29,7 +29,7 @@ With less, a camera looks along the line to the other one: rows would meet insid
 MAX_PIXELS: Final = 100_000_000
 """A rectified image has at most this many pixels; its two maps have 8 bytes for each pixel."""
 
-SAMPLES: Final = 50_000
+MAX_SAMPLES: Final = 50_000
 """Source pixels at most, evenly spread, of which it is counted how many are kept."""
 
 
@@ -95,8 +95,8 @@ def rectify(
         size: size of the output, width and height in pixels; None: the source's.
 
     Raises:
-        CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is none or too large,
-            lenses of different models; ``WRONG_SIZE``: images of different sizes;
+        CalibrationError: ``SHAPE``: an alpha outside of 0 to 1, a size that is not valid or too
+            large, lenses of different models; ``WRONG_SIZE``: images of different sizes;
             ``OUT_OF_FIELD``: the images would have nothing in them, as of cameras behind each
             other, or of which one stands on its head.
     """
@@ -110,12 +110,12 @@ def rectify(
     masks = tuple(_inside(chart, camera.size) for chart, camera in zip(maps, cameras, strict=True))
     across = min(float(turn[2, 2]) for turn in turns)
     upright = min(float(projection[0, 0]) for projection in projections) > 0
-    if not (upright and across > ACROSS and all(mask.any() for mask in masks)):
+    if not (upright and across > MIN_ACROSS_COSINE and all(mask.any() for mask in masks)):
         raise Code.OUT_OF_FIELD.refusal(
             f"rectify with alpha {alpha:g}: expected two cameras beside each other that see the "
             "same place the same way up, got parallel images with nothing in them, or upside down "
             f"(cosine between old and new viewing direction: {across:.2f})",
-            ACROSS,
+            MIN_ACROSS_COSINE,
             across,
         )
     kept = tuple(
@@ -216,7 +216,7 @@ def _inside(places: NDArray[Any], size: tuple[int, int]) -> NDArray[np.bool_]:
 def _kept(camera: CameraModel, turn: Array, projection: Array, output: tuple[int, int]) -> float:
     """Return the part of the source pixels that are in the output."""
     width, height = camera.size
-    apart = max(1, math.ceil(math.sqrt(width * height / SAMPLES)))
+    apart = max(1, math.ceil(math.sqrt(width * height / MAX_SAMPLES)))
     u, v = np.meshgrid(np.arange(apart // 2, width, apart), np.arange(apart // 2, height, apart))
     rays = camera.directions(np.column_stack([u.ravel(), v.ravel()]))
     # from pixel to ray to the rectified camera's ray to its pixel: P (R K^-1 u)

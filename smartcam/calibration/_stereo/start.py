@@ -31,13 +31,14 @@ RIGHT: Final = "right"
 SIDES: Final = (LEFT, RIGHT)
 """Names of the sides by number."""
 
-GUESSES: Final = 20
+MAX_GUESSES: Final = 20
 """Pairs at most that are tried for a first guess of the transform."""
 
-GROSS: Final = 10.0
-"""A pair that is more times the median off does not belong together, if it is far off, too."""
+GROSS_RATIO: Final = 10.0
+"""Multiple of the median error beyond which a pair's views do not belong together, if it is
+MIN_FAR_SHARE, too."""
 
-FAR: Final = 0.01
+MIN_FAR_SHARE: Final = 0.01
 """A pair is far off where its points are off by more than this part of the longer side of the
 image: neither noise nor a lens that is not yet adjusted does that."""
 
@@ -156,7 +157,8 @@ def _rig(
 ) -> tuple[Rigid, dict[int, float], list[int]]:
     """Return the pair's transform that fits most of the pairs best, and the pairs that do not fit.
 
-    Then those whose right view is numbered from the other end: ``turns`` of the target leave it as
+    Last come the pairs whose right view is numbered from the other end: ``turns`` of the target
+        leave it as
     it was. Which numbering fits is told by all pairs together, as the cameras may stand on their
     heads. Raises ``POOR_FIT``.
     """
@@ -166,7 +168,7 @@ def _rig(
         if one is not None and two is not None and moment[1] is not None
     ]
     best, least, off = IDENTITY, math.inf, np.zeros((len(pairs), len(turns)))
-    some = pairs[:: math.ceil(len(pairs) / GUESSES)]
+    some = pairs[:: math.ceil(len(pairs) / MAX_GUESSES)]
     for turn, (_, one, two, _) in itertools.product(turns, some):
         # T_right_left = T_right_target T_target_left; that with the least median counts, which half
         # of the pairs may not spoil: Rousseeuw, Least Median of Squares Regression (1984).
@@ -180,7 +182,7 @@ def _rig(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
-    far = max(GROSS * least, FAR * max(right.size))
+    far = max(GROSS_RATIO * least, MIN_FAR_SHARE * max(right.size))
     numbers, nearest = [number for number, *_ in pairs], off.min(axis=1).tolist()
     apart = {number: one for number, one in zip(numbers, nearest, strict=True) if one > far}
     turned = [number for number, one in zip(numbers, off, strict=True) if one[0] > one[-1]]

@@ -48,9 +48,9 @@ _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]{1,4})?
 _NOT_FINITE = re.compile(r"[-+]?\.?(?:nan|inf|infinity)", re.IGNORECASE)
 _NAME = re.compile(r"[\w/][\w./+-]*")
 _FLAGS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
-_PRINTED = 1e-4
+_MAX_PRINTED_DEVIATION = 1e-4
 """Largest deviation from a rotation of a matrix that was printed with few digits."""
-_EXACT = 1e-6
+_MAX_EXACT_DEVIATION = 1e-6
 """Largest deviation of a matrix that is taken as it is; :class:`Transform` has the same bound."""
 
 
@@ -90,7 +90,7 @@ def _cut(value: object) -> str:
 
 
 def load_json(text: str) -> Plain:
-    """Return a JSON document; its numbers are texts (``MALFORMED``: it is none, or too deep)."""
+    """Return a JSON document, its numbers as texts; MALFORMED: it is no JSON, or too deep."""
     try:
         return json.loads(text, parse_float=str, parse_int=str, parse_constant=str)
     except (ValueError, RecursionError) as exc:
@@ -100,7 +100,7 @@ def load_json(text: str) -> Plain:
 def load_yaml(text: str) -> Plain:
     """Return a YAML document, that of OpenCV too; its scalars are texts, its tags are dropped.
 
-    Raises ``MALFORMED``: it is none, it has aliases or a key twice, or is too deep;
+    Raises ``MALFORMED``: it is no YAML, it has aliases or a key twice, or is too deep;
     MissingExtraError: PyYAML is not installed.
     """
     if text.startswith("%YAML:"):  # OpenCV's spelling of a directive
@@ -225,8 +225,8 @@ def flag(value: Plain, where: str) -> bool:
 def frame_name(value: Plain, where: str) -> str:
     """Return a frame's name that every format can hold.
 
-    Raises ``BAD_NAME``: it is none, too long, or has letters that mean something in a file or on a
-    command line.
+    Raises ``BAD_NAME``: it is not valid, too long, or has letters that mean something in a file or
+    on a command line.
     """
     if not (isinstance(value, str) and len(value) <= _MAX_NAME and _NAME.fullmatch(value)):
         raise Code.BAD_NAME.unexpected(
@@ -245,11 +245,11 @@ def rigid(
     Raises ``MALFORMED``: its last row; ``NOT_RIGID``: it is no rotation.
     """
     matrix = np.array(rows, dtype=np.float64)
-    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_EXACT):
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0.0, atol=_MAX_EXACT_DEVIATION):
         raise malformed(where, "a last row 0 0 0 1", " ".join(f"{value:g}" for value in matrix[3]))
     rotation = matrix[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if _EXACT <= off < _PRINTED:
+    if _MAX_EXACT_DEVIATION <= off < _MAX_PRINTED_DEVIATION:
         rotation = _nearest_rotation(rotation)
     return Transform(target, source, rotation, matrix[:3, 3])
 

@@ -11,7 +11,7 @@ from smartcam.geometry import Code, Transform
 if TYPE_CHECKING:
     from smartcam.calibration._plane.calibration import PlaneCalibration
 
-_SIMILAR = 1e-9
+_MAX_SIMILAR_DEVIATION = 1e-9
 """Largest deviation of two axes from equal length and a right angle, by rounding."""
 
 
@@ -46,7 +46,7 @@ def plane_frame(calibration: PlaneCalibration, *, name: str = "plane") -> PlaneF
     square = 0.5 * float(np.trace(inner))
     shear = float(np.abs(inner - square * np.eye(2)).max()) / square
     bend = float(np.abs(matrix[3, :2]).max()) * calibration.place.camera_size
-    if max(shear, bend) > _SIMILAR:
+    if max(shear, bend) > _MAX_SIMILAR_DEVIATION:
         raise Code.NOT_SIMILAR.refusal(
             f"{calibration.model}: expected one scale for the whole plane, got axes that differ by "
             f"{shear:.2g} and a scale that changes by {bend:.2g} over the points: no rigid frame "

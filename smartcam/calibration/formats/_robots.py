@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._units import LengthUnit
     from smartcam.geometry._inside import Array
 
-_UNIT: Final = 0.01
+_MAX_UNIT_DEVIATION: Final = 0.01
 """Largest deviation of a quaternion's length from one; it is made one."""
 
 
@@ -78,7 +78,7 @@ def _to_vector(pose: Transform) -> list[float]:
 
 def _from_xyzw(quaternion: Array) -> Array:
     length = float(np.linalg.norm(quaternion))
-    if not abs(length - 1.0) < _UNIT:
+    if not abs(length - 1.0) < _MAX_UNIT_DEVIATION:
         raise Code.NOT_RIGID.refusal(
             f"expected a quaternion of length 1, got {quaternion.tolist()} of length {length:.6g}",
             1.0,

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PERIOD_MS = 100
-"""Period with which ``tf`` sends it; its documents call that a good value."""
+"""Period of the messages of ``tf``; its documents call 100 a good value."""
 
 _COMMAND = "static_transform_publisher"
 _PYTHON = re.compile(r"^(?:from|import) [a-z]", re.MULTILINE)
@@ -231,7 +231,10 @@ def compose_positions(transform: Transform, *, angles: bool = False, period: boo
 
 
 def compose_options(transform: Transform, *, angles: bool = False) -> str:
-    """Return the arguments of ROS 2's, one line; arguments as above."""
+    """Return the arguments of ROS 2's program, one line.
+
+    ``angles``: as for :func:`compose_positions`.
+    """
     values = dict(zip([*_POSITION, *_QUATERNION], row(transform), strict=True))
     if angles:
         turned = zip(_ANGLES, angles_zyx(transform.rotation), strict=True)

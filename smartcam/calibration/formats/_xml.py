@@ -81,7 +81,7 @@ def load_xml(text: str) -> XmlElement:
 
 
 def storage_data(element: XmlElement) -> Plain:
-    """Return an element of OpenCV's storage as the YAML of the same would be read."""
+    """Return an element of OpenCV's XML storage as its YAML storage is read."""
     if not element.children:
         listed = element.kind == "data" or " " in " ".join(element.text.split())
         return (

@@ -64,7 +64,7 @@ MAX_VIEWS = 40
 ADVISED_VIEWS = 10
 """Views from which on the wizard offers to calculate first."""
 
-CALCULATION = 120.0
+CALCULATION_TIMEOUT = 120.0
 """Seconds that the calculation may take; of 15 views it takes a few."""
 
 _MOVES: Mapping[str, str] = {
@@ -295,7 +295,7 @@ class _Views:
         if answers.get("next") == "calculate":
             return {}
         typed = None
-        if isinstance(self._robot, str):  # a pose that is none shall not cost a picture
+        if isinstance(self._robot, str):  # a pose that is not valid shall not cost a picture
             typed = _typed_pose(self._robot, answers)
         image = await self._take_picture()
         flange = typed or await self._flange()
@@ -349,7 +349,7 @@ class _Views:
             description="Several ways are compared by the poses that each has not seen.",
             button="Calculate",
             notes=(f"{len(self._samples)} views",),
-            timeout=CALCULATION,
+            timeout=CALCULATION_TIMEOUT,
         )
         found = (await ask(step, self._solve)).outcome
         if "code" in found:

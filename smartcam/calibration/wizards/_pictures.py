@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.calibration._detection.image import LARGEST, HasGrey
+from smartcam.calibration._detection.image import MAX_SIDE, HasGrey
 from smartcam.geometry import Code
 
 if TYPE_CHECKING:
@@ -93,8 +93,8 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")
-    if max(image.shape) > LARGEST:
-        raise _bad(name, f"{LARGEST} pixels along each side", f"{image.shape[1]}x{image.shape[0]}")
+    if max(image.shape) > MAX_SIDE:
+        raise _bad(name, f"{MAX_SIDE} pixels along each side", f"{image.shape[1]}x{image.shape[0]}")
     picture: NDArray[Any] = image
     return picture
 

@@ -59,14 +59,14 @@ class Input(ABC):
     default: Any = None
 
     def schema(self) -> dict[str, Any]:
-        """Return its JSON Schema.
+        """Return the input's JSON Schema.
 
         A unit stands in ``x-unit``, options as a ``const`` and a ``title`` each.
         """
         return {"title": self.label, **self._schema()}
 
     def checked(self, value: object) -> Any:
-        """Return an answer as it is used; ValueError: it is none, and what was expected."""
+        """Return an answer as it is used; ValueError: it is not valid, and what was expected."""
         return self._checked(value)
 
     @abstractmethod
@@ -85,7 +85,7 @@ class Number(Input):
         minimum: smallest one taken.
         maximum: largest one taken.
         integer: whether it must be whole.
-        optional: whether there may be none (null).
+        optional: whether the answer may be left out (null).
     """
 
     default: float | None = None

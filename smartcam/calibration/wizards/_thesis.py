@@ -273,7 +273,7 @@ class ThesisCalibration:
             )
 
     def _check_graph(self, topics: Sequence[str], frame: str) -> None:
-        """Refuse topics and frames of ROS where there is none, and topics that cannot be."""
+        """Refuse topics and frames of ROS where there is none, and names that no topic has."""
         named = [*topics, *((frame,) if frame else ())]
         if named and self.graph is None:
             raise Code.NOT_POSSIBLE.refusal(
@@ -477,7 +477,7 @@ class ThesisCalibration:
         self._touch()
 
     def _touch(self) -> None:
-        """Give a calibration under way its time from now on."""
+        """Begin the time anew after which a calibration under way is given up."""
         loop = asyncio.get_running_loop()
         self._called = loop.time()
         if self._timer is not None:

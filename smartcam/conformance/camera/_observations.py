@@ -27,7 +27,7 @@ T = TypeVar("T")
 INSPECTIONS = 3
 """Inspections that are looked at: an order that changes shows."""
 
-REBOOT_POLL = 0.25
+REBOOT_POLL_INTERVAL = 0.25
 """Seconds between two Connects to a camera that restarts, at most."""
 
 
@@ -331,7 +331,9 @@ def downtime(camera: CameraUnderTest) -> Downtime:
             seconds = time.monotonic() - began
             with camera.session() as client:
                 return Downtime(seconds, camera.active(client), camera.running(client))
-        time.sleep(max(0.0, tried_at + min(REBOOT_POLL, camera.options.quiet) - time.monotonic()))
+        time.sleep(
+            max(0.0, tried_at + min(REBOOT_POLL_INTERVAL, camera.options.quiet) - time.monotonic())
+        )
     camera.gone = f"it did not come back within {camera.options.reboot_timeout:g} s of a reboot"
     raise Differs("the camera is back after a reboot", camera.gone)
 
@@ -355,7 +357,7 @@ def _answers(camera: CameraUnderTest) -> bool:
     """Return True if a Connect is answered now."""
     try:
         with camera.link() as client:
-            client.answer(m.Connect(), within=max(camera.options.quiet, REBOOT_POLL))
+            client.answer(m.Connect(), within=max(camera.options.quiet, REBOOT_POLL_INTERVAL))
     except (NotObserved, Differs, EndedError):
         return False
     return True

@@ -23,8 +23,7 @@ MAX_SECONDS = 3600.0
 """Seconds that may be waited for one thing at most."""
 
 MAX_INPUT_DATA = 1 << 16
-"""Bytes of input data: it has a container's limit of about 64 kB (HAL 15, published for that
-side)."""
+"""Bytes of input data: about 64 kB, as a container (HAL 15, published for the other direction)."""
 
 
 class Allow(enum.Flag):
@@ -40,7 +39,7 @@ class Allow(enum.Flag):
     TRIGGER = enum.auto()
     """Inspect; what hangs on the camera's outputs sees it."""
     SWITCH = enum.auto()
-    """Load an application; the one of before is loaded again."""
+    """Load an application; the one from before is loaded again."""
     CLOCK = enum.auto()
     """Set the clock; put back to the second."""
     NUMBER = enum.auto()
@@ -54,7 +53,7 @@ class Allow(enum.Flag):
 
     @classmethod
     def read(cls, text: str) -> Allow:
-        """Read a comma list: names add to the three of the beginning, ``nothing`` forgets those.
+        """Read a comma list: names add to the three defaults, ``nothing`` removes those.
 
         Raises:
             ConfigurationError: a name is unknown.
@@ -75,7 +74,7 @@ class Allow(enum.Flag):
 
     @property
     def names(self) -> list[str]:
-        """Their names, in lower case."""
+        """The actions' names, in lower case."""
         return [one.name.lower() for one in type(self) if one in self and one.name]
 
 

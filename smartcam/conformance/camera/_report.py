@@ -179,7 +179,7 @@ class CameraReport:
         }
 
     def write(self, path: str) -> None:
-        """Write it to a file as JSON.
+        """Write the report to a file as JSON.
 
         Raises:
             ConfigurationError: the file cannot be written.

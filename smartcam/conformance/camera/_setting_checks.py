@@ -211,7 +211,7 @@ def clock_is_set(camera: CameraUnderTest) -> None:
 
 @check({"": "MV30, published", "bid": "ID-a 52, derived"}, needs=Allow.CLOCK)
 def impossible_date_is_harmless(camera: CameraUnderTest) -> None:
-    """A time that is none is dropped or converted; a BVS ID refuses it."""
+    """A time that is not valid is dropped or converted; a BVS ID refuses it."""
     request = m.SetClock(year=2016, month=13, day=32, hour=25, minute=61, second=61)
     with camera.session() as client:
         was, began = _read_clock(camera, client), time.monotonic()

@@ -330,7 +330,7 @@ CHECKS: tuple[ClientCheck, ...] = (
         name="fails_where_a_result_is_cut",
         scene=SCENES["cut_result"],
         rule=rules.fails,
-        expects="a container has as many bytes as its header says, or it is none",
+        expects="a container has as many bytes as its header says, or it is no container",
         source="SC-A28, published for the length field",
     ),
     ClientCheck(

@@ -1,6 +1,6 @@
-"""Rules: what a client has to do, looked up in what it said and in what it gave.
+"""Rules for a client, checked against its messages and its results.
 
-Each takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns what was wrong, in
+Each rule takes a :class:`~smartcam.conformance.client._runs.ClientRun` and returns the mistake in
 words, or None.
 """
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from smartcam.conformance.client._runs import ClientRun, Said
 
 GRACE = 0.05
-"""Seconds that a status takes to the client at most: until then the client cannot know of it."""
+"""Seconds that a status may take to the client, which cannot know of it before."""
 
 
 def _wrong_results(run: ClientRun) -> str | None:
-    """Return the first mistake in the results that it gave; it may have given too few."""
+    """Return the first mistake in the client's results; too few are no mistake."""
     scene, sent, last = run.scene, run.sent_turns, -1
     for number, data in enumerate(run.outcome.results, 1):
         what = f"result {number}, {data[:32].hex(' ') or 'empty'},"
@@ -206,7 +206,7 @@ def is_quiet_while_busy(run: ClientRun) -> str | None:
 
 
 def _is_command(one: Said) -> bool:
-    """Return True if a message is a command; questions and the session's end are none."""
+    """Return True if a message is a command; questions and the session's end are not."""
     harmless = (m.Query, m.GetStatus, m.GetClock, m.Connect, m.Disconnect)
     return one.sender is Sender.CLIENT and not isinstance(one.message, harmless)
 

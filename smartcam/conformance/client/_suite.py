@@ -39,7 +39,7 @@ def read_options(config: Any) -> ClientOptions:
     """Read the options from pytest's ``config``; none is given where no plugin has them.
 
     Raises:
-        pytest.UsageError: a value cannot be.
+        pytest.UsageError: a value is not valid.
     """
     timeout = config.getoption("--client-timeout", default=None)
     if timeout is not None and not 0 < timeout <= MAX_SECONDS:

@@ -324,7 +324,7 @@ def read_results(output: bytes) -> tuple[bytes, ...]:
     """Read what a command printed: one result a line, empty lines aside.
 
     Raises:
-        ValueError: a line is none.
+        ValueError: a line is not valid.
     """
     results: list[bytes] = []
     for number, line in enumerate(output.decode(errors="replace").splitlines(), 1):

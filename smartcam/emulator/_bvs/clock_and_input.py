@@ -39,7 +39,7 @@ class CalendarClock:
             return datetime.max.replace(tzinfo=UTC)
 
     def set(self, message: m.SetClock, now: int) -> bool:
-        """Set it; what is no time is dropped: False.
+        """Set the clock; return False for a message that holds no valid time.
 
         Source: mvBlueGEMINI manual p. 30 (published): invalid values may be dropped or converted.
         """

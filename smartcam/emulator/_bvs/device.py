@@ -121,7 +121,7 @@ class Device:
     Args:
         applications: the programs stored on it; at least one, ids differ.
         active: id of the loaded one; default the first.
-        running: in run mode from the beginning.
+        running: True for run mode from the beginning.
         quirks: what is not known about real cameras.
         clock_time: what its clock shows at first; a time without a zone is taken as it is.
         scene: the table it looks at.
@@ -308,7 +308,7 @@ class Device:
         """
         if self._session:
             self._enter(DeviceState.DISCONNECTED)
-        self._session = self._owes_switch = False  # an answer is for who asked
+        self._session = self._owes_switch = False  # an answer is for the client that asked
         self._output = []
 
     def watch(self, on_entered: Callable[[DeviceState], None]) -> None:

@@ -37,7 +37,7 @@ def _value(line: str) -> int:
 
 
 def _status(line: str) -> m.StatusReport:
-    """Return the mode; LookupError: it is none."""
+    """Return the mode; LookupError: there is no such mode."""
     return m.StatusReport(status={"0": Status(0), "1": ONLINE}[line])
 
 
@@ -76,7 +76,7 @@ class TelnetClient(LineClient):
     """One client: it logs in, then its commands are done one after the other (decided).
 
     Attributes:
-        number: of the session, from 0.
+        number: number of the session, from 0.
     """
 
     def __init__(

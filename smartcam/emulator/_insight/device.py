@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.emulator")
 
-_MAX_NUMBER = 0xFFFFFFFF  # of a run, as other cameras number them
+_MAX_NUMBER = 0xFFFFFFFF  # largest number of a run, as at other cameras
 
 
 class _PendingEvent:
@@ -65,7 +65,7 @@ class _PendingEvent:
 class InSightDevice:
     """A camera with jobs and an image.
 
-    What a client's command asks for returns or tells the status code that answers it.
+    The methods that clients' commands call return, or tell, the status code of the answer.
 
     Its arguments are those of :class:`~smartcam.emulator.EmulatedInSight`.
 
@@ -164,7 +164,7 @@ class InSightDevice:
         return self._agenda[0][0] if self._agenda else None
 
     def advance_to(self, now: int) -> None:
-        """Bring its time up, nanoseconds, and do what was due, in order, each at its own time.
+        """Move the device's time on, nanoseconds, and do what falls due, in order of time.
 
         An earlier time than before changes nothing.
         """
@@ -175,7 +175,7 @@ class InSightDevice:
         self._now = max(self._now, now)
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do something when so much time has passed; at once for none."""
+        """Do something after some seconds; at once for 0."""
         if seconds <= 0:
             action()
             return

@@ -41,9 +41,9 @@ class Control(EmulatorData):
     """
 
     kind: Literal["int", "float", "string"] = Field(
-        description="which command sets it: SI an int, SF a float, SS a string"
+        description="command that sets the cell: SI an int, SF a float, SS a string"
     )
-    value: int | float | str = Field(description="what it holds when the job is loaded")
+    value: int | float | str = Field(description="content when the job is loaded")
     low: float | None = Field(default=None, description="least number that is taken")
     high: float | None = Field(default=None, description="greatest number that is taken")
     max_length: int = Field(
@@ -208,7 +208,7 @@ class InspectedJob(Job):
     its values in ``NAME_1``, ``NAME_2``, ...
     """
 
-    inspector: Inspector = Field(description="what inspects the pictures")
+    inspector: Inspector = Field(description="the program that inspects the pictures")
     application: int = Field(description="id of the program for the inspector")
 
     def fresh_cells(self) -> dict[str, str]:

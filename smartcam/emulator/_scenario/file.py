@@ -17,7 +17,7 @@ def load_scenario(path: str | Path, *, dialect: str | None = None) -> Scenario:
     """Read a scenario file (YAML) with one camera.
 
     Args:
-        path: of the file.
+        path: path of the file.
         dialect: goes before what the file says.
 
     Raises:
@@ -37,7 +37,7 @@ def load_scenarios(path: str | Path, *, dialect: str | None = None) -> tuple[Sce
     """Read a scenario file (YAML): one camera, or several under ``cameras``.
 
     Args:
-        path: of the file.
+        path: path of the file.
         dialect: goes before what the file says.
 
     Raises:

@@ -30,7 +30,7 @@ Mistake: TypeAlias = tuple[tuple[str | int, ...], str]
 class Scenario(EmulatorData):
     """One camera: its applications, how it stands at first, its quirks, and what happens to it."""
 
-    name: str = Field(default="camera", min_length=1, max_length=200, description="for logs")
+    name: str = Field(default="camera", min_length=1, max_length=200, description="name in logs")
     protocol: str = Field(
         default=BVS.name, description="name of the protocol; others than bvs take options"
     )
@@ -47,21 +47,21 @@ class Scenario(EmulatorData):
         default=None,
         description="id of the one loaded at first; default the first of applications, else 1",
     )
-    running: bool = Field(default=False, description="in run mode from the beginning")
+    running: bool = Field(default=False, description="camera is in run mode from the beginning")
     builtins: bool = Field(
         default=True, description="have the built-in applications, as far as their ids are free"
     )
     quirks: Quirks = Field(default=Quirks(), description="what is unknown of real cameras")
-    seed: int = Field(
-        default=0, description="of all that is left to chance: the scene's noise, the timeline"
-    )
+    seed: int = Field(default=0, description="seed of all chance: the scene's noise, the timeline")
     timeline: tuple[Cue, ...] = Field(
-        default=(), max_length=MAX_CUES, description="what happens to it by itself, and when"
+        default=(),
+        max_length=MAX_CUES,
+        description="what happens to the camera by itself, and when",
     )
 
     options: dict[str, Any] = Field(
         default_factory=dict[str, Any],
-        description="of another protocol than bvs: what its emulated camera is made of",
+        description="options of the emulated camera of another protocol than bvs",
     )
 
     @field_validator("dialect")

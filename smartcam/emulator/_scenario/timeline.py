@@ -111,14 +111,12 @@ class Cue(EmulatorData):
         ),
     )
     after: _Seconds = Field(default=0.0, description="seconds later")
-    spread: _Seconds = Field(
-        default=0.0, description="by chance up to so many seconds later still, all as likely"
-    )
+    spread: _Seconds = Field(default=0.0, description="most seconds later by chance, all as likely")
     chance: float = Field(
-        default=1.0, gt=0, le=1, description="how likely it is that it happens, each time"
+        default=1.0, gt=0, le=1, description="probability that it happens, each time"
     )
     do: Annotated[tuple[Fault, ...], _OneOrMore, BeforeValidator(_as_list)] = Field(
-        description="what is injected then: one fault, or several"
+        description="one fault that is injected then, or several"
     )
 
     @model_validator(mode="after")

@@ -206,7 +206,7 @@ class Duplicate(WireFault):
     """The message comes more than once, one right behind the other."""
 
     kind: Literal["duplicate"] = "duplicate"
-    copies: int = Field(default=1, ge=1, le=100, description="How often beside the first time.")
+    copies: int = Field(default=1, ge=1, le=100, description="How many more times.")
 
 
 class Insert(CameraWireFault):
@@ -336,7 +336,7 @@ class Refuse(DeviceFault):
     """
 
     kind: Literal["refuse"] = "refuse"
-    seconds: Seconds = Field(description="How long, s.")
+    seconds: Seconds = Field(description="How long no connection is taken, s.")
 
 
 class BusyForEver(DeviceFault):
@@ -385,8 +385,8 @@ class OperatorSwitch(DeviceFault):
     """An operator loads another application behind the client's back."""
 
     kind: Literal["switch_application"] = "switch_application"
-    application: int = Field(ge=1, le=0xFFFFFFFF, description="Its id.")
-    running: bool = Field(default=False, description="Whether it runs when it is loaded.")
+    application: int = Field(ge=1, le=0xFFFFFFFF, description="Id of the application.")
+    running: bool = Field(default=False, description="Camera is in run mode afterwards.")
 
 
 class OperatorStop(DeviceFault):
@@ -408,7 +408,7 @@ class Condition(DeviceFault):
     """
 
     kind: Literal["condition"] = "condition"
-    condition: Literal["system_error", "overheat"] = Field(description="Which of the two.")
+    condition: Literal["system_error", "overheat"] = Field(description="Bit of the status.")
     active: bool = Field(default=True, description="Whether it comes or goes.")
 
 
@@ -416,7 +416,7 @@ class LateResult(DeviceFault):
     """An inspection takes longer: the one under way, else the next that begins."""
 
     kind: Literal["late_result"] = "late_result"
-    seconds: Seconds = Field(description="How much longer, s.")
+    seconds: Seconds = Field(description="How much longer the inspection takes, s.")
 
 
 class NoResult(DeviceFault):
@@ -432,7 +432,7 @@ class ExtraResult(DeviceFault):
     """
 
     kind: Literal["extra_result"] = "extra_result"
-    count: int = Field(default=1, ge=1, le=100, description="How often beside the first time.")
+    count: int = Field(default=1, ge=1, le=100, description="How many more times.")
 
 
 class DigitalInput(DeviceFault):
@@ -454,7 +454,7 @@ class MovePart(DeviceFault):
     """A part of the scene lies somewhere else; a new name is a new part."""
 
     kind: Literal["move_part"] = "move_part"
-    part: str = Field(min_length=1, max_length=200, description="Its name.")
+    part: str = Field(min_length=1, max_length=200, description="Name of the part.")
     x: Place = Field(description="To the right, m.")
     y: Place = Field(description="Away from the table's front, m.")
     theta: Place = Field(default=0.0, description="Counter-clockwise, rad.")
@@ -464,7 +464,7 @@ class RemovePart(DeviceFault):
     """A part is taken from the scene."""
 
     kind: Literal["remove_part"] = "remove_part"
-    part: str = Field(min_length=1, max_length=200, description="Its name.")
+    part: str = Field(min_length=1, max_length=200, description="Name of the part.")
 
 
 class ClearFaults(DeviceFault):

@@ -78,14 +78,14 @@ MessageName = Annotated[
 
 
 class BaseFault(EmulatorData):
-    """Base of all faults: which message it waits for."""
+    """Base of all faults: the choice of the message that a fault waits for."""
 
     default_sender: ClassVar[m.Sender]
-    """Sender of the messages that are meant where neither name nor ``sender`` says so."""
+    """Sender that is assumed where neither ``on`` nor ``sender`` names one."""
     senders: ClassVar[frozenset[m.Sender]] = frozenset(m.Sender)
     """Senders whose messages the fault can wait for."""
     can_act_at_once: ClassVar[bool]
-    """True if the fault acts at once where it is given nothing to wait for."""
+    """True if the fault acts at once when it has no message to wait for."""
 
     on: On = Field(
         default=None,
@@ -116,7 +116,7 @@ class BaseFault(EmulatorData):
     @model_validator(mode="before")
     @classmethod
     def _read_on(cls, data: Any) -> Any:
-        """YAML 1.1 reads a bare ``on`` as true, also where it is a key."""
+        """Restore the key ``on``, which YAML 1.1 reads as true."""
         if isinstance(data, dict) and True in data and "on" not in data:
             return {"on" if key is True else key: value for key, value in data.items()}
         return data
@@ -176,13 +176,13 @@ class WireFault(BaseFault):
 
 
 class CameraWireFault(WireFault):
-    """Base of those that act on what the camera says only."""
+    """Base of the faults that act on the camera's messages only."""
 
     senders: ClassVar[frozenset[m.Sender]] = frozenset({m.Sender.CAMERA})
 
 
 class EndingFault(WireFault):
-    """Base of those that end a connection."""
+    """Base of the faults that end a connection."""
 
     when: Literal["before", "after"] = Field(
         default="before",

@@ -93,14 +93,14 @@ class WireCodec(Protocol):
 class WireMessage(Transmission):
     """A message on its way, or something inserted."""
 
-    what: Frame | bytes  # the frame that its sender meant; bytes for what makes none
+    what: Frame | bytes  # the frame that its sender meant; bytes where they make no frame
     original: bytes  # its bytes
     changeable: bool = True  # whether later faults act on it
     passed: bytearray = field(default_factory=bytearray)  # what has passed
 
     @classmethod
     def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:
-        """Return one that passes as it is."""
+        """Return a message that passes as it is."""
         return cls([data], what=what, original=data)
 
     @property

@@ -60,7 +60,7 @@ class Gate:
             await self._pass(program, None, timeout)
 
     def goes_in(self, program: str) -> bool:
-        """Let a command begin if it need not wait; whether it did."""
+        """Let a command begin if it need not wait; return whether it began."""
         if self._line or (self.holder is not None and self.holder != program):
             return False
         self._active[program] += 1
@@ -92,7 +92,7 @@ class Gate:
         await self._pass(program, reservation, timeout)
 
     def release(self, reservation: Hashable) -> None:
-        """End a reservation, or the wait for it; one that is not there is none."""
+        """End a reservation, or the wait for it; does nothing where neither is there."""
         self._reservations.discard(reservation)
         if not self._reservations:
             self._free("Released")
@@ -137,7 +137,7 @@ class Gate:
         return waiting
 
     def give_up(self, waiting: InLine) -> None:
-        """Take one that has lined up out again, or back what it was granted."""
+        """Take a waiting caller out of the line, or back the turn that it was granted."""
         if waiting in self._line:
             self._line.remove(waiting)
         elif waiting.reservation is not None:

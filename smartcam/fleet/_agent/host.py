@@ -242,7 +242,7 @@ class Host:
 
     @contextlib.contextmanager
     def counted(self, said: str) -> Iterator[None]:
-        """Count how a trigger in here ends, if ``said`` is one."""
+        """Count how the trigger in the block ends, if ``said`` is a trigger."""
         outcome = RESULT
         try:
             yield

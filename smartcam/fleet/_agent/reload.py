@@ -91,8 +91,8 @@ class LoadedFleet(NamedTuple):
     Attributes:
         file: contents of the fleet file.
         plan: cameras of the file, by name.
-        marks: by name, what tells whether a camera has changed: what the file says of it, and what
-            stands in the files that it names.
+        marks: text by camera's name that tells whether a camera has changed: what the file says of
+            it, and what stands in the files that it names.
     """
 
     file: FleetFile
@@ -104,7 +104,7 @@ def loaded(file: FleetFile, folder: Path) -> LoadedFleet:
     """Return a file with its cameras.
 
     Raises:
-        ValueError: the cameras cannot be.
+        ValueError: the cameras are not valid.
     """
     plan = {planned.name: planned for planned in file.plan()}
     seen: dict[str, str] = {}

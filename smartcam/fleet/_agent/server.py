@@ -336,7 +336,7 @@ class FleetServer(Server):
         """Return the source of a camera's session; an emulated camera is started for it.
 
         Raises:
-            SmartCamError: it cannot be.
+            SmartCamError: it cannot be done.
         """
         async with contextlib.AsyncExitStack() as stack:
             entry = planned.entry

@@ -99,7 +99,7 @@ class Summaries:
         self._agent.begin(self._answer(question, pattern), "smartcam.fleet.summary")
 
     async def _answer(self, question: BusQuestion, pattern: str) -> None:
-        """Say it in parts, so that a thousand cameras hold up nobody."""
+        """Answer in parts, so that a thousand cameras hold up nobody."""
         key = self._keys.summary(self._agent.name)
         try:
             hosts = [one for one in self._agent.hosts.values() if meets(pattern, one.name)]
@@ -165,7 +165,7 @@ def _read(payload: bytes) -> Iterable[ToldCamera]:
 
 
 def by_name(told: Iterable[ToldCamera], better: Callable[[ToldCamera], Any]) -> dict[str, Any]:
-    """Return one for each name: where two agents have it for a moment, the better one."""
+    """Return one camera for each name: where two agents have it for a moment, the better one."""
     found: dict[str, ToldCamera] = {}
     for one in told:
         known = found.get(one.summary.camera)

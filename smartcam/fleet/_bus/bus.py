@@ -41,7 +41,7 @@ class Handle(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """End it; idempotent."""
+        """End the declaration; idempotent."""
 
 
 class Publisher(Handle):
@@ -54,7 +54,7 @@ class Publisher(Handle):
 
     @abc.abstractmethod
     def put(self, payload: bytes) -> None:
-        """Say it; never blocks."""
+        """Publish the payload; never block."""
 
 
 class Bus(abc.ABC):

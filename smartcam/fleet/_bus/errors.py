@@ -50,7 +50,7 @@ def from_fields(fields: Any) -> SmartCamError:
 
 def _from_fields(fields: Any) -> BaseException:
     if not isinstance(fields, dict):
-        return RemoteProtocolError(f"the agent's error is none: {fields!r:.80}")
+        return RemoteProtocolError(f"the agent's error is not valid: {fields!r:.80}")
     said = cast("dict[str, Any]", fields)
     error = _KINDS.get(str(said.get("kind")), SmartCamError)(str(said.get("text", "")))
     attributes: Any = said.get("attributes")

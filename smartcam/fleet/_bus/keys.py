@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 ROOT = "smartcam"
 
 ANYONE = "anyone"
-"""The role of a program whose certificate has none, or that has no certificate."""
+"""The role of a program without a certificate, or with one that names no role."""
 
 COMMANDS = frozenset(
     {
@@ -39,7 +39,7 @@ COMMANDS = frozenset(
 """Calls that change something, or keep others from doing so; all others are questions."""
 
 FENCED = COMMANDS - {"release", "leave"}
-"""Commands that say in which reservation's block they are called, and are not done without it."""
+"""Commands that name the reservation in whose block they are called, and need it."""
 
 
 @lru_cache(maxsize=4096)
@@ -86,8 +86,8 @@ def _fits(pattern: str, chunk: str) -> bool:
 class Keys:
     """The keys of one fleet.
 
-    What is said under which prefix decides who may say it: commands, questions, results, states,
-    presence and what other programs use have prefixes of their own.
+    Access is granted by prefix, so commands, questions, results, states, presence and the keys for
+    other programs each have a prefix of their own.
 
     Args:
         fleet: name of the fleet.
@@ -122,7 +122,7 @@ class Keys:
         return f"{self.root}/ask/{role}/{agent}/{camera}"
 
     def reload(self, agent: str) -> str:
-        """Have an agent read its file again."""
+        """Return the key at which an agent is told to read its file again."""
         return f"{self.root}/administer/{agent}/reload"
 
     def reply(self, program: str) -> str:

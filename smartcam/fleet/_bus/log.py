@@ -1,8 +1,9 @@
-"""Numbered things of one camera: kept by its agent, and put in order by who hears of them.
+"""Numbered things of one camera: kept by its agent, and put in order by their receiver.
 
-An agent numbers what it says without gaps and keeps the last of it (:class:`AgentLog`). Who hears
-it (:class:`Feed`) takes each number once and in order: what came twice is dropped, and what is
-missing is asked for. What the agent no longer has was missed, and how many that were is known.
+An agent numbers what it says without gaps and keeps the last of it (:class:`AgentLog`). A receiver
+that hears it (:class:`Feed`) takes each number once and in order: what came twice is dropped, and
+what is missing is asked for. What the agent no longer has was missed, and how many that were is
+known.
 """
 
 from __future__ import annotations

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 def grace(timeout: float) -> float:
-    """Return the seconds for which a reply is awaited beyond a call's own.
+    """Return the seconds for which a reply is awaited beyond a call's timeout.
 
-    So the agent gives up first. Half of it may go by until the call is there; then the call has
-    all its time.
+    So the agent gives up first. The call may take half of this time to reach the agent without
+    losing any of its own.
     """
     return min(0.25, 0.02 + 0.1 * timeout)
 
@@ -52,7 +52,7 @@ _NONE = -(1 << 63)  # in place of a number
 
 
 def encode_status(number: int, status: int, endian: int, application: int | None) -> bytes:
-    """Return a status of a session as bytes, as :func:`encode_state` does; ``number`` is its own.
+    """Return a status as bytes, as :func:`encode_state` does; ``number`` is the event's.
 
     Raises:
         struct.error: it does not fit.
@@ -66,7 +66,7 @@ def decode_state(data: bytes) -> dict[str, Any]:
     """Return the fields of an event.
 
     Raises:
-        ValueError: it is nothing of the kind.
+        ValueError: the bytes are no event.
     """
     if data[:4] == _IS_STATUS and len(data) == _STATUS.size:
         _, number, status, endian, application = _STATUS.unpack(data)
@@ -96,7 +96,7 @@ def decode(payload: bytes, what: str) -> BusMessage:
     """Return the message in ``payload``.
 
     Raises:
-        RemoteProtocolError: it is none; ``what`` is said to be broken.
+        RemoteProtocolError: the payload is no message; ``what`` names it.
     """
     try:
         (size,) = _LENGTH.unpack_from(payload)
@@ -123,7 +123,7 @@ def decode(payload: bytes, what: str) -> BusMessage:
 # ---------------------------------------------------------------------- results
 
 CURRENT, LATE = 1, 2
-"""Flags of a run: not known to be an older trigger's; known to be one's that was given up."""
+"""Flags of a run: CURRENT, not known to belong to an older trigger; LATE, its trigger gave up."""
 
 _RUN = struct.Struct("<QIqIBxxxIIddddI")
 _BATCH = struct.Struct("<4sQQI")
@@ -147,8 +147,8 @@ class ResultRun(NamedTuple):
         triggered_at: when their trigger was sent, the same way; NaN without one.
         latency: seconds from the trigger to the containers; NaN without a trigger.
         payloads: bytes of each container.
-        cells: JSON with the values that the one payload was put together from, and what speaks
-            against them; empty without.
+        cells: JSON with the values of which the one payload was made, and objections to them;
+            empty without cells.
     """
 
     number: int
@@ -166,7 +166,7 @@ class ResultRun(NamedTuple):
 
     @property
     def next(self) -> int:
-        """The number behind it."""
+        """The number after the run's last one."""
         return self.number + len(self.payloads)
 
     @property
@@ -230,7 +230,7 @@ def decode_runs(payload: bytes, what: str) -> Batch:
     """Return the runs in ``payload``.
 
     Raises:
-        RemoteProtocolError: it is broken.
+        RemoteProtocolError: the payload is broken; ``what`` names it.
     """
     try:
         magic, epoch, following, count = _BATCH.unpack_from(payload)
@@ -325,7 +325,7 @@ class TriggerOrder(NamedTuple):
 
 
 def encode_order(program: str, order: TriggerOrder) -> bytes:
-    """Return a call of ``program`` as bytes; as a message where it has more than numbers in it."""
+    """Return a call of ``program`` as bytes; a call with layouts becomes a JSON message."""
     number, epoch, deadline, timeout, application, expected, results, wait, each, data = order[:10]
     layouts, reservation = order.layouts, order.reservation
     flags = wait * _WAIT | each * _BY_APPLICATION | (data is not None) * _INPUT
@@ -373,10 +373,10 @@ def encode_order(program: str, order: TriggerOrder) -> bytes:
 
 
 def decode_order(payload: bytes, what: str) -> tuple[str, TriggerOrder] | None:
-    """Return the program and its call in ``payload``; None where that is a message.
+    """Return the program and its call in ``payload``; None where it is a JSON message.
 
     Raises:
-        RemoteProtocolError: it is broken; ``what`` is.
+        RemoteProtocolError: the payload is broken; ``what`` names it.
     """
     if payload[:4] != _IS_ORDER:
         return None
@@ -416,8 +416,8 @@ class TriggerReply(NamedTuple):
         call: the number of the call.
         epoch: number of the agent's start.
         clock: time of the agent's clock, seconds.
-        states: the number that the agent gives what happens next.
-        told: what happened and was not said before.
+        states: number that the agent will give its next event.
+        told: events that were not sent before.
         batch: results of the trigger, and the number that the agent gives the next one.
     """
 
@@ -440,10 +440,10 @@ def encode_outcome(
 
 
 def decode_outcome(payload: bytes, what: str) -> TriggerReply | None:
-    """Return the reply to a trigger in ``payload``; None where that is a message.
+    """Return the reply to a trigger in ``payload``; None where it is a JSON message.
 
     Raises:
-        RemoteProtocolError: it is broken; ``what`` is.
+        RemoteProtocolError: the payload is broken; ``what`` names it.
     """
     if payload[:4] != _IS_OUTCOME:
         return None

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-LONG = 1 << 16
+MAX_DIRECT_BYTES = 1 << 16
 """Bytes beyond which something is said by a thread, which waits until the engine has taken it."""
 
 LINK = re.compile(r"\w+/(?P<host>[0-9.]+|\[[^]]+\]):(?P<port>[0-9]+)")
 """The place of the other end of a connection, as the engine writes it."""
 
-CALM = 0.01
+BURST_PERIOD = 0.01
 """Seconds in which a few messages go out at once, and further ones together."""
 
 MAX_EXPRESS_MESSAGES, MAX_DIRECT_MESSAGES = 8, 64
@@ -71,7 +71,7 @@ class ZenohEnd(ZenohSession, Bus):
         self._sender: ThreadPoolExecutor | None = None
         self._sending = 0
         self._behind: collections.Counter[str] = collections.Counter()
-        self._calm_since, self._said = -CALM, 0
+        self._calm_since, self._said = -BURST_PERIOD, 0
         zenoh = self._zenoh
         control, priority = zenoh.CongestionControl, zenoh.Priority.INTERACTIVE_HIGH
         self._dropping, self._waiting_for_room = (
@@ -198,14 +198,18 @@ class ZenohEnd(ZenohSession, Bus):
         if session is None:
             return
         now = self._loop.time()
-        if now - self._calm_since > CALM:
+        if now - self._calm_since > BURST_PERIOD:
             self._calm_since, self._said = now, 0
         self._said += 1
         # what is said by itself goes out at once, a burst together: there is not room for many
         express = self._said <= MAX_EXPRESS_MESSAGES
         # a router, and a peer, has one to each who listens
         way = "" if self._link.mode == "client" else key
-        if len(payload) > LONG or self._said > MAX_DIRECT_MESSAGES or way in self._behind:
+        if (
+            len(payload) > MAX_DIRECT_BYTES
+            or self._said > MAX_DIRECT_MESSAGES
+            or way in self._behind
+        ):
             self._hand_over(way, session, key, payload, self._waiting_for_room[express])
             return
         try:

@@ -110,7 +110,7 @@ class Retry(Fields):
     """The delays before a camera that is not there, or was lost, is tried again."""
 
     initial: float = Field(0.1, ge=0, description="the first delay, seconds")
-    factor: float = Field(2.0, ge=1, description="how much longer each delay is than the last")
+    factor: float = Field(2.0, ge=1, description="each delay is this times the last")
     maximum: float = Field(10.0, ge=0, description="the longest delay, seconds")
     jitter: float = Field(0.3, ge=0, le=1, description="share of a delay that is left to chance")
     attempts: int | None = Field(None, ge=1, description="tries until it is given up; none: never")
@@ -139,11 +139,13 @@ def _or_bool(schema: dict[str, Any]) -> None:
 class Emulated(Fields):
     """Emulated cameras, to try a plant on a desk."""
 
-    count: int = Field(1, ge=1, le=MAX_CAMERAS_PER_AGENT, description="how many")
+    count: int = Field(1, ge=1, le=MAX_CAMERAS_PER_AGENT, description="number of cameras")
     scenario: str | None = Field(
         None, description="a scenario file with one camera, beside this file; default as the demo's"
     )
-    seed: int = Field(1, ge=0, description="of the first one's noise; each next one has one more")
+    seed: int = Field(
+        1, ge=0, description="seed of the first camera's noise; the next ones count on"
+    )
 
 
 class FramesEntry(Fields):
@@ -239,7 +241,7 @@ class CameraEntry(Fields):
         json_schema_extra={"oneOf": [{"required": [name]} for name in _SOURCES]}
     )
 
-    url: str | None = Field(None, description="where the camera is: bvs://HOST, insight://HOST")
+    url: str | None = Field(None, description="address of the camera: bvs://HOST, insight://HOST")
     emulated: Emulated | None = Field(None, description="an emulated one instead")
     software: dict[str, Any] | None = Field(
         None,
@@ -265,15 +267,16 @@ class CameraEntry(Fields):
         description="after a reconnect have application and run state back; default: where nodes "
         "of ROS become active by themselves",
     )
-    connect_timeout: Seconds = Field(10.0, description="for a session, all attempts together")
-    switch_timeout: Seconds = Field(10.0, description="for a switch until the camera is ready")
-    request_timeout: Seconds = Field(5.0, description="for the answer to a request")
+    connect_timeout: Seconds = Field(10.0, description="longest wait for a session, all attempts")
+    switch_timeout: Seconds = Field(10.0, description="longest wait for a switch")
+    request_timeout: Seconds = Field(5.0, description="longest wait for the answer to a request")
     liveness_timeout: Seconds | None = Field(
-        5.0, description="for a sign of life of a camera that is asked for one; null: no end"
+        5.0,
+        description="longest silence of a camera that is asked for a sign of life; null: no end",
     )
     frames: Annotated[FramesEntry | None, BeforeValidator(_frames)] = Field(
         None,
-        description="where its pictures come from: a URL, or a mapping with more",
+        description="source of the camera's pictures: a URL, or a mapping with more",
         json_schema_extra=_or_url,
     )
     ros2: RosCamera = Field(

@@ -36,7 +36,7 @@ class OperationsSection(Fields):
 
     listen: Place | None = Field(
         DEFAULT_PLACE,
-        description="where /healthz, /readyz and /metrics are served, HOST:PORT, to whoever asks; "
+        description="HOST:PORT at which /healthz, /readyz and /metrics are served, to all who ask; "
         "null: nowhere; port 0 takes a free one",
     )
     names: tuple[Name, ...] = Field(
@@ -47,14 +47,14 @@ class OperationsSection(Fields):
     )
     latency: Literal["agent", "camera"] = Field(
         "agent",
-        description="what has histograms of latency: all cameras of the agent together, each "
+        description="owner of the histograms of latency: all cameras of the agent together, each "
         "camera then has sum and count only; or each camera, which is 20 lines more for each",
     )
     log: Literal["text", "json"] = Field(
-        "text", description="how smartcam serve says what happens: lines for people, or JSON"
+        "text", description="form of smartcam serve's log: lines for people, or JSON"
     )
     level: Literal["debug", "info", "warning", "error"] = Field(
-        "info", description="of JSON lines, what is left out below"
+        "info", description="lowest level of JSON lines that are written"
     )
 
     @property

@@ -18,15 +18,19 @@ class RecordSection(Fields):
     """Recording beside the agent: of each camera files that follow each other, in one folder."""
 
     folder: str = Field(
-        "recordings", min_length=1, description="where the files are, beside this file; made if new"
+        "recordings",
+        min_length=1,
+        description="folder of the files, relative to this file; made if missing",
     )
-    size: Size = Field(1e8, description="a camera's next file begins behind so much: 100 MB")
-    age: Age = Field(3600.0, description="or behind so long: 1 h, 30 min, 1 d")
+    size: Size = Field(1e8, description="size at which a camera's next file begins, such as 100 MB")
+    age: Age = Field(3600.0, description="time after which it begins, such as 1 h, 30 min, 1 d")
     keep: Size = Field(
-        1e10, description="of all files together; beyond it the oldest are deleted: 10 GB"
+        1e10,
+        description="size of all files, beyond which the oldest are deleted, such as 10 GB",
     )
     cameras: Patterns = Field(
-        ("**",), description="which ones: names, * for one part of them, ** for any number"
+        ("**",),
+        description="cameras that are recorded: names, * for one part of a name, ** for any number",
     )
     frames: bool = Field(
         True,

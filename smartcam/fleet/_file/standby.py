@@ -11,7 +11,7 @@ class Standby(Fields):
     """The way an agent stands by for cameras that another one of the fleet has."""
 
     preference: int = Field(
-        0, ge=0, le=3, description="of several that stand by, the lowest takes over first"
+        0, ge=0, le=3, description="rank among several that stand by: the lowest takes over first"
     )
 
 

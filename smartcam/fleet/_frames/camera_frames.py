@@ -1,9 +1,9 @@
 """A camera's frames at its agent: one source, for all programs that look.
 
-Who wants a stream asks for one frame after the other: the next request is here before the next
-frame is, so nothing is late, and a program that asks no more gets no more. Between two requests the
-agent keeps a reader for it, which skips and counts as any other. That one ends with its program, or
-when nothing was asked for a while; with the last one the device stops.
+A program that wants a stream asks for one frame after the other: the next request is here before
+the next frame is, so nothing is late, and a program that asks no more gets no more. Between two
+requests the agent keeps a reader for it, which skips and counts as any other. That one ends with
+its program, or when nothing was asked for a while; with the last one the device stops.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MAX_FRAME_CALLS_PER_PROGRAM = 16
 """Calls for frames of one camera that one program may have under way: each may keep a frame."""
 
 MAX_ENCODINGS = 16
-"""Ways of encoding whose last frame is kept, for who wants the same."""
+"""Ways of encoding whose last frame is kept, for viewers that want the same."""
 
 MAX_VIDEO_SETTINGS = 4
 """Settings of H.264 that are encoded at one time."""
@@ -151,7 +151,7 @@ class SharedFrames:
             UnsupportedError: the camera has none.
             FrameSourceError: it cannot be opened; the next one tries again.
 
-        Cancellation: it is opened all the same, for who comes next.
+        Cancellation: it is opened all the same, for the next viewer.
         """
         if self._source is not None:
             return self._source
@@ -351,7 +351,7 @@ class SharedFrames:
         ending.add_done_callback(self._done)
 
     def leave(self, program: str, stream: int) -> None:
-        """End a stream; one that is not there is none."""
+        """End a stream; does nothing where it is not known."""
         viewer = self._viewers.get((program, stream))
         if viewer is not None:
             self._leave((program, stream), viewer)

@@ -7,7 +7,7 @@ import logging
 from typing import TYPE_CHECKING
 
 from smartcam.exceptions import ProtocolError
-from smartcam.fleet._frames.sender import SMALL, WINDOW
+from smartcam.fleet._frames.sender import MAX_UNCOUNTED_BYTES, WINDOW_BYTES
 from smartcam.fleet._frames.wire import decode_part
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ class Incoming:
             self._total = part.total
             self._data += data
         over = self._torn or self.complete
-        if part.total > (SMALL if over else WINDOW) and not self._caller.program.bus.local:
+        room = MAX_UNCOUNTED_BYTES if over else WINDOW_BYTES
+        if part.total > room and not self._caller.program.bus.local:
             self._caller.come(self._call, None if over else len(self._data))
         self._stirred.set()
 

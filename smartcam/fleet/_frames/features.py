@@ -23,7 +23,7 @@ _ACCESS: Final = ("rw", "ro", "wo", "")
 
 
 def feature_fields(feature: Feature) -> dict[str, Any]:
-    """Return a feature as JSON; a number that JSON does not have is none."""
+    """Return a feature as JSON; a number that JSON does not have becomes null."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in dataclasses.asdict(feature).items()
@@ -59,7 +59,7 @@ def read_value(said: object, who: str) -> FeatureValue:
     """Return a value that an agent says.
 
     Raises:
-        RemoteProtocolError: it is none.
+        RemoteProtocolError: it is not valid.
     """
     if isinstance(said, (bool, int, float, str)):
         return said
@@ -112,7 +112,7 @@ class FleetFeatures(DeviceFeatures):
         """Return a list of what an agent says.
 
         Raises:
-            RemoteProtocolError: it is none, or has too many items.
+            RemoteProtocolError: it is not valid, or has too many items.
         """
         found = said.get(name)
         if not isinstance(found, list) or len(found) > MAX_FEATURES:

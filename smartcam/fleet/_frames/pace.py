@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 
-SHARE = 0.04
+MAX_WAIT_SHARE = 0.04
 """Share of a frame's time on the way that a frame may have waited before."""
 
-LEAST = 0.002
+MIN_WAIT_SECONDS = 0.002
 """Seconds that each frame may have waited in any case."""
 
 PATIENCE = 1.25
@@ -20,7 +20,7 @@ PATIENCE = 1.25
 
 
 class FramePace:
-    """Of one stream. All times are of one clock."""
+    """Pace of one stream. All times are of one clock."""
 
     def __init__(self) -> None:
         self._gave: float | None = None
@@ -42,7 +42,7 @@ class FramePace:
             self._ways, self._gave = (self._ways[1], now - self._gave), None
         self._rest = rest
         way = min(self._ways)
-        since, until = now - max(LEAST, SHARE * way), now
+        since, until = now - max(MIN_WAIT_SECONDS, MAX_WAIT_SHARE * way), now
         if 0 < self._period <= way:  # else the link is free before there is another
             until = came + PATIENCE * self._period
         if rest and now < self._due:

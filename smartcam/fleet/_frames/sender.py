@@ -1,7 +1,7 @@
 """An agent's end of frames on their way: never more of them than a program has said it takes.
 
-Each program has a window of bytes that are under way to it. It says what has come, and gets more
-then. So a program that is slow, stopped or dead fills no queue but its own, nobody waits for it,
+Each program has a window of bytes that are under way to it. It says what has come, and then gets
+more. So a program that is slow, stopped or dead fills no queue but its own, nobody waits for it,
 and what it does not take in time is skipped where the frames are. There is no task in it: what
 comes pushes the next part out.
 """
@@ -20,21 +20,21 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Bus, Data
     from smartcam.fleet._bus.keys import Keys
 
-PART = 1 << 17
+PART_BYTES = 1 << 17
 """Bytes of a part: the loop takes less than 0.1 ms to hand them to the engine."""
 
-WINDOW = 3 * PART
+WINDOW_BYTES = 3 * PART_BYTES
 """Bytes under way to one program. The engine's queue has room for 16 packets of 64 kB, and drops
-what does not fit; where a router stands between, two programs have it together."""
+what does not fit; behind a router two programs share that queue."""
 
-SMALL = 1 << 16
+MAX_UNCOUNTED_BYTES = 1 << 16
 """Bytes of a frame that is one packet, and not counted: nobody says that it has come."""
 
 MAX_WAITING_BYTES = 1 << 26
-"""Bytes of frames that may wait for one program; the oldest of which nothing is under way are given
+"""Bytes of frames that may wait for one program; the oldest of which no part is under way are given
 up."""
 
-STALE = 10.0
+STALE_AFTER = 10.0
 """Seconds after which a frame of which nothing came there is given up."""
 
 
@@ -95,7 +95,7 @@ class FrameSender:
     def send(self, program: str, call: int, data: Data) -> None:
         """Send a frame's bytes as the answer to a call: what there is room for now."""
         total = len(data)
-        if self._bus.local or total <= SMALL:
+        if self._bus.local or total <= MAX_UNCOUNTED_BYTES:
             self._put(program, FramePart(call, 0, total), data)
             return
         window = self._windows.setdefault(program, _Window())
@@ -103,7 +103,7 @@ class FrameSender:
         for one in [*window.transfers.values()]:
             # what is under way stays so, unless it is long ago
             full = window.waiting + total > MAX_WAITING_BYTES and not one.under_way
-            if full or now - one.moved_at > STALE:
+            if full or now - one.moved_at > STALE_AFTER:
                 del window.transfers[one.call]
         window.transfers[call] = _Transfer(call, memoryview(data), now)
         self._push(program, window)
@@ -133,10 +133,10 @@ class FrameSender:
 
     def _push(self, program: str, window: _Window) -> None:
         """Send parts as long as there is room; of those begun first, first."""
-        room = WINDOW - window.under_way
+        room = WINDOW_BYTES - window.under_way
         for one in window.transfers.values():
             while one.sent < len(one.data):
-                part = one.data[one.sent : one.sent + PART]
+                part = one.data[one.sent : one.sent + PART_BYTES]
                 if len(part) > room:
                     return
                 room -= len(part)

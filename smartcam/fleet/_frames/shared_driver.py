@@ -16,7 +16,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.fleet._frames.caller import StreamCounts, as_source_error
-from smartcam.fleet._frames.stream import HOLD
+from smartcam.fleet._frames.stream import HOLD_TIMEOUT
 from smartcam.fleet._frames.wire import VIDEO, FrameForm
 from smartcam.frames import FrameDriver
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-ANSWER = 4.0
+ANSWER_TIMEOUT = 4.0
 """Seconds for the answer to a request of a stream, beyond those that it waits for a frame: to
 encode it, and for the way."""
 
@@ -158,7 +158,7 @@ class SharedFrameDriver(FrameDriver):
         counts, silent, torn = StreamCounts(), 0, 0
         while True:
             try:
-                deadline = loop.time() + HOLD + ANSWER
+                deadline = loop.time() + HOLD_TIMEOUT + ANSWER_TIMEOUT
                 answer, frames = await self._frames.ask_all(
                     "next_frame", deadline, self._arguments(stream), counts
                 )

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from smartcam.fleet._frames.wire import FrameForm
     from smartcam.frames import Frame, FrameReader
 
-IDLE = 3.0
+IDLE_TIMEOUT = 3.0
 """Seconds without a request after which a stream has ended."""
 
-HOLD = 1.0
+HOLD_TIMEOUT = 1.0
 """Seconds that a request waits for a frame at most; then it is answered that there is none."""
 
 
@@ -32,7 +32,7 @@ class FrameOrder(NamedTuple):
         encoding: form in which the frame is to come.
         timeout: seconds that the call may take.
         rest: seconds from one frame of a stream to the next, at least.
-        have: for H.264, number of the last encoded frame that the program has; 0 for none.
+        have: number, for H.264, of the last encoded frame that the program has; 0 for none.
     """
 
     program: str
@@ -49,7 +49,7 @@ class TakenFrame(NamedTuple):
     Attributes:
         frame: the frame in the form in which it is to come.
         took: seconds to encode it.
-        number: for H.264, place of the frame in the stream; else 0.
+        number: place, for H.264, of the frame in the stream; else 0.
     """
 
     frame: Frame
@@ -73,7 +73,7 @@ class FrameStream(ABC):
     def rest(self, close: Callable[[], None]) -> None:
         """Count the stream as idle; ``close`` is called if it stays so."""
         self.busy = False
-        self.idle = asyncio.get_running_loop().call_later(IDLE, close)
+        self.idle = asyncio.get_running_loop().call_later(IDLE_TIMEOUT, close)
 
     def wake(self) -> None:
         """Count the stream as busy: something is asked for."""
@@ -97,7 +97,7 @@ class FrameStream(ABC):
         """Return the numbers of frames sent, skipped and lost, to be told with the next frames."""
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """End the stream. Idempotent."""
         self.wake()
 
 
@@ -117,7 +117,7 @@ class PictureStream(FrameStream):
     async def take(self, order: FrameOrder) -> list[TakenFrame]:
         loop, reader = asyncio.get_running_loop(), self.reader
         since, until = self.pace.asked(loop.time(), reader.came, order.rest)
-        async with asyncio.timeout(min(order.timeout, HOLD)):
+        async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
             await reader.fresh(since, until)
             frame = await anext(reader)
         self.pace.took(reader.came, reader.statistics().offered)
@@ -152,7 +152,7 @@ class VideoStream(FrameStream):
     _last: tuple[int, int] = (0, 0)
 
     async def take(self, order: FrameOrder) -> list[TakenFrame]:
-        async with asyncio.timeout(min(order.timeout, HOLD)):
+        async with asyncio.timeout(min(order.timeout, HOLD_TIMEOUT)):
             units = await self.video.after(order.have)
         if self._first is None:
             self._first = units[0].offered - 1, units[0].lost

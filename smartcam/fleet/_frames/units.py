@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.fleet")
 
-TAKE = 1.0
+TAKE_TIMEOUT = 1.0
 """Seconds that readers have for an encoded frame before the next one of the same answer."""
 
 
@@ -27,7 +27,7 @@ class VideoUnits:
         decode: False: it gives the encoded frames.
 
     Attributes:
-        have: number of the last encoded frame of which there is a picture; 0: none is.
+        have: number of the last encoded frame that was decoded; 0: no frame was.
 
     Raises:
         MissingExtraError: what decodes is not installed.
@@ -77,5 +77,5 @@ class VideoUnits:
         sink.frame(frame)
         if not last:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(TAKE):
+                async with asyncio.timeout(TAKE_TIMEOUT):
                     await sink.taken()

@@ -18,7 +18,7 @@ from smartcam.exceptions import FrameSourceError
 if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource, H264Encoder
 
-LATE = 0.3
+LATE_SECONDS = 0.3
 """Seconds that an encoded frame is kept for programs that have the frames before it."""
 
 MAX_UNITS_KEPT = 64
@@ -124,7 +124,7 @@ class SharedVideo:
         kept = self._kept
         if not kept or kept[-1].number == have:
             return []
-        fresh = asyncio.get_running_loop().time() - LATE
+        fresh = asyncio.get_running_loop().time() - LATE_SECONDS
         found: list[VideoUnit] = []
         for unit in reversed(kept):
             if unit.made < fresh and found:

@@ -164,7 +164,7 @@ def _read_more(said: dict[str, Any], captured: float, who: str) -> dict[str, Any
     """Return the fields that :func:`_more` made, by this side's clock."""
     chunks, remark, trigger = said.get("chunks", {}), said.get("remark", ""), said.get("trigger")
     if not isinstance(chunks, dict):
-        raise TypeError("its chunks are none")
+        raise TypeError("its chunks are not valid")
     read: dict[str, Any] = {
         "chunks": {
             str(name): read_value(value, who)

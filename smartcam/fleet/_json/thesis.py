@@ -102,7 +102,7 @@ class JsonThesisFace:
         self._topics.interpret(self._host.settings.interpret_as if spec is None else spec)
 
     def is_calibrated(self, application: int) -> bool:
-        """Return False: what is said in JSON is in the camera's frame."""
+        """Return False: JSON has poses in the camera's frame."""
         return False
 
     def check_status_topic(self, topic: str) -> None:
@@ -118,7 +118,7 @@ class JsonThesisFace:
         return {"topic": self._topics.publish_results(_topic(topic), min_delay, queue)}
 
     async def end_publishing(self) -> None:
-        """Publish neither on topics that a request has named."""
+        """End publishing on the topics that requests have named."""
         self._topics.end_publishing()
 
     async def have_session(self) -> None:

@@ -164,10 +164,10 @@ class CameraTopics:
         self.interpret(host.settings.interpret_as)
 
     def interpret(self, spec: Any) -> None:
-        """Have its containers read in another way from now on.
+        """Have the camera's containers read in another way from now on.
 
         Raises:
-            ConfigurationError: ``spec`` is none.
+            ConfigurationError: ``spec`` is not valid.
         """
         self.interpretation: Interpretation | None = None if spec is None else self.reading(spec)
         self.interpret_as: Any = spec
@@ -176,7 +176,7 @@ class CameraTopics:
         """Return the interpretation of its containers by ``spec``.
 
         Raises:
-            ConfigurationError: ``spec`` is none.
+            ConfigurationError: ``spec`` is not valid.
         """
         settings = self._host.settings
         return Interpretation(spec, lenient=settings.lenient, y_down=settings.y_down)
@@ -184,7 +184,7 @@ class CameraTopics:
     def publish_status(self, topic: str) -> str:
         """Have the status said under a topic of the thesis' interface; return its key.
 
-        It takes the place of the one before; an empty name is none.
+        It takes the place of the one before; an empty name ends it.
         """
         if self.status_out is not None:
             self.status_out.close()
@@ -197,7 +197,7 @@ class CameraTopics:
     def publish_results(self, topic: str, min_delay: float, queue_size: int) -> str:
         """Have results said under a topic of the thesis' interface; return its key.
 
-        It takes the place of the one before; an empty name is none.
+        It takes the place of the one before; an empty name ends it.
         """
         if self.results_out is not None:
             self.results_out.close()

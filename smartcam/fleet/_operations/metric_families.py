@@ -91,7 +91,7 @@ def require_client() -> Any:
 
 
 class _One(NamedTuple):
-    """A family, as what prometheus-client makes a text of."""
+    """A family as a collector, from which prometheus-client makes a text."""
 
     family: Any
 
@@ -209,7 +209,7 @@ class _MetricKind(NamedTuple):
         text: help text of the family, for people.
         labels: names of the labels beside ``agent`` and ``camera``.
         values: function for a camera's values: the labels, and the arguments of a number.
-        lines: about, of one camera.
+        lines: approximate number of lines for one camera.
         chosen: whether a camera has it.
     """
 

@@ -82,7 +82,7 @@ class Lease:
 
     Attributes:
         epoch: number of the start of the agent that made the reservation.
-        lost: why the reservation is lost; empty as long as nobody has said so.
+        lost: why the reservation is lost; empty while it is not lost, as far as is known.
         told: whether there was an event for the loss.
     """
 

@@ -73,7 +73,8 @@ ASK_AGAIN = 2.0
 """Seconds for the answer to a question that waits; then it is asked again until its deadline."""
 
 REACH_TIMEOUT = 0.5
-"""Seconds that what was said before a reply is waited for; it comes before, unless it was lost."""
+"""Seconds to wait for the events that the agent sent before a reply, which were lost if they are
+late."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,8 +92,8 @@ class FleetCamera(Camera[ValueT]):
     """A camera that an agent of a fleet shares with other programs.
 
     It is made by :func:`smartcam.connect` with a fleet URL, and by a
-    :class:`~smartcam.fleet.Fleet`. Commands are the agent's to do, each once; results are read
-    here.
+    :class:`~smartcam.fleet.Fleet`. The agent carries out commands, each once; results are read
+    in this process.
 
     The link may be the one to the agent: one that is lost is a
     :exc:`~smartcam.ConnectionLostError` that names it. A call that was under way then may have been
@@ -116,7 +117,7 @@ class FleetCamera(Camera[ValueT]):
         observers: Iterable[Observer] = (),
     ) -> None:
         self._agents_layout: Any = None  # how to read results where this program does not say
-        self._unreadable: ConfigurationError | None = None  # that cannot work
+        self._unreadable: ConfigurationError | None = None  # why that cannot be used
         self._met = False
         super().__init__(settings, observers=observers)
         self._camera_name, self._program, self._shared = camera, program, shared
@@ -146,7 +147,7 @@ class FleetCamera(Camera[ValueT]):
         self.opening: asyncio.Task[None] | None = None  # whoever made it waits for its agent
         self._sessions = 0
         self._linked = False  # the agent has a session with the camera
-        self._trying = True  # the agent has not done with the first try
+        self._trying = True  # the agent's first try to connect is not over
         self._status: Status | None = None
         self._active: int | None = None
         self._about: dict[str, Any] = {}  # what the agent said of the camera
@@ -445,7 +446,7 @@ class FleetCamera(Camera[ValueT]):
         self._stir(error)
 
     def _stir(self, what: Status | LinkError) -> None:
-        """Give who waits something to look at."""
+        """Wake the callers that wait for a change."""
         for queue in self._watching:
             queue.put_nowait(what)
 
@@ -591,7 +592,7 @@ class FleetCamera(Camera[ValueT]):
         call: int | None = None,
         **arguments: Any,
     ) -> BusMessage:
-        """Have the agent do something; what it said before its reply is taken first."""
+        """Have the agent do something; take the events that it sent before its reply first."""
         limit = self._limit(timeout, self.settings.request_timeout)
         deadline = self._deadline(limit)
         await self._met_first(deadline)
@@ -750,7 +751,7 @@ class FleetCamera(Camera[ValueT]):
         try:
             present = self.status
             reply = await self._do("refresh", timeout)
-            if reply.fields["answer"]["asked"]:  # what was told before is not of now
+            if reply.fields["answer"]["asked"]:  # a status from before is not the current one
                 present = self.status
                 while not queue.empty():
                     status = queue.get_nowait()

@@ -36,7 +36,7 @@ MAX_AGENTS_NUMBERED = 1000
 
 
 class _BusPlace(Handle):
-    """Somebody who is given what is said under one key."""
+    """Receiver of the messages under one key."""
 
     def __init__(self, exchange: Exchange, key: str, call: Callable[..., None]) -> None:
         self.key, self.call = key, call
@@ -74,7 +74,7 @@ class Exchange(Bus):
     # ------------------------------------------------------------------ for many
 
     def see_all(self, see: Callable[[str, bool], None]) -> None:
-        """Hear of all cameras' presences from now on, for who watches one of them, and for all.
+        """Hear of all cameras' presences from now on, for watchers of one camera or of all.
 
         ``see(key, present)`` is called for each.
         """

@@ -31,8 +31,8 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 LOOK_AGAIN = 0.1
 """Seconds between two looks whether an agent has come."""
 
-LAST_LOOK = 1.0
-"""Seconds that a look may take at what is there instead."""
+LAST_LOOK_TIMEOUT = 1.0
+"""Seconds for the look at which fleets are there instead of the wanted one."""
 
 
 Reply = BusMessage | TriggerReply
@@ -103,7 +103,7 @@ class Program:
 
     @property
     def name(self) -> str:
-        """Its name, which no other program has: its role, and what a person would call it."""
+        """The program's unique name: its role, and what a person would call it."""
         return self._name.name
 
     @property
@@ -137,7 +137,7 @@ class Program:
             await asyncio.sleep(min(LOOK_AGAIN, left))
         what, meant = "camera", ""
         if "*" not in self._camera:
-            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK)
+            keys = await self.bus.present(Keys("*").camera("*", "**"), LAST_LOOK_TIMEOUT)
             meant = did_you_mean(self._camera, sorted({key.split("/", 5)[5] for key in keys}))
             what = f"camera {self._camera}"
         whose = self.bus.identity

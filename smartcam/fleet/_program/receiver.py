@@ -43,7 +43,7 @@ class ToldState(NamedTuple):
 
     @property
     def next(self) -> int:
-        """The number behind it."""
+        """The number after this state's."""
         return self.number + 1
 
     @property
@@ -52,7 +52,7 @@ class ToldState(NamedTuple):
         return 500
 
     def since(self, number: int) -> ToldState:
-        """Return itself: it is one thing."""
+        """Return this state, which has one number only."""
         return self
 
 
@@ -67,7 +67,7 @@ def state(data: bytes) -> ToldState:
 
 
 class FleetListeners(Listeners):
-    """Passes over who came later than what is handed on."""
+    """Passes over listeners that came later than the results that are handed on."""
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -76,7 +76,7 @@ class FleetListeners(Listeners):
         )
 
     def unmarked(self) -> list[asyncio.Future[Result]]:
-        """Return the waiters that nobody has said yet of since when."""
+        """Return the waiters whose beginning is not known yet."""
         return [one for one in self._next_results if one not in self._since]
 
     def waits_since(self, future: asyncio.Future[Result], clock: float) -> None:
@@ -206,13 +206,13 @@ class Receiver:
 
     @property
     def epoch(self) -> int:
-        """Of the agent whose states were taken last; 0 before."""
+        """Epoch of the agent whose states were taken last; 0 before."""
         return self._states.epoch
 
     # ------------------------------------------------------------------ on demand
 
     def want_results(self, since: float) -> None:
-        """Somebody listens to results from ``since`` on (the agent's clock)."""
+        """Note that somebody listens to results from ``since`` on (the agent's clock)."""
         if "results" in self._handles:
             return
         program = self._caller.program
@@ -355,7 +355,7 @@ class Receiver:
         self._wake()
 
     def _see(self, epoch: int) -> None:
-        """Look whether the agent was started anew: presence does not tell where it is back soon."""
+        """Look whether the agent was started anew: presence does not show a quick restart."""
         met = self._caller.met
         if met is not None and self._caller.restarted(epoch):
             self._caller.lose(f"the agent {met.agent} was restarted")
@@ -406,7 +406,7 @@ class Receiver:
         return outcome
 
     def _take_run(self, run: ResultRun) -> None:
-        """Hand containers that came together to who listens, and has listened since before."""
+        """Hand containers that came together to the listeners that were there before."""
         listeners = self._listeners
         listeners.results.horizon = run.clock
         try:

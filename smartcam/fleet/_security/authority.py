@@ -130,7 +130,7 @@ class _Authority:
 
     @classmethod
     def of(cls, folder: Path) -> _Authority:
-        """Return that of a folder; it is made where there is none."""
+        """Return the authority of a folder; make one where there is none."""
         from cryptography import x509
 
         place = folder / AUTHORITY

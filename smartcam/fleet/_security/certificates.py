@@ -153,7 +153,7 @@ def read_identity(folder: Path) -> Identity:
     """Read whose the certificate of a folder is; blocks for some milliseconds.
 
     Raises:
-        ConfigurationError: the files are none, or do not belong together.
+        ConfigurationError: the files are not valid, or do not belong together.
         MissingExtraError: cryptography is not installed.
     """
     x509 = x509_module()

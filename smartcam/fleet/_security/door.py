@@ -49,7 +49,7 @@ REST = 4.0
 """Rest after a look at connections, in multiples of what it took, however many come: it looks at
 every descriptor, and an agent may have thousands of cameras."""
 
-CALM_GROWTH = 8
+MAX_CALM_GROWTH = 8
 """Descriptors more than at the last look that are taken for calm."""
 
 CHECK_AFTER = 50
@@ -145,8 +145,8 @@ class Door:
 
     Args:
         ports: ports at which the engine listens.
-        links: gives the places of who has come in, such as ``("10.1.0.5", 40123)``; None where
-            that is not known.
+        links: function for the addresses of links that have come in, such as
+            ``("10.1.0.5", 40123)``; it gives None where they are not known.
 
     Attributes:
         shut: whether the door takes nobody in.
@@ -188,7 +188,7 @@ class Door:
         most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         lowest, before = _lowest_free(most), self._lowest
         self._lowest = lowest
-        calm = not self.shut and lowest <= before + CALM_GROWTH
+        calm = not self.shut and lowest <= before + MAX_CALM_GROWTH
         delay = LOOK_EVERY_IF_CALM if calm else LOOK_EVERY
         self._timer = asyncio.get_running_loop().call_later(delay, self._look)
         self._looks += 1
@@ -235,7 +235,7 @@ class Door:
         self._expect_look(max(0.0, self._rested - asyncio.get_running_loop().time()))
 
     def _expect_look(self, delay: float | None) -> None:
-        """Look who comes in ``delay`` seconds, or not; what was expected before is forgotten."""
+        """Look at the port in ``delay`` seconds, or not at all; this replaces an earlier plan."""
         if self._coming is not None:
             self._coming.cancel()
             self._coming = None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 FILE: Final = struct.Struct("<2sIHHI")
 INFO: Final = struct.Struct("<IiiHHIIiiII")
-MOST: Final = 1 << 28
+MAX_PIXEL_BYTES: Final = 1 << 28
 """Bytes of pixels; no camera has more."""
 
 
@@ -40,7 +40,8 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
             f"compression {compression}, with a head of {head} bytes"
         )
     stride = (width * bits // 8 + 3) & ~3
-    if width < 1 or height < 1 or stride * height > MOST or len(data) < offset + stride * height:
+    size = stride * height
+    if width < 1 or height < 1 or size > MAX_PIXEL_BYTES or len(data) < offset + size:
         raise FrameFormatError(
             f"bitmap of {width}x{height}: expected {stride * height} bytes of pixels from byte "
             f"{offset} on, got {max(len(data) - offset, 0)}"

@@ -79,7 +79,7 @@ class H264Encoder:
         self._count = 0
 
     def begin_anew(self) -> None:
-        """Have the next frame be a key frame, for who joins or has lost something."""
+        """Have the next frame be a key frame, for a viewer that joins or has lost something."""
         self._broken += 1
 
     async def encode(self, frame: Frame) -> Frame:
@@ -168,7 +168,7 @@ class H264Decoder:
     def lost(self) -> None:
         """Report that bytes of the stream are missing: no picture comes until it is whole again.
 
-        A decoder cannot see what is missing, and would go on with a picture that is none.
+        A decoder cannot see what is missing, and would go on with a broken picture.
         """
         self._losses += 1
 
@@ -176,7 +176,7 @@ class H264Decoder:
         """Return the next picture, with all that was known of its encoded frame.
 
         Args:
-            frame: of format ``H264``; one encoded frame, whole.
+            frame: frame of format ``H264``; one encoded frame, whole.
 
         Returns:
             None as long as there is no whole picture: at the start in the midst of a stream, and
@@ -222,7 +222,7 @@ class H264Decoder:
         room = (frame.width + 64) * (frame.height + 64)
         codec.options = {
             "max_pixels": str(room),
-            "err_detect": "explode",  # half a picture is none
+            "err_detect": "explode",  # refuse half a picture
         } | ({} if self._reorders else {"flags": "low_delay"})
         self._held.clear()
         self._missing, self._begun = None, False

@@ -38,8 +38,8 @@ class Codecs:
     its camera sent it: one that the codec has no form for is refused, and :meth:`converted` makes
     it one.
 
-    As many pictures as there are threads are under way at a time; who asks for more waits, first
-    come first served. Who reads a source and encodes what it gives in one loop therefore skips
+    As many pictures as there are threads are under way at a time; further calls wait, first
+    come first served. A loop that reads a source and encodes its frames therefore skips
     frames when this machine is too slow, and never lags.
 
     Args:
@@ -60,7 +60,7 @@ class Codecs:
         self._running: set[asyncio.Future[Any]] = set()
 
     async def __aenter__(self) -> Self:
-        """Have the threads; each begins with the first picture for it.
+        """Make the threads; each begins with the first picture for it.
 
         Raises:
             LocalProtocolError: it was entered before.
@@ -69,7 +69,7 @@ class Codecs:
         return self
 
     def begin(self) -> None:
-        """Have the threads, for who calls :meth:`close`.
+        """Make the threads; the caller ends them by :meth:`close`.
 
         Raises:
             LocalProtocolError: it was entered before.
@@ -82,7 +82,7 @@ class Codecs:
         await self.close()
 
     async def close(self) -> None:
-        """Finish what is under way, and end the threads; who waits for one gets an error.
+        """Finish pictures under way, and end the threads; waiting calls get an error.
 
         Idempotent.
 
@@ -104,7 +104,7 @@ class Codecs:
         pixels (4:2:0), of YUV formats as many as they did.
 
         Args:
-            frame: of 8 bits; Mono8, RGB8, BGR8, MJPEG, or any YUV.
+            frame: frame of 8 bits; Mono8, RGB8, BGR8, MJPEG, or any YUV.
             quality: 1 to 100.
 
         Raises:

@@ -57,7 +57,7 @@ RESTART_TIMEOUT: Final = 1.0
 """Seconds without a packet of use after which a leader with an old id is that of a new count."""
 
 FASTEST: Final = 2000.0
-"""Frames a second: what goes further ahead than that is no gap but a new count."""
+"""Highest frame rate: ids that go ahead faster show a new count, and no gap."""
 
 SHORT_IDS: Final = 65535
 """Block ids of 16 bits: 1 to 65535."""
@@ -179,7 +179,7 @@ class Assembler:
         return lost
 
     def next_deadline(self) -> float | None:
-        """Return when :meth:`handle_timeout` is to be called; None: when nothing new comes, not."""
+        """Return when :meth:`handle_timeout` is to be called; None: only after a new packet."""
         return min(map(self._deadline, self._open_blocks()), default=None)
 
     def handle_timeout(self, now: float) -> list[Resend]:

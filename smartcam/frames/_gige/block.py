@@ -68,7 +68,7 @@ class Block:
 
     Args:
         number: number of the block, counted on past the ids' wrap.
-        block_id: on the wire.
+        block_id: number of the block on the wire.
         extended: whether the ids have 64 bits.
         datagram: bytes of a full packet with its header.
         most: bytes of the largest payload.

@@ -282,7 +282,7 @@ class RequestRefusedError(FrameSourceError):
     """The camera answered with an error.
 
     Attributes:
-        status: of :class:`~smartcam.frames._gige.gvcp.GvcpStatus`.
+        status: member of :class:`~smartcam.frames._gige.gvcp.GvcpStatus`.
     """
 
     def __init__(

@@ -17,14 +17,14 @@ from xml.parsers import expat
 
 from smartcam.exceptions import MessageError
 
-LARGEST: Final = 16 << 20
+MAX_PLAIN_BYTES: Final = 16 << 20
 """Bytes of a description that is not packed; those of large cameras have 2 MB."""
 
 LARGEST_PACKED: Final = 4 << 20
 """Bytes of a description's ZIP archive: 2 MB of XML have 0.2 MB. Each 46 bytes can be one more file
 in it, which takes 8 us."""
 
-DEEPEST: Final = 32
+MAX_LEVELS: Final = 32
 """Levels of its elements."""
 
 MAX_ELEMENTS: Final = 400_000
@@ -92,8 +92,10 @@ def locate(url: str) -> Location:
     if found is None:
         raise MessageError(f"expected 'Local:NAME;ADDRESS;LENGTH', got {url[:80]!r}")
     place = Location(found[1], int(found[2], 16), int(found[3], 16))
-    if not 0 < place.length <= LARGEST:
-        raise MessageError(f"{url[:80]!r}: expected 1 to {LARGEST} bytes, got {place.length}")
+    if not 0 < place.length <= MAX_PLAIN_BYTES:
+        raise MessageError(
+            f"{url[:80]!r}: expected 1 to {MAX_PLAIN_BYTES} bytes, got {place.length}"
+        )
     return place
 
 
@@ -101,8 +103,8 @@ def unpack(data: bytes) -> bytes:
     """Return a description's text; ZIP archives are unpacked, of several files the first XML.
 
     Raises:
-        MessageError: it cannot be unpacked, or to more than :data:`LARGEST`; or it is packed in
-            another way than by DEFLATE, of which a few bytes may stand for gigabytes.
+        MessageError: it cannot be unpacked, or to more than :data:`MAX_PLAIN_BYTES`; or it is
+            packed in another way than by DEFLATE, of which a few bytes may stand for gigabytes.
     """
     if not data.startswith(b"PK"):
         return data.rstrip(b"\0")
@@ -123,7 +125,7 @@ def unpack(data: bytes) -> bytes:
                     f"got method {how}"
                 )
             with archive.open(names[0]) as file:
-                text = file.read(LARGEST + 1)
+                text = file.read(MAX_PLAIN_BYTES + 1)
     except (
         zipfile.BadZipFile,
         zlib.error,
@@ -134,8 +136,8 @@ def unpack(data: bytes) -> bytes:
         ValueError,
     ) as exc:
         raise MessageError(f"the description's ZIP archive cannot be read: {exc}") from exc
-    if len(text) > LARGEST:
-        raise MessageError(f"the description unpacks to more than {LARGEST} bytes")
+    if len(text) > MAX_PLAIN_BYTES:
+        raise MessageError(f"the description unpacks to more than {MAX_PLAIN_BYTES} bytes")
     return text
 
 
@@ -172,9 +174,9 @@ class _XmlReader:
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         self._count += 1
-        if len(self._open) >= DEEPEST or self._count > MAX_ELEMENTS:
+        if len(self._open) >= MAX_LEVELS or self._count > MAX_ELEMENTS:
             raise MessageError(
-                f"the description: expected at most {MAX_ELEMENTS} elements in {DEEPEST} levels"
+                f"the description: expected at most {MAX_ELEMENTS} elements in {MAX_LEVELS} levels"
             )
         element = Element(tag.rpartition(":")[2], attributes)
         if self._open:

@@ -83,7 +83,7 @@ def decode_events(datagram: bytes) -> EventRequest:
     """Read a message of the message channel.
 
     Raises:
-        MessageError: it is none, or its lengths do not fit.
+        MessageError: it is not valid, or its lengths do not fit.
     """
     if len(datagram) < _REQUEST.size:
         raise MessageError(f"event: expected 8 bytes or more, got {len(datagram)}", data=datagram)

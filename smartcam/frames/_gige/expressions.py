@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 Number: TypeAlias = "int | float"
 Tree: TypeAlias = "tuple[str, tuple[Tree, ...]] | int | float | str"
 
-LONGEST: Final = 8192
+MAX_FORMULA_CHARACTERS: Final = 8192
 """Characters of a formula."""
 
 MAX_NAMES_SHOWN: Final = 20
 """Names of variables that an error shows."""
 
-DEEPEST: Final = 150
+MAX_LEVELS: Final = 150
 """Levels of a formula's tree."""
 
 _TOKEN: Final = re.compile(
@@ -167,17 +167,17 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> N
     """Work a formula out.
 
     EMVA's GenApi, by which makers test their descriptions, reads operators without parentheses in
-    another order than C, as which other programs read them. Where the two have different values
+    another order than C; other programs read them as C does. Where the two have different values
     nobody knows which one the maker means.
 
     Args:
-        formula: as the description has it.
+        formula: formula as the description has it.
         variables: value of each name in it.
         whole: whether all is whole numbers, as in an ``IntSwissKnife``.
 
     Raises:
-        MessageError: it is none, has a name that is not known, or no value: a division by zero,
-            a number past its bounds, or two values by two readings.
+        MessageError: it is not valid, has a name that is not known, or no value: a division by
+            zero, a number past its bounds, or two values by two readings.
     """
     tree, other = _parsed(formula)
     value = _worked_out(formula, tree, variables, whole)
@@ -247,9 +247,9 @@ class _FormulaParser:
     strength = _OF_C
 
     def __init__(self, formula: str) -> None:
-        if len(formula) > LONGEST:
+        if len(formula) > MAX_FORMULA_CHARACTERS:
             raise MessageError(
-                f"formula: expected at most {LONGEST} characters, got {len(formula)}"
+                f"formula: expected at most {MAX_FORMULA_CHARACTERS} characters, got {len(formula)}"
             )
         self._formula = formula
         self._tokens = self._cut(formula)
@@ -292,8 +292,8 @@ class _FormulaParser:
 
     def _choice(self) -> Tree:
         self._depth += 1
-        if self._depth > DEEPEST:
-            raise MessageError(f"formula: expected at most {DEEPEST} levels")
+        if self._depth > MAX_LEVELS:
+            raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
         tree = self._operation(0)
         if self._next("?"):
             first = self._choice()
@@ -311,8 +311,8 @@ class _FormulaParser:
             if strength < level:
                 break
             depth += 1
-            if depth > DEEPEST:
-                raise MessageError(f"formula: expected at most {DEEPEST} operators in a row")
+            if depth > MAX_LEVELS:
+                raise MessageError(f"formula: expected at most {MAX_LEVELS} operators in a row")
             self._at += 1
             self._depth += 1
             tree = (sign, (tree, self._operation(strength + 1)))
@@ -321,8 +321,8 @@ class _FormulaParser:
 
     def _unary(self) -> Tree:
         self._depth += 1
-        if self._depth > DEEPEST:
-            raise MessageError(f"formula: expected at most {DEEPEST} levels")
+        if self._depth > MAX_LEVELS:
+            raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
         sign = self._next("-", "+", "~", "!")
         tree = (sign, (self._unary(),)) if sign else self._power()
         self._depth -= 1
@@ -373,10 +373,10 @@ class _EmvaParser(_FormulaParser):
 
     def _choice(self) -> Tree:
         self._depth += 1
-        if self._depth > DEEPEST:
-            raise MessageError(f"formula: expected at most {DEEPEST} levels")
+        if self._depth > MAX_LEVELS:
+            raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
         tree = self._operation(0)
-        for _ in range(DEEPEST):
+        for _ in range(MAX_LEVELS):
             if not self._next("?"):
                 break
             first = self._choice()
@@ -395,8 +395,8 @@ class _EmvaParser(_FormulaParser):
                 if at:
                     raise self._misread(before, "-(")
                 self._depth += 1
-                if self._depth > DEEPEST:
-                    raise MessageError(f"formula: expected at most {DEEPEST} levels")
+                if self._depth > MAX_LEVELS:
+                    raise MessageError(f"formula: expected at most {MAX_LEVELS} levels")
                 tree: Tree = ("-", (self._operation(0),))
                 self._depth -= 1
                 return tree

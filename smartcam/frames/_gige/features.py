@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.frames._features import FeatureKind, FeatureValue
     from smartcam.frames._gige.description import Element
 
-DEEPEST: Final = 64
+MAX_LINKED_NODES: Final = 64
 """Nodes that lead to each other: beyond that it is a circle."""
 
 MAX_NODES_VISITED: Final = 5000
@@ -34,7 +34,7 @@ MAX_ELEMENTS_VISITED: Final = 500_000
 """Elements of nodes and characters of formulas that are looked at for one value: about a second. A
 node may be asked for again and again, and each time all of it is looked at."""
 
-LONGEST: Final = 4096
+MAX_REGISTER_BYTES: Final = 4096
 """Bytes of a register."""
 
 _REGISTERS: Final = ("IntReg", "MaskedIntReg", "StructEntry")
@@ -357,7 +357,7 @@ class GenicamFeatures:
     def _step(self, node: Element, depth: int) -> None:
         """Count a node that is looked at; MessageError: it is too deep, or one too many."""
         self._steps += 1
-        if depth > DEEPEST or self._steps > MAX_NODES_VISITED:
+        if depth > MAX_LINKED_NODES or self._steps > MAX_NODES_VISITED:
             raise MessageError(f"node {node.name}: its description goes in a circle")
         self._spend(node, len(node.children))
 
@@ -588,7 +588,7 @@ class GenicamFeatures:
         if not await self._there(node, 0):
             return ""
         readable, writable = True, not await self._condition(node, "pIsLocked", False, 0)
-        for depth in range(DEEPEST):
+        for depth in range(MAX_LINKED_NODES):
             modes = _access(node)
             readable = readable and "WO" not in modes
             writable = writable and "RO" not in modes and node.kind not in _KNIVES
@@ -605,7 +605,7 @@ class GenicamFeatures:
 
     async def _unit(self, node: Element, problems: list[str]) -> str:
         """Return the unit of a node, or of the node that holds its value."""
-        for depth in range(DEEPEST):
+        for depth in range(MAX_LINKED_NODES):
             unit = node.text_of("Unit")
             if unit or node.kind not in ("Integer", "Float"):
                 return unit
@@ -632,7 +632,7 @@ class GenicamFeatures:
         if node.first("pPort") is None:
             raise MessageError(f"{node.kind} {node.name} is no register of the camera")
         length = int(await self._field(node, "Length", depth, 4))
-        if not 0 < length <= LONGEST:
+        if not 0 < length <= MAX_REGISTER_BYTES:
             raise MessageError(f"{node.kind} {node.name}: impossible length {length}")
         address = 0
         for one in node.children:

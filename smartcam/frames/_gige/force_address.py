@@ -1,7 +1,7 @@
 """Give a GigE Vision camera another IP address until it is switched off, by its hardware address.
 
-A camera whose address is of no network here can be found and given one, but not opened. The camera
-carries it out only while nobody controls it.
+A camera whose address fits no network of this machine can be found and given one, but not opened.
+The camera carries it out only while nobody controls it.
 
 Source: GigE Vision 2.0, chapter 14.2 (FORCEIP).
 """
@@ -70,7 +70,7 @@ async def force_address(
         port: UDP port that cameras listen at.
 
     Raises:
-        ConfigurationError: an address that is none, or that another camera has.
+        ConfigurationError: an address that is not valid, or that another camera has.
         FrameSourceError: there is no such camera, it refuses, or does not answer by its new
             address.
 
@@ -102,7 +102,7 @@ def checked_mac(mac: str) -> str:
     """Return a hardware address with small letters and colons.
 
     Raises:
-        ConfigurationError: it is none.
+        ConfigurationError: it is not valid.
     """
     given = check_text(mac, "mac", "force_address", most=100)
     digits = re.sub(r"[:.\-]", "", given.strip().lower())

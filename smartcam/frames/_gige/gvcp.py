@@ -123,9 +123,9 @@ class Ack(NamedTuple):
     """An answer.
 
     Attributes:
-        status: of :class:`GvcpStatus`, or a maker's own.
-        command: of :class:`GvcpCommand`, plus one; or PENDING_ACK.
-        request_id: of the request that it answers.
+        status: member of :class:`GvcpStatus`, or a maker's own.
+        command: member of :class:`GvcpCommand`, plus one; or PENDING_ACK.
+        request_id: id of the request that it answers.
         payload: what stands behind the header.
     """
 
@@ -209,7 +209,7 @@ def decode_ack(datagram: bytes) -> Ack:
     """Read an answer.
 
     Raises:
-        MessageError: it is none.
+        MessageError: it is not valid.
     """
     if len(datagram) < _ANSWER.size:
         raise MessageError(f"GVCP: expected 8 bytes or more, got {len(datagram)}", data=datagram)

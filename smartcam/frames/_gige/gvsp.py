@@ -83,7 +83,7 @@ class Leader(NamedTuple):
     """The contents of a block's first packet.
 
     Attributes:
-        payload_type: of :class:`PayloadType`.
+        payload_type: member of :class:`PayloadType`.
         ticks: reading of the camera's clock, ticks.
         pixel_format: PFNC's number.
         width: pixels.

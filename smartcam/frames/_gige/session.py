@@ -152,7 +152,7 @@ class GigESession:
     async def latched_clock(self) -> int | None:
         """Return the reading of the camera's clock now, ticks; None: it cannot be read.
 
-        A reading that does not go on counts as none: so it is with a camera that keeps whatever is
+        A reading that does not go on does not count: a camera may keep whatever is
         written into the register, and latches nothing.
 
         Raises:

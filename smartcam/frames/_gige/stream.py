@@ -30,7 +30,7 @@ BUFFER: Final = 8 << 20
 208 KiB, which a frame of 512x512 fills: what does not fit while the loop is busy is lost."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
-"""asm-generic/socket.h: past rmem_max, for who may administer the network."""
+"""asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
 
 
 class StreamSocket:
@@ -76,7 +76,7 @@ class StreamSocket:
             return False
 
     def close(self) -> None:
-        """Close it. Idempotent."""
+        """Close the socket. Idempotent."""
         self.socket.close()
 
 

@@ -189,4 +189,4 @@ COLOURS: Final = {
     pattern: Colours(_demosaiced(pattern, "GRAY"), _demosaiced(pattern, "RGB"))
     for pattern in ("RG", "GR", "GB", "BG")
 }
-"""By what the formats' table calls them; the last four are Bayer patterns by their first row."""
+"""Conversions by their names in the formats' table; the last four are Bayer patterns."""

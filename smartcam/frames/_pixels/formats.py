@@ -30,9 +30,11 @@ class PixelFormat:
     """The layout of a frame's pixels in its bytes.
 
     Attributes:
-        name: of PFNC, as ``Mono8``; where PFNC has none the usual one, as ``NV12`` or ``MJPEG``.
-        fourcc: of V4L2, as ``GREY``, or "" where V4L2 has none; without the blanks at its end.
-        bits: of a pixel, those that mean nothing included; 0: it is compressed.
+        name: name in PFNC, as ``Mono8``; where PFNC has none the usual one, as ``NV12`` or
+            ``MJPEG``.
+        fourcc: four letters of V4L2, as ``GREY``, or "" where V4L2 has none; without the blanks at
+            its end.
+        bits: bits of a pixel, unused ones included; 0 for a compressed format.
         code: 32 bits of PFNC, as GigE Vision sends it; 0: PFNC has none.
         depth: bits of a sample that mean something.
         layout: how its bytes are read.
@@ -119,7 +121,7 @@ def _samples(
 
 
 def _packed(name: str, code: int, colours: str) -> PixelFormat:
-    """Return a format whose samples share bytes; the code's third digits are its bits."""
+    """Return a format whose samples share bytes; the second byte of the code has its bits."""
     packing = PACKINGS[next(end for end in PACKINGS if name.endswith(end))]
     depth = 10 if "10" in name else 12
     layout = SampleLayout(COLOURS[colours], 2, packing=packing)

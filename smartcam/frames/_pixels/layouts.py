@@ -293,7 +293,7 @@ class Compressed(PixelLayout):
     """Bytes that only a codec reads.
 
     Attributes:
-        reader: what reads them, for the error of who asks for pixels.
+        reader: name of what reads the bytes, for errors.
     """
 
     reader: str

@@ -54,7 +54,7 @@ class RateStatistics:
     """The quality and rates that a rate control has set, and the reason.
 
     Attributes:
-        quality: of JPEG, that frames are to have.
+        quality: JPEG quality that frames are to have.
         fps: frames a second at most.
         why: what these follow: "bit rate", "latency" or "the best quality"; "" before the first
             frame. Behind it stands "at the lowest quality" where there are fewer frames, too, and
@@ -115,7 +115,7 @@ class RateControl:
     Args:
         bitrate: bits a second on average.
         latency: seconds from capture to arrival.
-        quality: of JPEG, the lowest and the best, 1 to 100.
+        quality: JPEG quality, the lowest and the best, 1 to 100.
         fps: frames a second, the fewest and the most.
 
     Raises:
@@ -295,7 +295,7 @@ def _check(
 
 
 def _check_pair(value: tuple[float, float], name: str) -> None:
-    """Check that both are numbers; which range they have says who calls."""
+    """Check that both are numbers; the caller checks their range."""
     if not isinstance(value, tuple) or len(value) != 2:
         raise wrong_argument(name, "the least and the most, a pair", value, "RateControl")
     for one in value:

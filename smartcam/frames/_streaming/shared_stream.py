@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LINGER: Final = 2.0
-"""Seconds that the source is read on without a viewer: who has asked for its parameters begins to
-play in that time."""
+"""Seconds that the source is read on without a viewer: a client that has asked for its parameters
+begins to play in that time."""
 
 KEY_PAUSE: Final = 1.0
 """Seconds between two key frames that viewers ask for, however many they are."""
@@ -92,7 +92,7 @@ class SharedH264:
         self._go()
 
     def leave(self, viewer: StreamViewer) -> None:
-        """Hand a viewer no more; who is none is not missed."""
+        """Hand a viewer no more; one that was not there is ignored."""
         self._viewers.pop(viewer, None)
         self._rest_if_idle()
 
@@ -104,7 +104,7 @@ class SharedH264:
         """Return a key frame of the stream that is encoded, or would be for a viewer.
 
         Raises:
-            FrameSourceError: the source gives none, or none in time.
+            FrameSourceError: the source gives no frame, or none in time.
 
         Cancellation: safe.
         """

@@ -20,9 +20,9 @@ class Ioctl(NamedTuple):
     """An ioctl.
 
     Attributes:
-        name: of the header, without its ``VIDIOC_``.
-        number: of the ioctl.
-        layout: of its argument.
+        name: name in the header, without its ``VIDIOC_``.
+        number: number of the ioctl.
+        layout: layout of its argument.
     """
 
     name: str

@@ -26,8 +26,8 @@ class Full(NamedTuple):
     Attributes:
         data: a copy, the only one that is made; of a buffer with an error it is empty.
         used: bytes that the driver says it wrote.
-        flags: of V4L2.
-        seconds: of its time stamp.
+        flags: flags of V4L2.
+        seconds: seconds of its time stamp.
         sequence: the driver's number of the frame.
     """
 

@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 FORMATS: Final = {abi.fourcc(one.fourcc): one for one in PIXEL_FORMATS if one.fourcc}
 """The supported formats of V4L2."""
 
-ENOUGH: Final = 512
+MAX_ANSWERS: Final = 512
 """Answers to one enumeration at most; a driver that goes on is broken."""
 
-NEAR: Final = 0.01
+MAX_RATE_OFF: Final = 0.01
 """Share by which a rate may differ from the wanted one: 29.97/s is 30/s to a camera."""
 
 REASONS: Final = {
@@ -92,7 +92,8 @@ class CaptureDevice:
         """Open a device that captures pictures.
 
         Raises:
-            FrameSourceError: there is none, it is none, or it is not allowed.
+            FrameSourceError: there is no such file, it is no device of
+                V4L2, or it may not be opened.
         """
         try:
             number = system.open(path)
@@ -107,7 +108,7 @@ class CaptureDevice:
         return device
 
     def close(self) -> None:
-        """Give it back."""
+        """Give the device back."""
         system.close(self.number)
 
     @property
@@ -137,7 +138,7 @@ class CaptureDevice:
 
     def enumerate(self, request: Ioctl, *fields: object) -> Iterator[tuple[Any, ...]]:
         """Yield the entries that the driver enumerates; none where it has no enumeration."""
-        for index in range(ENOUGH):
+        for index in range(MAX_ANSWERS):
             try:
                 yield self.try_to(request, index, *fields)
             except OSError as exc:
@@ -240,7 +241,7 @@ class CaptureDevice:
             return
         kind = next(
             (name for bit, name in _OTHER_KINDS.items() if does & bit),
-            "no camera: it captures no pictures, or gives none by streaming",
+            "no camera: it captures no pictures, or does not stream them",
         )
         here = tuple(f"{path} ({name})" for path, name in system.nodes().items())
         raise FrameSourceError(
@@ -309,7 +310,7 @@ class CaptureDevice:
                 raise failure(self.path, "setting its rate", exc) from exc
             can = over = under = 0
         got = under / over if can & abi.CAP_TIMEPERFRAME and over and under else None
-        if wanted is not None and (got is None or abs(got - wanted) > wanted * NEAR):
+        if wanted is not None and (got is None or abs(got - wanted) > wanted * MAX_RATE_OFF):
             there = tuple(
                 f"{one:g}/s" for one in self.rates(layout.fourcc, layout.width, layout.height)
             )

@@ -40,17 +40,17 @@ class V4L2Driver(FrameDriver):
     What the URL does not say stays as the device has it. What it says and the device does not
     take is a :exc:`~smartcam.FrameFormatError` that lists what it has.
 
-    - the path: of the device; ``/dev/v4l/by-id/...`` is the same camera at any port.
-    - ``format``: of the pixels, by its name in PFNC or V4L2.
+    - the path: the device's; ``/dev/v4l/by-id/...`` is the same camera at any port.
+    - ``format``: pixel format, by its name in PFNC or V4L2.
     - ``size``: ``WIDTHxHEIGHT``, pixels.
     - ``fps``: frames a second.
-    - ``buffers``: 2 to 32 that the driver writes into; 4.
+    - ``buffers``: number of buffers that the driver writes into, 2 to 32; default 4.
     - ``control.NAME``: sets a control, in the order of the URL, as often as the device is started:
       ``control.brightness=10``, ``control.power_line_frequency=50_hz``. The name is its label in
       small letters with underscores, the value a number, a menu's label, or ``on`` and ``off``.
 
-    ``source.features`` has the controls for the time in between; what is set so is set until the
-    URL's are set again.
+    ``source.features`` has the controls for the time in between; such a setting
+    lasts until those of the URL are set again.
 
     While nothing is read from it, the device is closed: another program can use it. Each frame's
     bytes are copied out of the driver's buffer once. One that is replaced before a reader took it
@@ -117,7 +117,7 @@ class V4L2Driver(FrameDriver):
             await self._do(self._end, "stop")
 
     async def close(self) -> None:
-        """Have neither device nor thread left."""
+        """Close the device, and end the thread."""
         try:
             await self.stop()
         finally:

@@ -33,9 +33,9 @@ class BufferStamps:
     those two periods.
 
     Args:
-        name: of the camera, for the log.
-        period: of a frame, seconds; None: unknown. Where frames come slower, as in the dark, what
-            is seen of them counts.
+        name: name of the camera, for the log.
+        period: period of a frame, seconds; None: unknown. Where frames come slower, as in the dark,
+            what is seen of them counts.
         began: when the device began to stream, seconds of ``time.monotonic()``.
 
     Source: V4L2 documentation, buffer flags (published); two periods: derived.
@@ -58,9 +58,9 @@ class BufferStamps:
         """Return when the frame with that number was taken.
 
         Args:
-            seconds: of its stamp.
-            flags: of its buffer.
-            number: of the frame, counted on over lost ones.
+            seconds: seconds of its stamp.
+            flags: flags of its buffer.
+            number: number of the frame, counted on over lost ones.
             now: seconds of ``time.monotonic()``.
         """
         self.is_newest = False

@@ -21,7 +21,7 @@ MAX_BAD_IN_A_ROW: Final = 30
 """Buffers without a picture, one after the other, after which the stream ends."""
 
 MAX_EMPTY_IN_A_ROW: Final = 1000
-"""Times that the system may report a full buffer and give none before the stream ends."""
+"""Times that the system may report a full buffer and give no buffer before the stream ends."""
 
 HALF_OF_NUMBERS: Final = 1 << 31
 """Half of all frame numbers, which have 32 bits: a larger step forwards is one backwards."""
@@ -59,7 +59,7 @@ class CaptureStream:
         self._bad = self._empty = 0
 
     def close(self) -> None:
-        """Stop it, and give buffers and device back."""
+        """Stop the stream, and give buffers and device back."""
         self._buffers.release()
         self.device.close()
 
@@ -117,7 +117,7 @@ class CaptureStream:
         self._empty += 1
         if self._empty > MAX_EMPTY_IN_A_ROW:
             raise FrameSourceError(
-                f"{self._name}: its driver says that a picture is there, and gives none",
+                f"{self._name}: its driver says that a picture is there, and gives no picture",
                 source=self._name,
             )
 

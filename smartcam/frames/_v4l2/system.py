@@ -55,5 +55,5 @@ def now() -> float:
 def _name(folder: Path) -> str:
     try:
         return (folder / "name").read_text(encoding="utf-8", errors="replace").strip()
-    except OSError:  # it is just going
+    except OSError:  # the device is being unplugged
         return ""

@@ -166,7 +166,7 @@ class VideoDriver(FrameDriver):
         await self.stop()
 
     async def _begin(self) -> tuple[PictureReading, Read]:
-        """Open it and read the first picture."""
+        """Open the video and read the first picture."""
         await self.stop()
         thread = self._thread = _ReadingThread(self.name)
         reading = await thread.open(self._opened)
@@ -295,7 +295,7 @@ class _Playback:
 
     Args:
         fps: pictures a second; None: by their time stamps.
-        rate: of those without a stamp.
+        rate: rate of frames without a stamp.
     """
 
     def __init__(self, fps: float | None, rate: float | None) -> None:

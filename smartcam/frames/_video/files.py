@@ -101,7 +101,7 @@ class Read(NamedTuple):
     """A picture.
 
     Attributes:
-        pixels: of it.
+        pixels: pixels of the picture.
         time: seconds by the stream's own clock; None: it has none.
         arrived: seconds of ``time.monotonic()``, before it was decoded, or earlier.
         lost: damaged ones that came before it.
@@ -146,7 +146,7 @@ class PictureReading(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Give it back. Idempotent."""
+        """Close what is read. Idempotent."""
 
 
 class VideoReading(PictureReading):
@@ -246,7 +246,7 @@ class VideoReading(PictureReading):
         stream = streams[0]
         stream.codec_context.thread_count = 1  # more of them hold frames back
         if stream.codec_context.name not in _EXPLODES_AT_TAGS:
-            stream.codec_context.options = {"err_detect": "explode"}  # half a picture is none
+            stream.codec_context.options = {"err_detect": "explode"}  # refuse half a picture
         wanted = self.plan.format
         if wanted is not None and wanted.compressed:
             comes = _PASSED_ON.get(stream.codec_context.name, stream.codec_context.name)
@@ -273,7 +273,8 @@ class VideoReading(PictureReading):
         while not self._pictures and not self.stopped.is_set():
             if self.plan.network and time.monotonic() - begun > self.plan.timeout:
                 raise self.plan.wrong(
-                    f"expected a picture, got bytes that make none for {self.plan.timeout:g} s"
+                    "expected a picture, got bytes that make no picture for "
+                    f"{self.plan.timeout:g} s"
                 )
             asked = time.monotonic()
             packet = self._tried(lambda: next(self._packets, None))
@@ -341,7 +342,7 @@ class VideoReading(PictureReading):
             raise self.plan.wrong(f"{exc}; #format=RGB8 converts") from exc
 
     def close(self) -> None:
-        """Close it."""
+        """Close the video."""
         self._container.close()
 
     def _error(self, failure: Exception, took: float) -> FrameSourceError:

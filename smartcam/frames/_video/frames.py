@@ -59,7 +59,7 @@ _TRANSPARENT: Final = {"yuva420p": "yuv420p", "yuva422p": "yuv422p", "yuva444p":
 """FFmpeg's formats with a plane of alpha behind Y, U and V, and the same without."""
 
 CONVERTIBLE: Final = {"RGB8": "rgb24", "BGR8": "bgr24", "Mono8": "gray"}
-"""Formats that FFmpeg converts to for who asks, and what it calls them."""
+"""Formats that FFmpeg converts to on request, and its names for them."""
 
 LIMITED, FULL = 1, 2  # AVCOL_RANGE_MPEG, AVCOL_RANGE_JPEG
 _RANGES: Final = {LIMITED: "MPEG", FULL: "JPEG"}  # as PyAV calls them
@@ -76,7 +76,7 @@ class Pixels(NamedTuple):
     """The pixels of a decoded frame, in one of our formats.
 
     Attributes:
-        format: of the pixels.
+        format: format of the pixels.
         width: pixels.
         height: pixels.
         stride: bytes from row to row.
@@ -95,7 +95,7 @@ def format_of(name: str, colour_range: int, space: int) -> PixelFormat:
     """Return our format of one of FFmpeg's.
 
     Args:
-        name: as ``yuv420p``.
+        name: name such as ``yuv420p``.
         colour_range: AVColorRange; 0, which is unknown, is the limited one.
         space: AVColorSpace.
 

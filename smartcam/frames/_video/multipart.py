@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MAX_PICTURE_BYTES: Final = 32 << 20
 
 MAX_BETWEEN_BYTES: Final = 1 << 20
-"""Bytes in a row that belong to no picture, after which the stream is none."""
+"""Bytes in a row that belong to no picture, after which it is no stream of pictures."""
 
 MAX_HEAD_BYTES: Final = 8 << 10
 """Bytes before a picture in which its length is looked for."""
@@ -41,7 +41,7 @@ class PictureCutter:
     """Cuts pictures from bytes that come in any pieces.
 
     Attributes:
-        damaged: pictures that began and are none, since the last whole one.
+        damaged: pictures that began and are not whole, since the last whole one.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class PictureCutter:
     def _end(self) -> int | None:
         """Return the end of the picture; None: that did not come yet.
 
-        Below 0 it is none, and the next one may begin at that place.
+        Below 0 it is not one, and the next one may begin at that place.
         """
         while (after := self._segment()) is not None:
             if self._length is not None and abs(after) > self._length and self._ends_at_length():

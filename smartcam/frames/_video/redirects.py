@@ -48,7 +48,7 @@ def follow_redirects(
 
     Args:
         url: ``http:``, ``https:``, ``rtsp:`` or ``rtsps:``; may have user and password.
-        name: of the source, for errors; without a password.
+        name: name of the source, for errors; without a password.
         timeout: seconds for all of it.
         tls: how the server shows who it is, where it is asked by TLS.
 
@@ -89,7 +89,7 @@ def followed(url: str, location: str, peer: str, name: str) -> str:
         url: URL that was asked.
         location: header of the answer.
         peer: address that the answer came from.
-        name: of the source, for errors.
+        name: name of the source, for errors.
 
     Raises:
         FrameSourceError: it leads to another host or port.

@@ -36,7 +36,7 @@ class WebDriver(VideoDriver):
     _size: tuple[int, int] | None = None
 
     async def open(self) -> StreamFormat:
-        """Read a picture of it, and let it go again.
+        """Read one picture, and close the connection again.
 
         Raises:
             FrameFormatError: it is no video, or has pixels that we have no name for.
@@ -79,7 +79,7 @@ class WebDriver(VideoDriver):
         await super().stop()
 
     async def _begin_parts(self, sink: FrameSink) -> bool:
-        """Begin to read; return False where it is no stream of JPEGs, or a proxy's to ask for."""
+        """Begin to read; return False for another stream, or where a proxy has to be asked."""
         if self._elsewhere or _by_proxy(self.address.scheme, self.address.host):
             return False
         url = self.address.url.partition("#")[0]
@@ -187,7 +187,7 @@ class _PartsStream:
             await asyncio.sleep(left)
         seconds = f"{self._timeout:g} s"
         if self._loop.time() - self._heard < self._timeout:
-            text = f"expected a picture, got bytes that make none for {seconds}"
+            text = f"expected a picture, got bytes that make no picture for {seconds}"
             self._decoding.over(FrameFormatError(f"{self._name}: {text}"))
         else:
             text = f"expected an answer, got none within {seconds}"

@@ -53,12 +53,12 @@ class WebStream:
     """The body of an answer to GET.
 
     Args:
-        name: of the source, for errors.
-        url: with user and password.
+        name: name of the source, for errors.
+        url: URL with user and password.
         tls: how the server shows who it is, where it is asked by TLS.
 
     Attributes:
-        answer: once :meth:`open` has returned.
+        answer: head of the server's answer; there once :meth:`open` has returned.
     """
 
     answer: WebAnswer
@@ -103,7 +103,7 @@ class WebStream:
         )
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """End the stream. Idempotent."""
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.transport.abort()
@@ -112,7 +112,7 @@ class WebStream:
         """Yield the body as it comes.
 
         Raises:
-            MessageError: its chunks are none.
+            MessageError: its chunks are not valid.
             OSError: the connection is lost.
         """
         if "chunked" not in self.answer.header("transfer-encoding").lower():

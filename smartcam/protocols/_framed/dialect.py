@@ -359,7 +359,7 @@ class FramedDialect(Dialect):
 
     @cached_property
     def constant(self) -> dict[type[Message], tuple[bytes, int, int | None]]:
-        """Of the messages that have no body: whole frame, id, id of the answer."""
+        """Messages without a body: the whole frame, its id, the id of the answer."""
         found: dict[type[Message], tuple[bytes, int, int | None]] = {}
         for row in self.table:
             if not row.fields:
@@ -479,7 +479,7 @@ class FramedDialect(Dialect):
         return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:
-        """Return any request by its id, for who knows better.
+        """Return any request by its id, for users who know it better than the table.
 
         Raises:
             LocalProtocolError: Connect and Disconnect.

@@ -27,7 +27,7 @@ DEFAULT_MAX_LENGTH = 1 << 20
 manual, p. 35); 1 MiB leaves room for its successors and refuses a length bomb."""
 
 
-LARGE = 1 << 12
+MIN_OWN_BUFFER_BYTES = 1 << 12
 """Bytes of a frame from which on its rest is collected in a buffer of its own. Below it an
 unfinished frame is copied in front of the next chunk, which costs less."""
 
@@ -49,7 +49,7 @@ MIN_READ_BYTES = 1 << 10
 """Bytes that one read takes at most where the frames are many and small."""
 
 
-ALIKE = 16
+MAX_ALIKE_FRAMES = 16
 """Frames that are cut at once where they begin with the same bytes, the length among them."""
 
 
@@ -195,7 +195,7 @@ class Framer:
             self._window = self._store = memoryview(bytearray(min(2 * count, MAX_READ_BYTES)))
         if self.start < len(self.buffer):
             self.feed(data)
-        elif count >= LARGE and self._header_at(data, 0)[1] >= LARGE:
+        elif count >= MIN_OWN_BUFFER_BYTES and self._header_at(data, 0)[1] >= MIN_OWN_BUFFER_BYTES:
             self.buffer, self.start = data, 0  # not copied: it is cut before the next bytes come
             self._window = self._store
         else:
@@ -238,7 +238,7 @@ class Framer:
         begin = start + header.size
         end = begin + size
         if end > len(buffer):
-            if header.size + size >= LARGE:
+            if header.size + size >= MIN_OWN_BUFFER_BYTES:
                 self._collect(header.size + size)
             else:
                 self._keep(start)
@@ -269,8 +269,8 @@ class Framer:
         before -= header.length_includes
         longest = self._max_length + header.length_includes
         length = before + other
-        if start + ALIKE * length <= available and length >= least and other <= longest:
-            head, end = buffer[like : like + least], start + (ALIKE - 1) * length
+        if start + MAX_ALIKE_FRAMES * length <= available and length >= least and other <= longest:
+            head, end = buffer[like : like + least], start + (MAX_ALIKE_FRAMES - 1) * length
             if buffer[start : start + least] == head == buffer[end : end + least]:
                 start = _cut_alike(buffer, start, head, length, found)
         while start <= last:
@@ -419,14 +419,14 @@ def _cut_alike(buffer: bytes, start: int, head: bytes, length: int, found: list[
     Returns:
         The place of the next frame.
     """
-    cut = _cutter(ALIKE, len(head), length - len(head))
-    last = len(buffer) - ALIKE * length
+    cut = _cutter(MAX_ALIKE_FRAMES, len(head), length - len(head))
+    last = len(buffer) - MAX_ALIKE_FRAMES * length
     while start <= last:
         parts = cut(buffer, start)
-        if parts[::2].count(head) < ALIKE:
+        if parts[::2].count(head) < MAX_ALIKE_FRAMES:
             break
         found += parts[1::2]
-        start += ALIKE * length
+        start += MAX_ALIKE_FRAMES * length
     return start
 
 

@@ -144,7 +144,7 @@ class Machine:
         max_length: bytes of the largest payload that is accepted.
         policy: policy in place of the role's own; the emulator's quirks use it.
         trace: called with the sender and each whole frame, in both directions, and with the error
-            for bytes that make none.
+            for bytes that make no frame.
         kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
             that the answer to Connect does not fit are left out when it comes; where several are
             left, :meth:`adopt` decides.
@@ -270,7 +270,7 @@ class Machine:
         A frame that does not become whole in time is broken, as the policy says.
 
         Args:
-            count: of the bytes.
+            count: number of the bytes.
             now: when they came, in seconds since any beginning.
 
         Returns:
@@ -314,8 +314,9 @@ class Machine:
 
         Args:
             message: what to say.
-            answered: for an :class:`~smartcam.protocols.messages.UnknownMessage`, whether an
-                answer is expected; by default what the table says, True for an unknown id.
+            answered: True if an answer is expected to an
+                :class:`~smartcam.protocols.messages.UnknownMessage`; the default is what the table
+                says, and True for an unknown id.
             again: True if another request of the same kind may still wait for its answer: the
                 answers come in the order of the requests.
 
@@ -555,7 +556,7 @@ class Machine:
                 frames[self._framer.take(frame, end)] = message
 
     def _forget_familiar(self) -> None:
-        """Look at each message again, since it may mean another thing or be none now."""
+        """Look at each message again, since it may mean another thing or may be no message now."""
         self._statuses, self._results = {}, {}
         self._familiar = {self._status_id: self._statuses}
 

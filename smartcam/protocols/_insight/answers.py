@@ -47,7 +47,7 @@ class CommandAnswer(NamedTuple):
 class AnswerReader(LineReader):
     """Cuts answers from a stream; each has the form that its command says.
 
-    Who feeds it reads until nothing is left to be read; then no more than a line waits.
+    The machine that feeds it reads until nothing is left; then no more than a line waits.
 
     Args:
         max_length: longest text of an answer that says its length, bytes.

@@ -101,7 +101,7 @@ class InSightDialect(Dialect):
     def with_parameters(self, parameters: Mapping[str, str]) -> InSightDialect:
         """Return the dialect with user, password, cells and counter of a URL.
 
-        Raises ConfigurationError: a cell is none, or a text cannot be sent.
+        Raises ConfigurationError: a cell is not valid, or a text cannot be sent.
         """
         for key in ("user", "password"):
             problem = unsendable(parameters.get(key, ""), MAX_LOGIN)

@@ -79,7 +79,7 @@ class Command(m.Request):
     """A command line of any kind that the library knows the answer's form of.
 
     Raises:
-        ConfigurationError: it is none, or it cannot be sent.
+        ConfigurationError: it is not valid, or it cannot be sent.
     """
 
     answer: ClassVar[type[m.Message] | None] = Reply

@@ -2,7 +2,7 @@
 
 Native mode is text over telnet (TCP port 23). The client sends one command a line, the camera
 answers with a status code on a line of its own and, where the command asks for something, with data
-behind it. Nothing in here does input or output.
+behind it. Nothing in this module does input or output.
 
 Where a fact comes from stands in ``docs/insight.md``: *manual* is the maker's published help,
 *clients* is what public clients and records of their traffic show (derived).
@@ -328,7 +328,7 @@ _JOB_NUMBER = re.compile(r"([0-9]{1,3})(?![0-9])", re.ASCII)
 
 
 def parse_cell(text: str) -> Cell:
-    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: it is none."""
+    """Read a cell as people write it, ``A1`` or ``b012``; ConfigurationError: it is no cell."""
     match = _CELL.fullmatch(text)
     if match is None or int(match[2]) > LAST_ROW:
         raise ConfigurationError(
@@ -372,7 +372,7 @@ def parse_tag(text: str) -> str:
     """Read a cell's name: letters, digits, underscores and dots, at most 127 (manual, published).
 
     Two names that differ in case only are the same (manual, published), so it is returned in lower
-    case. Raises ConfigurationError: it is none, or it has the form of a cell.
+    case. Raises ConfigurationError: it is not valid, or it has the form of a cell.
     """
     if not _TAG.fullmatch(text) or _CELL_LIKE.fullmatch(text):
         raise ConfigurationError(

@@ -311,7 +311,7 @@ def parts_from_json(value: object) -> list[Localization] | None:
 
 
 def _part(said: Mapping[str, Any]) -> Localization:
-    """Return a localization of JSON; raises where it is none."""
+    """Return a localization of JSON; raises where it is not valid."""
     if set(said) != set(Localization._fields):
         raise ValueError("these are not its fields")
     pose, feature, photo = said["pose"], said["feature_id"], said["photo_index"]

@@ -53,7 +53,7 @@ class BagRecorder(Recorder):
         overwrite: take the place of a bag that is there.
 
     Attributes:
-        path: as given.
+        path: path that was given.
     """
 
     def on_frame(self, entry: TraceEntry) -> None:

@@ -18,7 +18,7 @@ Value = TypeVar("Value")
 class LastBodies(Generic[Key, Value]):
     """The values that a file said of its last frames with data.
 
-    Whoever writes asks for the number of a frame by its data, who reads for the data by the number.
+    A writer asks for the number of a frame by its data, a reader for the data by the number.
     Both forget alike, so what one finds is there for the other.
     """
 

@@ -86,9 +86,9 @@ class RecordedError(NamedTuple):
         error: name of the exception's class.
         text: text of the error.
         triggered_at: time of the call of ``trigger()``, UTC; None where no trigger ended so.
-        since: of a gap (``error`` is ``RecordingGap``): when the first record came that was not
-            written, UTC; ``at`` is when the last did. None of other errors.
-        records: of a gap: how many were not written. None of other errors.
+        since: time of the first record that was not written, UTC, where ``error`` is
+            ``RecordingGap``; ``at`` is that of the last one. None for other errors.
+        records: number of records in a gap that were not written. None for other errors.
     """
 
     camera: str
@@ -192,7 +192,7 @@ def message_of(kind: str, item: Item, raw_from: int | None = None) -> bytes:
     Args:
         kind: name of the kind of item, a key of ``KINDS``.
         item: item to write.
-        raw_from: of a result, the number of the frame that has its ``raw``, which is not written
+        raw_from: number, for a result, of the frame that has its ``raw``, which is not written
             then.
 
     Raises:
@@ -209,7 +209,7 @@ def message_fields(data: bytes) -> dict[str, Any]:
     """Return the object that a message is.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not valid.
     """
     parsed: Any = json.loads(data)
     if not isinstance(parsed, dict):
@@ -294,7 +294,7 @@ def time_of(text: str) -> datetime:
     """Return the time that a text says, UTC.
 
     Raises:
-        ValueError: it is none, or has no time zone.
+        ValueError: it is not valid, or has no time zone.
     """
     at = datetime.fromisoformat(text)
     if at.tzinfo is None:
@@ -443,7 +443,7 @@ KINDS: dict[str, Kind] = {
     "frames": Kind(
         "frames",
         "smartcam.Frame",
-        "A frame on the wire, or bytes that make none.",
+        "A frame on the wire, or bytes that make no frame.",
         {
             "at": _AT,
             "camera": _CAMERA,

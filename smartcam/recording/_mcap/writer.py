@@ -32,7 +32,7 @@ _ZSTD = "zstd"
 class McapWriter:
     """Writes a file from its begin to its end; not for several threads.
 
-    Whoever writes behind what an error has cut off makes a file that cannot be read.
+    After an error nothing more may be written: the file could not be read.
 
     Args:
         stream: the file, open.

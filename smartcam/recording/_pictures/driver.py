@@ -131,7 +131,7 @@ class RecordedDriver(FrameDriver):
         )
 
     async def start(self, sink: FrameSink) -> None:
-        """Play it from its begin."""
+        """Play the recording from its beginning."""
         self._task = asyncio.create_task(self._play(sink), name=f"frames of {self.name}")
 
     async def stop(self) -> None:

@@ -59,7 +59,7 @@ class RotatingRecorder:
             it is again.
 
     Attributes:
-        path: as given.
+        path: path that was given.
 
     Raises:
         ConfigurationError: an argument is wrong.

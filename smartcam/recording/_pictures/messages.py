@@ -248,7 +248,7 @@ def picture_of(schema: str, data: memoryview) -> RecordedPicture:
     """Return the picture of a message; its pixels are a view of ``data``.
 
     Raises:
-        ValueError: it is none, or has not what its format asks for.
+        ValueError: it is not valid, or has not what its format asks for.
     """
     values = _values(schema, data)
     said = _Values(values)

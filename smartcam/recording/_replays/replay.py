@@ -168,12 +168,12 @@ class ReplayedCamera(EmulatedCamera):
         quirks: what is not known of real cameras, beside the recorded deviations of the dialect:
             fields of :class:`~smartcam.emulator.Quirks`.
         clock: clock that the replay runs by; default: real time.
-        name: for logs; default the recorded one.
+        name: name for logs; default the recorded one.
         on_over: called once, in the event loop, when nothing is left; never with ``loop``.
 
     Attributes:
         plan: plan of what is played.
-        speed: as given.
+        speed: speed that was given.
 
     Raises:
         ConfigurationError: something given is wrong, or the camera cannot be replayed.

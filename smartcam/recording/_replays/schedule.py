@@ -100,7 +100,8 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     """Work out how to play a camera of a recording, by default the only one in it.
 
     Raises:
-        ConfigurationError: no such camera, it had no session, or it is none that can be emulated.
+        ConfigurationError: no such camera, it had no session, or it cannot be
+                emulated.
         RecordingError: its containers are more than :data:`MAX_REPLAY`.
     """
     known = recording.camera(camera)

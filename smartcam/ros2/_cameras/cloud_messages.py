@@ -34,7 +34,7 @@ LARGEST_VALUE: Final = 65534.0
 """Steps of a compressed depth from the farthest, which is 1, to the nearest."""
 
 MIN_DEPTH_RANGE: Final = 1.001
-"""Farthest depth of a picture over the nearest, at least, for its steps to be of some size."""
+"""Least ratio of the farthest and the nearest depth in a picture, so that its steps are not 0."""
 
 PNG_OPTIONS: Final = (16, 1)
 """OpenCV's IMWRITE_PNG_COMPRESSION, and the quickest compression."""
@@ -75,8 +75,9 @@ def compressed_depth_fields(
     """Return a depth picture as image_transport's ``compressedDepth`` has it.
 
     Its data are an int32, which is 0, two float32 (a, b), and a PNG with 16 bits. For ``32FC1`` a
-    value v of the PNG is the depth ``a / (v - b)``, 0 is none; a and b are such that the nearest
-    and the farthest depth of the picture use the whole range. For ``16UC1`` values are millimetres.
+    value v of the PNG is the depth ``a / (v - b)``, 0 means no depth; a and b are such that the
+    nearest and the farthest depth of the picture use the whole range. For ``16UC1`` values are
+    millimetres.
     Source: ``codec.cpp`` and ``compression_common.h`` of image_transport_plugins.
 
     Args:

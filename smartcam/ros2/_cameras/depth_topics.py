@@ -58,7 +58,7 @@ class DepthTopics:
         stereo: makes a :class:`smartcam.depth.StereoDepth`, not open, each time that somebody
             begins to hear; or one that is open, which stays the caller's, and streams on.
         node: open node of ROS.
-        frame_id: of the left camera after rectification; "": the node's name with
+        frame_id: frame id of the left camera after rectification; "": the node's name with
             ``_left_optical``.
         depth_encoding: ``32FC1``, metres, or ``16UC1``, millimetres.
         place: where the left camera is: its hand-eye calibration, or a transform from the left

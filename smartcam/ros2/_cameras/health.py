@@ -83,7 +83,7 @@ def health(known: KnownState, *, heard: bool = True) -> Health:
 
     Args:
         known: what is known of the camera.
-        heard: whether there is a sign of who has the session with the camera.
+        heard: whether there is a sign of the program that has the session with the camera.
     """
     if not known.connected:
         text = known.why[:MAX_ERROR_CHARACTERS] or "there was no session yet"

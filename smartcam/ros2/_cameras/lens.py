@@ -24,7 +24,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 
 def as_path(url: str) -> Path | None:
-    """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" is none.
+    """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" means no file.
 
     Raises:
         ConfigurationError: it is of another scheme.
@@ -51,7 +51,7 @@ class CameraLens:
         size: function that returns the pictures' width and height.
 
     Raises:
-        ConfigurationError: the URL cannot be.
+        ConfigurationError: the URL is not valid.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class CameraLens:
         self._writing = asyncio.Lock()
 
     async def load(self) -> None:
-        """Read the file, once; one that is none is told in the log, and counts as not there."""
+        """Read the file, once; log one that is not valid, and take it as missing."""
         if self._read or self._path is None:
             return
         async with self._writing:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-PATIENCE = 60.0
+PATIENCE_TIMEOUT = 60.0
 """Seconds that one wait for a camera takes before the next one begins."""
 
 RETRY = Backoff(initial=0.5, maximum=10.0)
@@ -149,7 +149,7 @@ class CameraLifecycle(Lifecycle):
         told, delays = "", RETRY.delays()
         while True:
             try:
-                await self._camera.wait_connected(PATIENCE)
+                await self._camera.wait_connected(PATIENCE_TIMEOUT)
                 await self.configure()
                 await self.activate()
             except (LinkError, ResponseTimeoutError) as exc:
@@ -167,7 +167,7 @@ class CameraLifecycle(Lifecycle):
             await asyncio.sleep(next(delays))
 
     async def close(self) -> None:
-        """End it; others are told, and then it serves no more. Idempotent."""
+        """End the node: tell others, and then stop its services. Idempotent."""
         self.closed = True
         starting, self._starting = self._starting, None
         try:

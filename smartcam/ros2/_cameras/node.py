@@ -42,11 +42,11 @@ class CameraPart(Protocol):
     """A part of a camera's node, which owns what it declares, and its tasks."""
 
     def start(self) -> Awaitable[None] | None:
-        """Declare it, and begin."""
+        """Declare the part, and begin."""
         ...
 
     async def close(self) -> None:
-        """End it, within seconds; also where starting it failed."""
+        """End the part, within seconds; also where starting it failed."""
         ...
 
 
@@ -70,7 +70,7 @@ class CameraNodeOptions:
         hardware_id: id of the hardware in diagnostics; empty for the camera's address.
         settings: what the session with the camera is told, where that is not what the camera's own
             settings say: the agent's, of a camera of a fleet.
-        heard: whether there is any sign of who has the session, the agent of a fleet; None where
+        heard: whether there is any sign of the agent that has the session; None where
             nobody is between.
         frames: parameters that say where its frames come from, by v4l2_camera's names:
             ``video_device``, ``pixel_format``, ``image_size`` and ``camera_info_url``.
@@ -222,7 +222,7 @@ class CameraNode(Server):
         """Open the node, and begin with all that it is made of.
 
         Raises:
-            SmartCamError: something of it cannot be; all is undone.
+            SmartCamError: something of it is not valid; all is undone.
 
         Cancellation: leaves it closed.
         """

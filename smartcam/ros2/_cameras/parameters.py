@@ -54,7 +54,7 @@ SAID: Mapping[str, tuple[str, Callable[[CameraSettings], Any]]] = {
 
 FRAMES = {
     "video_device": "where frames come from",
-    "pixel_format": "of frames, as four characters",
+    "pixel_format": "format of frames, as four characters",
     "image_size": "width and height of frames in pixels",
     "camera_info_url": "where the lens is said",
 }

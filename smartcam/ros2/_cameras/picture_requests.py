@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-LONGEST: Final = 60.0
-"""Seconds that a request may give a picture, and has where it says none."""
+MAX_TIMEOUT: Final = 60.0
+"""Longest ``timeout`` of a request, seconds, and the one of a request without any."""
 
 
 async def one_frame(
@@ -106,9 +106,9 @@ class PictureRequests:
             return {"error": error_text(exc)}
 
     async def _serve(self, asked: float) -> dict[str, Any]:
-        if not 0 <= asked <= LONGEST:
-            raise RosMessageError(f"timeout: expected 0 to {LONGEST:g} seconds, got {asked:g}")
-        timeout = asked or LONGEST
+        if not 0 <= asked <= MAX_TIMEOUT:
+            raise RosMessageError(f"timeout: expected 0 to {MAX_TIMEOUT:g} seconds, got {asked:g}")
+        timeout = asked or MAX_TIMEOUT
         try:
             async with asyncio.timeout(timeout):
                 await self._one_at_a_time.acquire()

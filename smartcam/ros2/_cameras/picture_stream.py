@@ -18,11 +18,11 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 Item = TypeVar("Item")
 
-LOOK: Final = 0.1
+LOOK_INTERVAL: Final = 0.1
 """Seconds between two looks whether somebody hears."""
 
 SELDOM: Final = 1.0
-"""Seconds between two looks where the graph tells of who comes; and for looks after it has."""
+"""Seconds between two looks where the graph tells of new listeners."""
 
 AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
 """Delays after which a source that ended is opened again, while somebody hears."""
@@ -105,7 +105,7 @@ class HeardPictures(Generic[Item]):
         loop = asyncio.get_running_loop()
         often = 0.0
         while not self.heard:
-            pause = LOOK if not self._watches or loop.time() < often else SELDOM
+            pause = LOOK_INTERVAL if not self._watches or loop.time() < often else SELDOM
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._woken.wait()
@@ -118,12 +118,12 @@ class HeardPictures(Generic[Item]):
         loop = asyncio.get_running_loop()
         end = loop.time() + seconds
         while self.heard and loop.time() < end:  # noqa: ASYNC110 - nothing tells of it
-            await asyncio.sleep(LOOK)
+            await asyncio.sleep(LOOK_INTERVAL)
 
     async def _stream(self) -> None:
         """Publish until nobody hears, or the source ends."""
         try:
-            async with self._read(LOOK) as reader:
+            async with self._read(LOOK_INTERVAL) as reader:
                 while self.heard:
                     with contextlib.suppress(FrameTimeoutError):
                         await self._one(await anext(reader))

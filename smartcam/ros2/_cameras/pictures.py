@@ -43,7 +43,7 @@ class CameraPictures:
 
     Topics, private to the node: ``image_raw``, ``camera_info``, ``image_raw/compressed``; services:
     ``set_camera_info`` and ``request_image``. A picture and its ``camera_info`` have one stamp:
-    when it was captured. Who is slow gets the newest, and holds up nobody.
+    when it was captured. A slow subscriber gets the newest, and holds up nobody.
 
     Args:
         camera: the camera; None where ``frames`` is all there is.
@@ -57,7 +57,7 @@ class CameraPictures:
         quality: quality of JPEGs, 1 to 100.
 
     Raises:
-        ConfigurationError: a value cannot be, or there is neither a camera nor a source.
+        ConfigurationError: a value is not valid, or there is neither a camera nor a source.
     """
 
     def __init__(

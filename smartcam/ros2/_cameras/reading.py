@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def reading_of(camera: Camera[Any]) -> Interpretation:
-    """Return the interpretation of results that no trigger reads otherwise."""
+    """Return the camera's own interpretation, which a trigger may replace for its results."""
     return camera._default  # noqa: SLF001 - smartcam's own
 
 

@@ -316,7 +316,7 @@ class _SubscriberOutlet:
         self._go_on(put)
 
     def heir(self, min_delay: float, queue_size: int) -> _SubscriberOutlet:
-        """Return one that goes on with the same publisher; what waited here is dropped."""
+        """Return an outlet that goes on with the same publisher; waiting results are dropped."""
         self._end()
         made = _SubscriberOutlet(self.topic, self._publisher, min_delay, queue_size)
         made.dropped = self.dropped

@@ -52,7 +52,7 @@ class CameraGraph:
             self._calibrations.graph = self
 
     async def close(self) -> None:
-        """Let them use it no more. Idempotent."""
+        """End the calibrations' use of the graph. Idempotent."""
         calibrations = self._calibrations
         if calibrations is not None and calibrations.graph is self:
             calibrations.graph = None

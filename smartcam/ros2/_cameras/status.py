@@ -212,7 +212,7 @@ class CameraStatus:
         return options.hardware_id or hardware_id(told or place_of(self._camera))
 
     def _is_heard(self, counted: Statistics) -> bool:
-        """Return True if there is, or was, any sign of who has the session with the camera."""
+        """Return True if there is, or was, any sign of the program that has the session."""
         if self._options.heard is not None:
             return self._options.heard()
         return bool(counted.sessions or counted.last_error)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-LEAST: Final = 0.05
+MIN_INTERVAL: Final = 0.05
 """Seconds between two messages."""
 
 MAX_WAITING_EVENTS: Final = 64
@@ -45,7 +45,7 @@ class CameraStatusTopic:
         """Return a topic's full name; empty for none, and for the one that a node always has.
 
         Raises:
-            ConfigurationError: the topic cannot be.
+            ConfigurationError: the topic is not valid.
         """
         if not topic:
             return ""
@@ -56,7 +56,7 @@ class CameraStatusTopic:
         """Publish on a topic, instead of the one that was said before; empty for none.
 
         Raises:
-            ConfigurationError: the topic cannot be.
+            ConfigurationError: the topic is not valid.
         """
         full = self.resolve(topic)
         if full == self._topic:
@@ -93,7 +93,7 @@ class CameraStatusTopic:
                 if fields != said:
                     said = fields
                     self._say(publisher, fields)
-                    await asyncio.sleep(LEAST)
+                    await asyncio.sleep(MIN_INTERVAL)
                 try:
                     await anext(events)
                 except (SmartCamError, StopAsyncIteration):

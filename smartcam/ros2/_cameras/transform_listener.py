@@ -112,7 +112,7 @@ class _FrameLink:
         """Return the transform at a time, interpolated.
 
         Raises:
-            CalibrationError: BAD_TIME: it is not known; NOT_RIGID: it is none.
+            CalibrationError: BAD_TIME: it is not known; NOT_RIGID: it is not valid.
         """
         if self.static is not None:
             return _transform(self, self.static, None)
@@ -221,7 +221,7 @@ class TransformListener:
 
         Raises:
             CalibrationError: ``WRONG_FRAME``: TF does not lead there; ``BAD_TIME``: not at that
-                time, or the newest is old; ``NOT_RIGID``: a transform is none.
+                time, or the newest is old; ``NOT_RIGID``: a transform is not valid.
             RosError: the node is not open.
         """
         frame, base = frame.strip("/"), base.strip("/")

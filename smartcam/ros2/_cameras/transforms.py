@@ -157,7 +157,7 @@ class StaticTransforms:
     def replace(self, transforms: Iterable[Transform]) -> None:
         """Publish others in their place, as after a new calibration.
 
-        Who has heard the old ones keeps those whose child is none of the new ones: TF forgets
+        A listener of the old transforms keeps those whose child is none of the new ones: TF forgets
         nothing.
 
         Raises:

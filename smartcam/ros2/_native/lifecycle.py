@@ -3,7 +3,7 @@
 rclpy's own callbacks of a transition block its thread until the transition has ended. A camera may
 take long for one, so the order is the other way round: smartcam's life cycle does the work in the
 event loop, and has ROS' machine make each step. The machine tells of each step and answers who
-asks for the state; who asks for a change is answered here.
+asks for the state; requests for a change are answered here.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class NativeLifecycle:
     def _follow(self, transition: LifecycleTransition) -> None:
         try:
             self._machine.trigger_transition_by_id(transition.id, True)
-        except Exception as exc:  # noqa: BLE001 - the context is gone, and who asks with it
+        except Exception as exc:  # noqa: BLE001 - the context is gone, and the asker with it
             logger.warning("%s ! %s: %s", self._name, transition.label, exc)
 
     def close(self) -> None:

@@ -61,7 +61,7 @@ class NativeNode(NamedNode):
         graph: view of the other nodes.
 
     Raises:
-        ConfigurationError: a name or domain cannot be, or there is no rclpy.
+        ConfigurationError: a name or domain is not valid, or there is no rclpy.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -123,7 +123,7 @@ class NativeNode(NamedNode):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open it.
+        """Open the node.
 
         Raises:
             RosError: rclpy makes no node.
@@ -160,7 +160,7 @@ class NativeNode(NamedNode):
                     end.fail(str(why))
 
     async def stop(self) -> None:
-        """Close it, with all that it publishes, hears, serves and calls. Idempotent, bounded."""
+        """Close the node with its publishers, subscriptions and services. Idempotent, bounded."""
         spun = self._spun
         if spun is None:
             return
@@ -227,7 +227,7 @@ class NativeNode(NamedNode):
         """Return an end that rclpy makes.
 
         Raises:
-            RosError: rclpy makes none.
+            RosError: rclpy makes no endpoint.
         """
         self.check_open()
         try:
@@ -260,7 +260,8 @@ class NativeNode(NamedNode):
             qos: quality of service.
 
         Raises:
-            ConfigurationError: the topic cannot be, or the type is not known or has other fields.
+            ConfigurationError: the topic is not valid, or the type is not known or has other
+                fields.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
@@ -277,7 +278,7 @@ class NativeNode(NamedNode):
             qos: quality of service; its depth is that of the queue.
 
         Raises:
-            ConfigurationError: the topic cannot be, or the type is not built for this ROS.
+            ConfigurationError: the topic is not valid, or the type is not built for this ROS.
             RosError: the node is not open.
         """
         kind, name = self.types.message(type), self._resolved(topic, "topic")
@@ -304,7 +305,7 @@ class NativeNode(NamedNode):
             timeout: seconds that the handler may take.
 
         Raises:
-            ConfigurationError: the name cannot be, or the type is not known or has other fields.
+            ConfigurationError: the name is not valid, or the type is not known or has other fields.
             RosError: the node is not open.
         """
         del qos
@@ -322,7 +323,7 @@ class NativeNode(NamedNode):
             qos: quality of service; ROS' own for services is used.
 
         Raises:
-            ConfigurationError: the name cannot be, or the type is not built for this ROS.
+            ConfigurationError: the name is not valid, or the type is not built for this ROS.
             RosError: the node is not open.
         """
         del qos

@@ -1,4 +1,4 @@
-"""The ends of services through rclpy: who serves, and who calls."""
+"""The ends of services through rclpy: servers and clients."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ class NativeService:
 
 
 class NativeClient:
-    """ServiceCalls a service through rclpy; made by :meth:`NativeNode.client`.
+    """Calls a service through rclpy; made by :meth:`NativeNode.client`.
 
     Attributes:
         name: absolute name of the service.
@@ -245,7 +245,7 @@ class NativeClient:
             raise ServiceCallError(f"{self.name}: this client is closed", service=self.name)
 
     async def call(self, request: object = None, /, *, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call it, once somebody serves it.
+        """Call the service, once somebody serves it.
 
         Args:
             request: one of the type's own, or a mapping of its fields.

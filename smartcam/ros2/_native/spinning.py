@@ -24,7 +24,7 @@ logger: logging.Logger = logging.getLogger("smartcam.ros2")
 THREADS = 4
 """Threads of a node's executor: a set of parameters takes one until its hook has answered."""
 
-LOOK_AGAIN = 1.0
+LOOK_INTERVAL = 1.0
 """Seconds between two looks of a spinning thread whether its event loop is still there."""
 
 AFTER_ERROR = 0.05
@@ -101,7 +101,7 @@ class NativeContext:
             if self._users:
                 return
             context, self._context = self._context, None
-        with contextlib.suppress(Exception):  # who has shut it down already
+        with contextlib.suppress(Exception):  # it may be shut down already
             context.try_shutdown()
 
 
@@ -189,7 +189,7 @@ class SpunNode:
         return True
 
     def abandon(self) -> None:
-        """End it at the program's end, where nobody has done so; bounded."""
+        """End a node that is still open at the program's end, in bounded time."""
         self.end()
         self._thread.join(EXIT_TIMEOUT)
 
@@ -199,7 +199,7 @@ class SpunNode:
         why: RosError | None = None
         try:
             context = self._context.open()
-        except BaseException as exc:  # noqa: BLE001 - told to who waits
+        except BaseException as exc:  # noqa: BLE001 - told to the waiter
             self.in_loop(self._tell, exc)
             _open.discard(self)
             return
@@ -207,7 +207,7 @@ class SpunNode:
             self._make(context)
             self.in_loop(self._tell, None)
             why = self._spin(context)
-        except BaseException as exc:  # noqa: BLE001 - told to who waits, or when all has ended
+        except BaseException as exc:  # noqa: BLE001 - told to the waiter, or when all has ended
             why = RosError(f"{self._name}: {type(exc).__name__}: {exc!s:.300}")
         finally:
             self._close()
@@ -242,7 +242,7 @@ class SpunNode:
             if not context.ok():
                 return RosError(f"{self._name}: rclpy's context was shut down: the node is gone")
             try:
-                self.executor.spin_once(LOOK_AGAIN)
+                self.executor.spin_once(LOOK_INTERVAL)
             except shut_down:
                 continue
             except NoReplyError:

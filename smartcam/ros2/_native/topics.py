@@ -113,7 +113,7 @@ class NativePublisher:
         def say() -> None:
             try:
                 self._say(self.type.encode(what))
-            except Exception as exc:  # noqa: BLE001 - told to who waits
+            except Exception as exc:  # noqa: BLE001 - told to the waiter
                 failed.append(exc)
             self._node.in_loop(done.set)
 

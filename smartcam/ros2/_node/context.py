@@ -180,7 +180,7 @@ class RosContext:
 
         Args:
             name: name of the topic or service.
-            kind: of them.
+            kind: kind of the endpoints.
             watcher: function that is called in the event loop.
 
         Returns:

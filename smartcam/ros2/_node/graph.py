@@ -65,8 +65,9 @@ class RosGraph:
             self._declared.close()
 
     def listen(self, listener: Callable[[Entity, bool], None]) -> Callable[[], None]:
-        """Have ``listener(entity, present)`` called for who comes and goes; return what ends it.
+        """Have ``listener(entity, present)`` called for entities that come and go.
 
+        Return a function that ends this.
         For those that are there already it is called at once.
         """
         self._listeners.append(listener)

@@ -20,7 +20,7 @@ class PublisherEnd(Protocol):
 
     An end may also have ``heard``, which says whether anybody hears the topic as far as is known;
     ``publish_encoded``, which takes bytes of the type; and ``publish_newest``, which takes
-    pictures: of those, who is slow gets the newest only.
+    pictures: True for pictures, of which a slow subscriber gets the newest only.
     """
 
     @property

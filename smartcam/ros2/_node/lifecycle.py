@@ -101,24 +101,24 @@ TRANSITIONS = tuple(
 """Transitions, in the order in which rcl names them. Nobody can ask for one from number 10 on."""
 
 PRIVATE = 10
-"""Ids from here on are of transitions that follow by themselves."""
+"""First id of the transitions that follow by themselves."""
 
 
 class Lifecycle:
     """The states of a managed node, and the ways between them; one at a time.
 
-    A transition that has begun goes on when who asked for it gives up. What it has to do may fail
-    with a :exc:`~smartcam.SmartCamError`, which leads back; any other error leads over error
-    processing to Unconfigured.
+    A transition that has begun goes on when its caller gives up. Its work may fail with a
+    :exc:`~smartcam.SmartCamError`, which leads back; any other error leads over error processing to
+    Unconfigured.
 
     Args:
         name: the node's, for texts.
-        work: what there is to do for a transition, by its label.
+        work: functions that do the work of transitions, by their labels.
         timeout: seconds that a transition may take.
 
     Attributes:
-        state: the present one; a transition's own while it is under way.
-        closed: nothing can be asked for any more.
+        state: the present state; during a transition the state of the transition.
+        closed: True if no transition can be asked for any more.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class Lifecycle:
         return [one for one in TRANSITIONS if one.start is self.state]
 
     def listen(self, heard: Callable[[LifecycleTransition], None]) -> Callable[[], None]:
-        """Have ``heard`` called after each step; return what ends that."""
+        """Have ``heard`` called after each step; return a function that ends this."""
         self._heard.append(heard)
         return lambda: self._heard.remove(heard) if heard in self._heard else None
 
@@ -150,7 +150,7 @@ class Lifecycle:
         """Wait until no transition is under way.
 
         Raises:
-            RosError: one is, for longer than it may take.
+            RosError: a transition takes longer than it may.
         """
         try:
             async with asyncio.timeout(self._timeout):
@@ -186,23 +186,23 @@ class Lifecycle:
         """Begin a transition that was asked for."""
 
     async def configure(self) -> None:
-        """Have it configured: from Unconfigured to Inactive, else nothing; as :meth:`change`."""
+        """Go from Unconfigured to Inactive as :meth:`change` does; else do nothing."""
         await self._have("configure", INACTIVE, ACTIVE)
 
     async def activate(self) -> None:
-        """Have it active: from Inactive to Active, else nothing; as :meth:`change`."""
+        """Go from Inactive to Active as :meth:`change` does; else do nothing."""
         await self._have("activate", ACTIVE)
 
     async def deactivate(self) -> None:
-        """Have it not active: from Active to Inactive, else nothing; as :meth:`change`."""
+        """Go from Active to Inactive as :meth:`change` does; else do nothing."""
         await self._have("deactivate", INACTIVE, UNCONFIGURED)
 
     async def cleanup(self) -> None:
-        """Have it not configured: from Inactive to Unconfigured, else nothing; as `change`."""
+        """Go from Inactive to Unconfigured as :meth:`change` does; else do nothing."""
         await self._have("cleanup", UNCONFIGURED)
 
     async def shutdown(self) -> None:
-        """Have it Finalized, for good; as :meth:`change`."""
+        """Go to Finalized, for good, as :meth:`change` does."""
         await self._have("shutdown", FINALIZED)
 
     async def _have(self, label: str, *enough: LifecycleState) -> None:
@@ -258,7 +258,7 @@ class Lifecycle:
         self._follow(SUCCESS)
 
     def _finished(self, task: asyncio.Task[None]) -> None:
-        """Look at how it ended; one that was cancelled, before it began perhaps, has failed."""
+        """Note how a transition ended; one that was cancelled has failed."""
         if task.cancelled():
             self._follow(FAILURE)
         else:

@@ -20,7 +20,7 @@ class NamedNode(Server):
         namespace: namespace of the node, such as ``/line1``.
 
     Raises:
-        ConfigurationError: one of the names cannot be.
+        ConfigurationError: one of the names is not valid.
     """
 
     def __init__(self, name: str, namespace: str) -> None:
@@ -54,7 +54,7 @@ class NamedNode(Server):
             what: kind of the thing named, for error texts.
 
         Raises:
-            ConfigurationError: the name cannot be.
+            ConfigurationError: the name is not valid.
             RosError: the node is not open.
         """
         full = resolve(name, self.namespace, self.name, what)

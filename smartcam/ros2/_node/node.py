@@ -56,7 +56,7 @@ class Node(NamedNode):
         parameters: parameters of the node.
 
     Raises:
-        ConfigurationError: a name, domain or distribution cannot be.
+        ConfigurationError: a name, domain or distribution is not valid.
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
@@ -106,7 +106,7 @@ class Node(NamedNode):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open it.
+        """Open the node.
 
         Raises:
             ConnectFailedError: there is no router, or it cannot listen.
@@ -134,7 +134,7 @@ class Node(NamedNode):
             raise
 
     async def stop(self) -> None:
-        """Close it, with all that it publishes, hears, serves and calls. Idempotent."""
+        """Close the node, with all that it publishes, hears, serves and calls. Idempotent."""
         token, self._token = self._token, None
         if token is None:
             return
@@ -163,7 +163,7 @@ class Node(NamedNode):
             qos: quality of service.
 
         Raises:
-            ConfigurationError: the topic cannot be, or there is no such type.
+            ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
         kind = self.types.message(type)
@@ -179,7 +179,7 @@ class Node(NamedNode):
             qos: quality of service; its depth is that of the queue.
 
         Raises:
-            ConfigurationError: the topic cannot be, or there is no such type.
+            ConfigurationError: the topic is not valid, or there is no such type.
             RosError: the node is not open.
         """
         kind = self.types.message(type)
@@ -207,7 +207,7 @@ class Node(NamedNode):
             timeout: seconds that the handler may take.
 
         Raises:
-            ConfigurationError: the name cannot be, or there is no such type.
+            ConfigurationError: the name is not valid, or there is no such type.
             RosError: the node is not open.
         """
         kind = self.types.service(type)
@@ -225,7 +225,7 @@ class Node(NamedNode):
             qos: quality of service.
 
         Raises:
-            ConfigurationError: the name cannot be, or there is no such type.
+            ConfigurationError: the name is not valid, or there is no such type.
             RosError: the node is not open.
         """
         kind = self.types.service(type)
@@ -240,7 +240,7 @@ class Node(NamedNode):
             timeout: seconds for one call.
 
         Raises:
-            ConfigurationError: the name cannot be.
+            ConfigurationError: the name is not valid.
         """
         return ParameterClient(self, resolve(name, self.namespace, self.name, "node"), timeout)
 

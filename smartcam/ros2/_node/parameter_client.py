@@ -80,11 +80,11 @@ class ParameterClient:
         """Set parameters, all or none.
 
         Args:
-            values: by their names; an ``int`` is no double.
+            values: values by the parameters' names; an ``int`` is no double.
             **more: further ones.
 
         Raises:
-            ConfigurationError: a value can be none.
+            ConfigurationError: a value can be no parameter.
             ServiceCallError: the node refused, with its reason.
         """
         both = {**(values or {}), **more}

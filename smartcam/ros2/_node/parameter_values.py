@@ -34,7 +34,7 @@ _TO_ARRAY: Final = 5
 _NUMBERS: Final = (INTEGER, DOUBLE)
 _INT64: Final = (-(1 << 63), (1 << 63) - 1)
 
-_CLOSE: Final = 1e-9
+_MAX_DEVIATION: Final = 1e-9
 """Largest deviation of a double from a bound or a step, as a part of either."""
 
 
@@ -124,7 +124,9 @@ class ParameterDescription:
 
 
 def _double_fits(value: float, first: float, last: float, step: float) -> bool:
-    if math.isclose(value, first, rel_tol=_CLOSE) or math.isclose(value, last, rel_tol=_CLOSE):
+    if math.isclose(value, first, rel_tol=_MAX_DEVIATION) or math.isclose(
+        value, last, rel_tol=_MAX_DEVIATION
+    ):
         return True
     if not first <= value <= last:
         return False
@@ -133,7 +135,7 @@ def _double_fits(value: float, first: float, last: float, step: float) -> bool:
     if not math.isfinite(value):
         return False
     nearest = first + round((value - first) / step) * step
-    return math.isclose(value, nearest, rel_tol=_CLOSE, abs_tol=_CLOSE * step)
+    return math.isclose(value, nearest, rel_tol=_MAX_DEVIATION, abs_tol=_MAX_DEVIATION * step)
 
 
 def range_of(
@@ -142,7 +144,7 @@ def range_of(
     """Return a range as it is declared: both bounds, or neither.
 
     Raises:
-        ConfigurationError: there can be none, or it holds nothing.
+        ConfigurationError: there can be no such value, or it holds nothing.
     """
     if minimum is None and maximum is None and step is None:
         return None, None, None
@@ -212,7 +214,7 @@ def typed(name: str, given: object, declared: int = NOT_SET) -> Typed:
         declared: the type of a list without elements.
 
     Raises:
-        ConfigurationError: it can be none.
+        ConfigurationError: it can be no parameter.
     """
     if isinstance(given, Typed):
         return given

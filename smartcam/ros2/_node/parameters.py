@@ -109,12 +109,12 @@ class RosParameters:
     # ------------------------------------------------------------------ life
 
     def open(self) -> None:
-        """Let other nodes see them; the node does so when it is opened."""
+        """Let other nodes see the parameters; the node calls it when it is opened."""
         if self._services is not None:
             self._services.open()
 
     async def close(self) -> None:
-        """Give up sets that are under way; what is declared stays. The node does so."""
+        """Give up sets that are under way; declared parameters stay. The node calls it."""
         if self._services is not None:
             self._services.close()
         for task in self._tasks:
@@ -152,7 +152,7 @@ class RosParameters:
             type: name of the type, such as ``string_array``, for a list without elements.
 
         Raises:
-            ConfigurationError: it is declared, or value, name, type or range cannot be.
+            ConfigurationError: it is declared, or value, name, type or range is not valid.
         """
         if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
             raise ConfigurationError(f"parameter {name!r:.80}: expected a name in printable text")
@@ -176,7 +176,7 @@ class RosParameters:
         self._tell(new=[name])
 
     def undeclare(self, name: str) -> None:
-        """Have a parameter no more.
+        """Remove a parameter.
 
         Raises:
             ConfigurationError: there is none of this name.
@@ -237,7 +237,7 @@ class RosParameters:
         """Set one, as other nodes do.
 
         Raises:
-            ConfigurationError: there is none of this name, or the value cannot be.
+            ConfigurationError: there is none of this name, or the value is not valid.
             RosError: its ``on_set`` failed, or sets before it took too long.
             SmartCamError: whatever its ``on_set`` raised to refuse it.
 
@@ -249,7 +249,7 @@ class RosParameters:
         """Set several at once, or none of them: what failed half way is taken back.
 
         Raises:
-            ConfigurationError: there is none of a name, or a value cannot be.
+            ConfigurationError: there is none of a name, or a value is not valid.
             RosError: an ``on_set`` failed, or sets before it took too long.
             SmartCamError: whatever an ``on_set`` raised to refuse it.
 
@@ -272,7 +272,7 @@ class RosParameters:
             self._turn.release()
 
     async def carry_out(self, values: Mapping[str, object]) -> None:
-        """Set as :meth:`set_all`, to its end even if who asked for it is gone."""
+        """Set as :meth:`set_all`, to its end even if the caller is gone."""
         task = asyncio.get_running_loop().create_task(self.set_all(values))
         self._tasks.add(task)
         task.add_done_callback(self._ended)

@@ -34,7 +34,7 @@ class QoS:
         lifespan: seconds after which a message counts for nothing.
 
     Raises:
-        ConfigurationError: a value cannot be.
+        ConfigurationError: a value is not valid.
     """
 
     reliable: bool = True

@@ -1,6 +1,6 @@
 """Answer a call that is not carried out, so that its caller's wait ends.
 
-rmw_zenoh drops an error reply, so who calls by it would wait for ever. An answer that it sees is an
+rmw_zenoh drops an error reply, so its clients would wait for ever. An answer that it sees is an
 ordinary one. Many types have fields for that: ``success`` and a text, or an ``error``. The lists of
 ROS' own services say nothing by being empty, as rclcpp's do where a parameter is not declared. Any
 answer of another type, such as a sum, or of one without fields, would be a lie: such a call waits

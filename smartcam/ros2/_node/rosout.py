@@ -28,7 +28,7 @@ MAX_TEXT_CHARACTERS = 8000
 """Characters of a record's text."""
 
 CLOSE_TIMEOUT = 1.0
-LOOK_AGAIN = 0.005
+LOOK_INTERVAL = 0.005
 
 TURN = 64
 """Records that are published in one turn of the event loop."""
@@ -96,7 +96,7 @@ class RosOut:
         try:
             async with asyncio.timeout(CLOSE_TIMEOUT):
                 while publisher.published + publisher.dropped < self._handed:  # noqa: ASYNC110
-                    await asyncio.sleep(LOOK_AGAIN)  # a thread says them
+                    await asyncio.sleep(LOOK_INTERVAL)  # a thread says them
         except TimeoutError:
             pass  # the network does not take them
         finally:
@@ -157,7 +157,7 @@ class _Handler(logging.Handler):
         return True
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Hand it on."""
+        """Hand the log record on."""
         with _inside():
             try:
                 self._take(record)

@@ -1,4 +1,4 @@
-"""The ends of services: who serves, and who calls.
+"""The ends of services: servers and clients.
 
 As ``rmw_service_data.cpp`` and ``rmw_client_data.cpp`` of rmw_zenoh: a service is a complete
 queryable, a reply repeats number and GID of its request.
@@ -178,7 +178,7 @@ class RosService(RosEnd):
         self._context.zenoh.refuse(query, f"{self.name}: {why}")
 
     def _on_graph(self, entity: Entity, present: bool) -> None:
-        """Give up what was called by who is gone."""
+        """Give up the calls of a client that is gone."""
         if present:
             return
         left = [call for call in self._waiting if call.attachment.gid != entity.gid]
@@ -271,7 +271,7 @@ class RosClient(RosEnd):
             raise ServiceCallError(f"{self.name}: this client is closed", service=self.name)
 
     async def call(self, request: object = None, /, *, timeout: float = 10.0, **fields: Any) -> Any:
-        """Call it, once somebody serves it; the first reply counts.
+        """Call the service, once somebody serves it; the first reply counts.
 
         Args:
             request: one of the type's own, or a mapping of its fields.

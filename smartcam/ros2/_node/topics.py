@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
-LONG = 1 << 16
+MAX_DIRECT_BYTES = 1 << 16
 """Bytes beyond which a message is said by a thread, which waits until the engine has taken it."""
 
 MAX_WAITING_BYTES = 1 << 26
@@ -199,7 +199,7 @@ class RosPublisher(RosEnd):
         self._check_open()
         attachment = self._attachment()
         waits = self._context.waits(self)
-        if len(data) > LONG and self._lane == "short" and not waits:
+        if len(data) > MAX_DIRECT_BYTES and self._lane == "short" and not waits:
             self._lane = "long"  # from now on: a short one would overtake it
         if self._direct and self._lane == "short" and not waits and self._context.calm():
             quietly(self._publisher.put, data, attachment=attachment)
@@ -240,7 +240,7 @@ class RosPublisher(RosEnd):
                 return
             try:
                 self._say_newest(self.type.encode(what))
-            except BaseException as exc:  # noqa: BLE001 - told to who waits
+            except BaseException as exc:  # noqa: BLE001 - told to the waiter
                 done.set_exception(exc)
             else:
                 done.set_result(None)
@@ -258,7 +258,7 @@ class RosPublisher(RosEnd):
         if self._closed or slot is None:
             return
         attachment = self._attachment()
-        if len(data) > LONG:
+        if len(data) > MAX_DIRECT_BYTES:
             if self._hasty is None:
                 zenoh = self._context.zenoh.engine
                 self._hasty = self._context.zenoh.session.declare_publisher(

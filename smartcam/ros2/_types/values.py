@@ -40,7 +40,7 @@ class RosMessage:
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
-_LONG = 16
+_MAX_SHOWN = 16
 """Elements or bytes above which a value is not shown whole."""
 
 
@@ -56,9 +56,9 @@ def _same(one: Any, other: Any) -> bool:
 
 def _shown(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        text = ", ".join(map(str, value[:_LONG].tolist()))
-        return f"[{text}{f', ... of {len(value)}' if len(value) > _LONG else ''}]"
-    if isinstance(value, bytes | bytearray | memoryview | list | tuple) and len(value) > _LONG:
+        text = ", ".join(map(str, value[:_MAX_SHOWN].tolist()))
+        return f"[{text}{f', ... of {len(value)}' if len(value) > _MAX_SHOWN else ''}]"
+    if isinstance(value, bytes | bytearray | memoryview | list | tuple) and len(value) > _MAX_SHOWN:
         return f"<{type(value).__name__} of {len(value)}>"
     return repr(value)
 

@@ -59,7 +59,7 @@ NOT_FINITE = tuple(
     for code in "fd"
     for number in (math.nan, math.inf, -math.inf)
 )
-"""Bytes of numbers that are none, in each size and order."""
+"""Bytes of numbers that are not valid, in each size and order."""
 
 LAYOUTS = ("x: int8", "x: real32 mm, y: real32 mm, theta: real32 deg", "(name: string[3])*")
 """Layouts that a user may write behind an interpreter's name."""
@@ -341,7 +341,7 @@ def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
         raise AssertionError(message) from error
     for pose in _poses(value):
         numbers = (*pose.position, *pose.orientation)
-        assert all(map(math.isfinite, numbers)), f"{where}: a pose that is none: {pose}"
+        assert all(map(math.isfinite, numbers)), f"{where}: a pose that is not finite: {pose}"
 
 
 def see_error(error: InterpretationError, data: bytes) -> None:

@@ -39,7 +39,7 @@ class Edit(Transmission):
 
 
 def _gap(seconds: float) -> Edit:
-    """Return one that lets so much time pass, or two turns of the event loop at 0."""
+    """Return a wait of so many seconds, or of two turns of the event loop at 0."""
     return Edit([b"", b""], pauses=[seconds])
 
 

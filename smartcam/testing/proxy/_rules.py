@@ -269,9 +269,9 @@ class DelayBytes(Pace, name="delay"):
     """Pass everything later; the order stays, the end of the stream comes later too.
 
     Args:
-        seconds: for everything.
+        seconds: seconds for everything.
         jitter: seconds; up to so much more, evenly spread, for each piece that comes.
-        seed: of the jitter.
+        seed: seed of the jitter.
     """
 
     seconds: float
@@ -294,10 +294,10 @@ class DatagramRule(Rule):
     """A rule for UDP.
 
     Args:
-        number: of the datagram in its direction and connection, from 1; None lets the probability
-            decide.
-        probability: of each datagram, 0 to 1.
-        seed: of the chance; the same seed picks the same datagrams.
+        number: number of the datagram in its direction and connection, from 1; None lets the
+            probability decide.
+        probability: probability for each datagram, 0 to 1.
+        seed: seed of the chance; the same seed picks the same datagrams.
     """
 
     number: int | None = None
@@ -316,12 +316,12 @@ class DatagramRule(Rule):
 
 
 class Lose(DatagramRule):
-    """Let it vanish."""
+    """Drop the datagram."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repeat(DatagramRule):
-    """Send it more than once.
+    """Send the datagram more than once.
 
     Args:
         copies: how many more.
@@ -332,7 +332,7 @@ class Repeat(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Late(DatagramRule):
-    """Send it later; others overtake it.
+    """Send the datagram later; others overtake it.
 
     Args:
         seconds: how much.
@@ -345,7 +345,7 @@ class Late(DatagramRule):
 
 @dataclass(frozen=True, kw_only=True)
 class Reorder(DatagramRule):
-    """Send it behind those that follow.
+    """Send the datagram after the ones that follow.
 
     Args:
         behind: how many of the same direction and connection overtake it.

@@ -78,7 +78,7 @@ class ProxiedConnection(Proxied):
         return len(self._carried) == len(DIRECTIONS)
 
     def turn_away(self, why: str) -> None:
-        """End it to make room, or because client and target did not speak in time."""
+        """End the connection to make room, or because client and target did not speak in time."""
         self.note("turned away")
         self.reset()
 
@@ -198,7 +198,7 @@ class _RawAcceptor(Acceptor[ProxiedConnection]):
         self._relay = relay
 
     def adopt(self, connection: socket.socket) -> None:
-        """Pair it with a socket to the target."""
+        """Pair the connection with a socket to the target."""
         self._relay.take(connection)
 
 

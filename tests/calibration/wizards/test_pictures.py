@@ -61,7 +61,7 @@ def test_picture_that_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_picture_with_too_many_pixels_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "LARGEST", 40)
+    monkeypatch.setattr(pictures, "MAX_SIDE", 40)
     with refused("BAD_PICTURE", "expected 40 pixels along each side, got 48x32"):
         decode_picture(encoded())
 

@@ -60,7 +60,7 @@ def test_it_is_unpacked() -> None:
 
 
 def test_what_unpacks_to_too_much_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_description, "LARGEST", 10_000)
+    monkeypatch.setattr(_description, "MAX_PLAIN_BYTES", 10_000)
     with pytest.raises(MessageError, match="more than 10000"):
         unpack(zipped(bytes(10_001)))
     assert len(unpack(zipped(bytes(10_000)))) == 10_000

@@ -254,7 +254,7 @@ async def test_a_driver_that_says_full_for_ever_and_gives_nothing_ends(
         replay.ioctl(device, request, argument)
 
     monkeypatch.setattr(system, "ioctl", ioctl)
-    assert "says that a picture is there, and gives none" in await _reading(FrameSourceError)
+    assert "says that a picture is there, and gives no picture" in await _reading(FrameSourceError)
 
 
 @pytest.mark.parametrize("steps", range(0, 40, 3))

@@ -22,11 +22,11 @@ class AccessUnit(NamedTuple):
     """One encoded frame that came whole.
 
     Attributes:
-        data: as in a file (annex B, or a JPEG).
+        data: bytes as in a file (annex B, or a JPEG).
         timestamp: ticks of 90 kHz.
         lost: packets that were lost since the last one that came whole.
-        damaged: frames since then that did not come whole, as far as one saw something of them.
-        arrived: when its first packet did, as it was told; 0.0 where it was not.
+        damaged: frames since then of which some packets came, but not all.
+        arrived: time of arrival of its first packet; 0.0 where that is not known.
         begins: whether it is the first one of a stream: nothing before it belongs to that.
     """
 
@@ -54,7 +54,7 @@ class OpenUnit(ABC):
         self.has_picture = False
 
     def add(self, payload: bytes) -> None:
-        """Take what a packet has; what cannot be makes it damaged."""
+        """Take a packet's payload; one that is not valid makes the unit damaged."""
         if self.whole:
             self.size += len(payload) + len(START_CODE)
             self.whole = self.size <= MAX_ACCESS_UNIT_BYTES and (
@@ -73,7 +73,7 @@ class OpenUnit(ABC):
 
     @abstractmethod
     def _added(self, payload: bytes) -> bool:
-        """Take a payload, which has bytes; return False if it cannot be."""
+        """Take a payload, which has bytes; return False if it is not valid."""
 
 
 class UnitKind(Protocol):

@@ -41,7 +41,7 @@ class Coding(NamedTuple):
     """The coding of a stream.
 
     Attributes:
-        name: of the codec.
+        name: name of the codec.
         format: name of its encoded frames' format.
         kind: makes the kind of its payloads.
         size_in: returns the size of the pictures where an encoded frame tells it.

@@ -58,8 +58,8 @@ class DecodingPlan(NamedTuple):
     """The plan by which frames are made of a stream.
 
     Attributes:
-        name: of the source.
-        coding: of the stream.
+        name: name of the source.
+        coding: coding of the stream.
         delay: longest time from exposure to arrival, seconds.
         size: size that the pictures must have; None: any.
         sets: parameters of the codec that were told beside the stream, as in a file.

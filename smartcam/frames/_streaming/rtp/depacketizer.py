@@ -32,13 +32,13 @@ class Depacketizer:
     Another SSRC is a new stream.
 
     A frame ends with the packet that has the marker. Some senders put markers on each slice or
-    unit: who is wary waits until :data:`PROOFS` frames showed that the marker is right, or until
+    unit: a wary reader waits until :data:`PROOFS` frames showed that the marker is right, or until
     :meth:`end_marked`; behind a wrong one frames end with the next timestamp. Parameters without a
     picture belong to the next frame, whatever their marker and timestamp.
 
     Args:
         window: packets.
-        kind: of the payloads.
+        kind: kind of the payloads.
         wary: whether the marker is to prove itself first.
 
     Attributes:
@@ -77,7 +77,7 @@ class Depacketizer:
         """Take a packet, and return the frames that are whole with it.
 
         Args:
-            packet: of the stream.
+            packet: packet of the stream.
             now: when it arrived.
         """
         if packet.ssrc != self._ssrc:

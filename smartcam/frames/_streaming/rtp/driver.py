@@ -175,7 +175,7 @@ class _RtpStream:
     """The tasks and sockets of a driver while it streams.
 
     Args:
-        size: of the pictures; None: as the stream says.
+        size: size of the pictures; None: as the stream says.
     """
 
     def __init__(

@@ -16,13 +16,13 @@ RECEIVER_TIMEOUT: Final = 10.0
 
 MAX_RECEIVERS: Final = 64
 
-REMEMBERED: Final = 1024
+MAX_KEPT_PACKETS: Final = 1024
 """Packets that are kept to be sent again on request."""
 
 MAX_RESEND_AGE: Final = 0.2
 """Seconds after which a packet is not sent again: its picture would be late."""
 
-RESENT: Final = 5
+MAX_RESENDS: Final = 5
 """Times that one packet is sent again at most."""
 
 
@@ -129,13 +129,17 @@ class PacketHistory:
     def sent(self, sequence: int, data: bytes) -> None:
         """Remember a packet."""
         self._sent[sequence] = _SentPacket(data)
-        if len(self._sent) > REMEMBERED:
+        if len(self._sent) > MAX_KEPT_PACKETS:
             self._sent.popitem(last=False)
 
     def again(self, sequence: int) -> bytes | None:
         """Return a packet that is to be sent again; None: it is too old, or was too often."""
         found = self._sent.get(sequence)
-        if found is None or found.times >= RESENT or time.monotonic() - found.at > MAX_RESEND_AGE:
+        if (
+            found is None
+            or found.times >= MAX_RESENDS
+            or time.monotonic() - found.at > MAX_RESEND_AGE
+        ):
             return None
         found.times += 1
         return found.data

@@ -27,10 +27,10 @@ def units(access_unit: bytes) -> list[bytes]:
     """Return the units of an encoded frame, without start codes.
 
     Args:
-        access_unit: as in a file (ITU-T H.264, annex B).
+        access_unit: bytes as in a file (ITU-T H.264, annex B).
 
     Raises:
-        FrameFormatError: it begins with none, or has one that cannot be.
+        FrameFormatError: it begins with none, or has one that is not valid.
     """
     data = bytes(access_unit)
     place = data.find(b"\0\0\1")
@@ -64,13 +64,13 @@ class H264Packetizer:
 
     Args:
         payload_type: 0 to 127; what has no number of its own takes 96 to 127.
-        ssrc: of the stream; None: a random one.
-        sequence: of the first packet; None: a random one.
+        ssrc: SSRC of the stream; None: a random one.
+        sequence: number of the first packet; None: a random one.
         mtu_payload: bytes of a packet's payload.
 
     Attributes:
         packets_made: since the beginning.
-        octets_made: of their payloads.
+        octets_made: bytes of the packets' payloads.
 
     Raises:
         ConfigurationError: a number out of its range.
@@ -107,7 +107,7 @@ class H264Packetizer:
 
         Args:
             access_unit: one encoded frame, as in a file (annex B).
-            timestamp: of the frame, in ticks of 90 kHz; its lower 32 bits count.
+            timestamp: timestamp of the frame, in ticks of 90 kHz; its lower 32 bits count.
 
         Raises:
             FrameFormatError: it is no encoded frame; no sequence number was used.

@@ -64,7 +64,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
         sps: the sequence's parameters, with the two bytes of their head.
 
     Raises:
-        FrameFormatError: they are none.
+        FrameFormatError: they are not valid.
     """
     return checked_size("H265", sps, lambda: _size(FieldBits(sps[2:257])))
 
@@ -91,7 +91,7 @@ def size_in(access_unit: bytes) -> tuple[int, int] | None:
     """Return the size of the pictures where an encoded frame has the parameters.
 
     Raises:
-        FrameFormatError: the parameters are none.
+        FrameFormatError: the parameters are not valid.
     """
     for unit in H265Unit.leading(access_unit):
         if H265Unit.kind_of(unit[0]) == SPS:

@@ -58,7 +58,7 @@ class JpegUnits:
     """The kind of a stream of JPEGs; it remembers tables that are sent once.
 
     Args:
-        size: of the pictures where the packets have no room for it: above 2040 pixels.
+        size: size of the pictures where the packets have no room for it: above 2040 pixels.
     """
 
     def __init__(self, size: tuple[int, int] | None = None) -> None:
@@ -155,7 +155,7 @@ def scaled(quality: int) -> tuple[bytes, ...]:
 
 
 def cut(data: bytes, wide: int) -> tuple[bytes, ...]:
-    """Return the tables that stand one behind the other: of 64 bytes, or of 128 by a bit each."""
+    """Return the tables in ``data``: each has 64 bytes, or 128 where its bit in ``wide`` is set."""
     found: list[bytes] = []
     while data and len(found) < 4:
         size = 128 if wide >> len(found) & 1 else 64

@@ -31,7 +31,7 @@ class RtpPacket(NamedTuple):
     """One packet of a stream.
 
     Attributes:
-        marker: of video: the last packet of a picture.
+        marker: True for the last packet of a picture, in video.
         payload_type: 0 to 127.
         sequence: 0 to 65535.
         timestamp: 0 to 2**32 - 1; of video in ticks of 90 kHz.
@@ -47,7 +47,7 @@ class RtpPacket(NamedTuple):
     payload: bytes
 
     def pack(self) -> bytes:
-        """Return its bytes: no CSRC, no extension, no padding."""
+        """Return the packet's bytes: no CSRC, no extension, no padding."""
         second = self.marker << 7 | self.payload_type
         head = _HEAD.pack(VERSION << 6, second, self.sequence, self.timestamp, self.ssrc)
         return head + self.payload
@@ -89,10 +89,10 @@ class ReportBlock(NamedTuple):
 
     Attributes:
         ssrc: the stream.
-        fraction: of its packets that were lost since the last report, in 256ths.
+        fraction: part of its packets that was lost since the last report, in 256ths.
         lost: packets since the beginning; below 0 where there were more duplicates.
         highest: sequence number, with the count of its wraps above the 16 bits.
-        jitter: of the arrival, ticks of the stream's clock.
+        jitter: jitter of the arrival, ticks of the stream's clock.
         last_report: the middle 32 bits of the last sender report's NTP time; 0: none came.
         delay: since that came, in 65536ths of a second.
     """
@@ -106,7 +106,7 @@ class ReportBlock(NamedTuple):
     delay: int = 0
 
     def pack(self) -> bytes:
-        """Return its 24 bytes; ``lost`` is held within its 24 bits."""
+        """Return the block's 24 bytes; ``lost`` is held within its 24 bits."""
         lost = max(-(1 << 23), min(self.lost, (1 << 23) - 1)) & 0xFFFFFF
         rest = (self.highest, self.jitter, self.last_report, self.delay)
         return _BLOCK.pack(self.ssrc, self.fraction << 24 | lost, *rest)
@@ -124,10 +124,10 @@ class SenderReport(NamedTuple):
 
     Attributes:
         ssrc: the stream.
-        ntp: seconds since 1900 in units of 2**-32, at the same moment as
-        timestamp: of the stream's clock.
+        ntp: wall clock of the report, seconds since 1900 in units of 2**-32.
+        timestamp: the stream's clock at the same moment.
         packets: sent since the beginning.
-        octets: of payload in them.
+        octets: bytes of payload in these packets.
         blocks: what it says of others' streams, at most 31.
     """
 
@@ -139,7 +139,7 @@ class SenderReport(NamedTuple):
     blocks: tuple[ReportBlock, ...] = ()
 
     def pack(self) -> bytes:
-        """Return its bytes."""
+        """Return the report's bytes."""
         head = _SENDER.pack(*(part & mask for part, mask in zip(self[:5], _MASKS, strict=True)))
         return _packet(SR, len(self.blocks), head + b"".join(b.pack() for b in self.blocks))
 
@@ -151,7 +151,7 @@ class ReceiverReport(NamedTuple):
     blocks: tuple[ReportBlock, ...] = ()
 
     def pack(self) -> bytes:
-        """Return its bytes."""
+        """Return the report's bytes."""
         body = self.ssrc.to_bytes(4, "big") + b"".join(one.pack() for one in self.blocks)
         return _packet(RR, len(self.blocks), body)
 
@@ -163,7 +163,7 @@ class SourceDescription(NamedTuple):
     cname: str
 
     def pack(self) -> bytes:
-        """Return its bytes; a name is cut after 255."""
+        """Return the description's bytes; a name is cut after 255 bytes."""
         name = self.cname.encode()[:255]
         body = self.ssrc.to_bytes(4, "big") + bytes((CNAME, len(name))) + name + b"\0"
         return _packet(SDES, 1, body + bytes(-len(body) % 4))
@@ -176,7 +176,7 @@ class Goodbye(NamedTuple):
     reason: str = ""
 
     def pack(self) -> bytes:
-        """Return its bytes; a reason is cut after 255."""
+        """Return the packet's bytes; a reason is cut after 255 bytes."""
         body = b"".join(one.to_bytes(4, "big") for one in self.ssrcs)
         if self.reason:
             reason = self.reason.encode()[:255]
@@ -191,7 +191,7 @@ class PacketsMissing(NamedTuple):
     Attributes:
         ssrc: the receiver.
         media: the stream.
-        sequences: numbers of the packets that are missing.
+        sequences: numbers of the missing packets.
     """
 
     ssrc: int
@@ -199,7 +199,7 @@ class PacketsMissing(NamedTuple):
     sequences: tuple[int, ...]
 
     def pack(self) -> bytes:
-        """Return its bytes: one entry for up to 17 packets that are near each other."""
+        """Return the request's bytes: one entry for up to 17 packets that are near each other."""
         body = struct.pack("!II", self.ssrc, self.media)
         left = list(self.sequences)
         while left:
@@ -217,7 +217,7 @@ class PictureLost(NamedTuple):
     media: int
 
     def pack(self) -> bytes:
-        """Return its bytes."""
+        """Return the request's bytes."""
         return _packet(PSFB, PLI, struct.pack("!II", self.ssrc, self.media))
 
 
@@ -235,7 +235,8 @@ def parse_rtcp(data: bytes) -> list[Report]:
     """Read a datagram of RTCP; kinds of packets that we have no use for are left out.
 
     Raises:
-        MessageError: it is none: a length or count that does not fit, or not a report at first.
+        MessageError: it is not valid: a length or count that does not fit, or not a report at
+            first.
     """
     found: list[Report] = []
     place = 0

@@ -56,7 +56,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
             :func:`~smartcam.frames._streaming.rtp.h264.parameter_sets`.
 
     Raises:
-        FrameFormatError: they are none.
+        FrameFormatError: they are not valid.
     """
     return checked_size("H264", sps, lambda: _size(FieldBits(sps[1:256])))
 
@@ -65,7 +65,7 @@ def checked_size(codec: str, sps: bytes, read: Callable[[], tuple[int, int]]) ->
     """Return a size read from parameters.
 
     Raises:
-        FrameFormatError: they are none.
+        FrameFormatError: they are not valid.
     """
     try:
         width, height = read()
@@ -132,7 +132,7 @@ def size_in(access_unit: bytes) -> tuple[int, int] | None:
     """Return the size of the pictures where an encoded frame has the parameters.
 
     Raises:
-        FrameFormatError: the parameters are none.
+        FrameFormatError: the parameters are not valid.
     """
     for unit in H264Unit.leading(access_unit):
         if unit[0] & 0x1F == 7:

@@ -95,7 +95,7 @@ class PacketWays(Protocol):
         read: Callable[[], None],
         /,
     ) -> None:
-        """Call for each packet and report, with who sent it, and after those that came together."""
+        """Call for each packet and report, with its sender, and after those that came together."""
         ...
 
     def report(self, data: bytes, to: tuple[Any, ...], /) -> None:
@@ -112,12 +112,12 @@ class StreamReceiver:
 
     Args:
         pair: ways, not read yet.
-        payload_type: of the stream's packets.
+        payload_type: payload type of the stream's packets.
         repair: seconds that a missing packet is waited for, and asked for again.
         done: takes the encoded frames that came whole.
         gone: takes that the sender said goodbye.
         only: address of the host whose packets count; "": any.
-        kind: of the payloads; None: H.264.
+        kind: kind of the payloads; None: H.264.
         agreed: whether the stream was asked for, so that another one of the same host takes its
             place at once, and packets that are missing are waited for without asking.
         proofs: frames of the sender whose marker was right before.

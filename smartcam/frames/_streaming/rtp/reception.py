@@ -39,7 +39,7 @@ class Reception:
 
     @property
     def jitter(self) -> float:
-        """Of the arrival, seconds."""
+        """Jitter of the arrival, seconds."""
         return self._jitter / CLOCK_RATE
 
     def packet(self, packet: RtpPacket, now: float) -> None:

@@ -24,7 +24,7 @@ SEND_BUFFER: Final = 128 << 10
 """Bytes that may wait in the system, a twentieth of a second on a link of 20 Mbit/s."""
 
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
-"""asm-generic/socket.h: past rmem_max, for who may administer the network."""
+"""asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
 
 TRIES: Final = 32
 """Tries to find two free ports side by side."""
@@ -34,9 +34,9 @@ class Endpoint(NamedTuple):
     """An address with its kind.
 
     Attributes:
-        family: of sockets.
+        family: family of the sockets.
         host: a number, not a name.
-        port: of RTP; RTCP has the next one.
+        port: port of RTP; RTCP has the next one.
     """
 
     family: socket.AddressFamily
@@ -103,7 +103,7 @@ class SocketPair:
 
     @classmethod
     def listening(cls, at: Endpoint) -> SocketPair:
-        """Return those that a receiver has; a group is joined.
+        """Return the sockets of a receiver; a multicast group is joined.
 
         Raises:
             OSError: the port is in use, or there is no such address here.
@@ -124,7 +124,7 @@ class SocketPair:
 
     @classmethod
     def waiting(cls, at: Endpoint) -> SocketPair:
-        """Return those of who asks to be sent to: an even port of an address, and the next one.
+        """Return sockets to be sent to: an even port of an address, and the next one.
 
         Raises:
             OSError: no ports are free.
@@ -142,7 +142,7 @@ class SocketPair:
 
     @classmethod
     def sending(cls, to: Endpoint, ttl: int) -> SocketPair:
-        """Return those that a sender has.
+        """Return the sockets of a sender.
 
         Raises:
             OSError: no ports are free.
@@ -172,11 +172,11 @@ class SocketPair:
         rtcp: Callable[[bytes, tuple[Any, ...]], None],
         read: Callable[[], None] = lambda: None,
     ) -> None:
-        """Call for each datagram, with who sent it, until :meth:`close`.
+        """Call for each datagram, with its sender, until :meth:`close`.
 
         Args:
-            rtp: for those of the stream; None: they are not read.
-            rtcp: for reports.
+            rtp: receiver of the stream's packets; None: they are not read.
+            rtcp: receiver of reports.
             read: after those that came together.
         """
         for one, take in ((self.rtp, rtp), (self.rtcp, rtcp)):

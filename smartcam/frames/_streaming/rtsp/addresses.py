@@ -20,7 +20,7 @@ class RtspTarget(NamedTuple):
 
     Attributes:
         base: the stream's URL as its client writes it, without the slash at its end.
-        name: of the stream.
+        name: name of the stream.
         track: whether its track is meant, and not the stream as a whole.
     """
 

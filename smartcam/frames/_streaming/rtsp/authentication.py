@@ -30,7 +30,7 @@ class Authentication:
 
     Args:
         user: None: everybody may.
-        password: of the user.
+        password: password of the user.
         basic: whether the password may come as it is, for clients that know no Digest.
 
     Raises:

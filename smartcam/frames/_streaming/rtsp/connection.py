@@ -58,7 +58,7 @@ class ConnectionOwner(Protocol):
         ...
 
     def leave(self, connection: RtspConnection) -> None:
-        """Forget one that is closed."""
+        """Forget a connection that is closed."""
         ...
 
     def served(self, connection: RtspConnection) -> None:
@@ -156,7 +156,7 @@ class RtspConnection(asyncio.Protocol):
     # what others ask of it
 
     def close(self, why: str = "") -> None:
-        """End it when what was written is taken, or shortly after. Idempotent."""
+        """End the connection when all written bytes are taken, or shortly after. Idempotent."""
         self._end_sessions(why)
         if self._closing:
             return
@@ -166,7 +166,7 @@ class RtspConnection(asyncio.Protocol):
         self._cut = loop.call_later(CLOSE_TIMEOUT, self.transport.abort)
 
     def abort(self) -> None:
-        """End it at once."""
+        """End the connection at once."""
         self._closing = True
         self.transport.abort()
 
@@ -176,13 +176,13 @@ class RtspConnection(asyncio.Protocol):
         return bool(self.sessions) or self._serving
 
     def turn_away(self, why: str) -> None:
-        """End it at once, to make room or since it has no session in time."""
+        """End the connection at once, to make room or since it has no session in time."""
         _log.info("= %s: connection closed: %s", self.peer, why)
         self.abort()
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Answer, while in here, a request of somebody who may look."""
+        """Mark a viewer's request as being answered, as long as the block runs."""
         self._serving = True
         try:
             yield
@@ -242,7 +242,7 @@ class RtspConnection(asyncio.Protocol):
         """Return the next message.
 
         Raises:
-            RtspError: what came is none, or half of one.
+            RtspError: no request came, or half of one.
         """
         now = asyncio.get_running_loop().time
         half_since: float | None = None

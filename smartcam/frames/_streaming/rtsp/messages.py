@@ -41,9 +41,9 @@ class RtspError(Exception):
     """A request that is answered with an error.
 
     Args:
-        status: of RFC 2326, section 7.1.1.
+        status: status of RFC 2326, section 7.1.1.
         text: why, for people; the body of the answer.
-        headers: of the answer.
+        headers: headers of the answer.
         fatal: nothing more can be cut from these bytes.
     """
 
@@ -91,7 +91,7 @@ def answer(
 class RequestParser:
     """Cuts requests and packets from bytes that come in any pieces.
 
-    What is held is bounded by :data:`ROOM` and by what one feeds before one takes.
+    It holds at most :data:`ROOM` bytes and those that were fed since the last call of next.
     """
 
     def __init__(self) -> None:
@@ -118,7 +118,7 @@ class RequestParser:
         """Return the next whole message; None: it is not there yet.
 
         Raises:
-            RtspError: it can be none; a fatal one.
+            RtspError: they can be no request; the error is fatal.
         """
         while self._start is None:
             if self._data[:1] == b"$":

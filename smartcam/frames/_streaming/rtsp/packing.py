@@ -44,10 +44,10 @@ class PacketNumbers:
     """Numbers of one viewer's packets.
 
     Attributes:
-        ssrc: of the stream, as the viewer has it.
-        sequence: of the next packet.
+        ssrc: SSRC of the stream, as the viewer has it.
+        sequence: number of the next packet.
         packets: made since the beginning.
-        octets: of their payloads.
+        octets: bytes of the packets' payloads.
     """
 
     def __init__(self) -> None:

@@ -13,11 +13,11 @@ def describe(
     """Return the description of one stream of H.264.
 
     Args:
-        name: of the stream.
+        name: name of the stream.
         host: the server's own address.
         session: a number, another one for another description.
         sets: the sequence's and the picture's parameters.
-        payload_type: of its packets.
+        payload_type: payload type of its packets.
         rate: frames a second.
     """
     kind = "IP6" if ":" in host else "IP4"

@@ -65,8 +65,8 @@ class RtspServer(Server):
         max_viewers: sessions of all connections at a time.
 
     Raises:
-        ConfigurationError: no sources, a name that is none, user without password, or a number out
-            of its range.
+        ConfigurationError: no sources, a name that is not valid, user without password, or a number
+            out of its range.
     """
 
     def __init__(

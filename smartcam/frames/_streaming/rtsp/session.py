@@ -69,7 +69,7 @@ class RtspSession:
 
     @property
     def ssrc(self) -> int:
-        """Of its packets."""
+        """SSRC of the session's packets."""
         return self._numbering.ssrc
 
     def start(self, delivery: PacketDelivery) -> None:
@@ -111,7 +111,7 @@ class RtspSession:
         self._heard_at = self._loop.time()
 
     def take_rtcp(self, data: bytes) -> None:
-        """Hear what the client reports; what is none is left."""
+        """Hear what the client reports; other bytes are ignored."""
         try:
             reports = parse_rtcp(data)
         except MessageError:

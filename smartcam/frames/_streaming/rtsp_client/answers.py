@@ -30,11 +30,11 @@ _BEGINS: Final = re.compile(
     rb"\$|RTSP/\d|(?:ANNOUNCE|GET_PARAMETER|OPTIONS|PAUSE|REDIRECT|SET_PARAMETER|TEARDOWN) "
 )
 
-LONGEST_BEGIN: Final = 16
+MAX_BEGIN_BYTES: Final = 16
 """Bytes by which it is known that a message begins, at most."""
 
 USUAL_CHANNELS: Final = range(4)
-"""Channels that packets are believed to be of when they follow what is none."""
+"""Channels that packets are believed to be of when they follow bytes that belong to no packet."""
 
 
 class ServerAnswer(NamedTuple):
@@ -96,7 +96,7 @@ class AnswerParser:
         """Return the next whole message; None: it is not there yet.
 
         Raises:
-            MessageError: too much of what is none, or more than there is room for.
+            MessageError: too many bytes that belong to no message, or more than there is room for.
         """
         while self._head is None:
             if not self._skip_strays():
@@ -124,7 +124,7 @@ class AnswerParser:
     def _begins(self) -> bool | None:
         """Return True if a message begins; None: bytes that looked like one were thrown away."""
         found = _BEGINS.search(self._data)
-        gone = found.start() if found else max(0, len(self._data) - LONGEST_BEGIN)
+        gone = found.start() if found else max(0, len(self._data) - MAX_BEGIN_BYTES)
         if gone:
             self._strays += len(self._data[:gone].strip(b"\r\n\0 "))
             del self._data[:gone]
@@ -176,7 +176,7 @@ class AnswerParser:
 def _message(
     line: bytes, headers: Mapping[str, Sequence[str]]
 ) -> ServerAnswer | ServerRequest | None:
-    """Return the message that a first line begins; None: the line is none."""
+    """Return the message that a first line begins; None: the line begins no message."""
     if (found := _ANSWER.match(line)) is not None:
         reason = (found[2] or b"").decode("latin-1").strip()
         return ServerAnswer(int(found[1]), reason, headers)

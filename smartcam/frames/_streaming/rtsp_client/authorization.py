@@ -25,7 +25,7 @@ class Challenge(NamedTuple):
     """The way in which a server wants the password.
 
     Attributes:
-        scheme: in small letters.
+        scheme: name in small letters.
         parts: what it says, by names in small letters.
     """
 
@@ -70,7 +70,7 @@ class Credentials:
 
     Args:
         user: "": none.
-        password: of the user.
+        password: password of the user.
     """
 
     def __init__(self, user: str, password: str) -> None:

@@ -48,8 +48,8 @@ class ConversationPlan(NamedTuple):
     """Whom to ask, and for what.
 
     Attributes:
-        name: of the source, for errors.
-        url: with user and password.
+        name: name of the source, for errors.
+        url: URL with user and password.
         timeout: seconds until it plays, and for each answer after that.
         transports: ``tcp`` and ``udp``, in the order in which they are tried.
         elsewhere: whether a redirect to another host or port is followed.
@@ -118,7 +118,7 @@ class RtspConversation:
             raise plan.wrong(f"cannot be read: {why(exc)}") from None
 
     async def play(self) -> None:
-        """Have it play, and keep the session alive until :meth:`close`.
+        """Have the camera play, and keep the session alive until :meth:`close`.
 
         Raises:
             FrameSourceError: it refuses, or is silent.
@@ -321,7 +321,7 @@ class RtspConversation:
                 async with asyncio.timeout(min(self._plan.timeout, self._timeout)):
                     answer = await self.link.ask(method, self._aggregate, self._headers())
             except TimeoutError:
-                continue  # some do not answer while they play, and the packets tell who is gone
+                continue  # some do not answer while they play; packets show a dead one
             except FrameSourceError as error:
                 self.link.fail(str(error).removeprefix(f"{self._plan.name}: "))
                 return

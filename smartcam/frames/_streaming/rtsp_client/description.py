@@ -29,11 +29,11 @@ class VideoTrack(NamedTuple):
     """A stream of video.
 
     Attributes:
-        payload_type: of its packets.
+        payload_type: payload type of its packets.
         encoding: name of the encoding, in capital letters; "": none.
         control: where to ask for it, as it stands there; "": where one asked for the description.
-        parameters: of its encoding (fmtp), by names in small letters.
-        size: of the pictures where the description says so; None: it does not.
+        parameters: parameters of its encoding (fmtp), by names in small letters.
+        size: size of the pictures where the description says so; None: it does not.
         secure: whether its packets are encrypted (SRTP).
     """
 
@@ -62,7 +62,7 @@ class StreamDescription(NamedTuple):
 
     Attributes:
         control: where to ask for all streams together, as it stands there; "": nowhere.
-        tracks: of video.
+        tracks: tracks of video.
         others: kinds of the other streams, such as audio.
     """
 

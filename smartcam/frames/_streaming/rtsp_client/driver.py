@@ -204,7 +204,7 @@ class _Playing:
         conversation.link.on_end = self._over
 
     async def begin(self) -> None:
-        """Have it play, and decode what comes."""
+        """Have the camera play, and decode its packets."""
         await self._decoding.begin(self._receiver)
         await self._conversation.play()
         if self._watched:

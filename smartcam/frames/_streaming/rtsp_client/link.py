@@ -30,7 +30,7 @@ MAX_REFUSALS: Final = 3
 """Refusals of one request for its password, such as by a nonce that is too old."""
 
 MAX_UNANSWERED: Final = 32
-"""Requests without an answer that are remembered, for theirs may come late."""
+"""Unanswered requests that are remembered, since their answers may come late."""
 
 _ALLOWED: Final = ("GET_PARAMETER", "OPTIONS", "SET_PARAMETER")
 _ENDING: Final = ("REDIRECT", "TEARDOWN")
@@ -40,8 +40,8 @@ class RtspLink(asyncio.Protocol):
     """A connection to a server; one task asks, and packets are handed on as they come.
 
     Args:
-        name: of the source, for errors.
-        credentials: what to show who asks for a password.
+        name: name of the source, for errors.
+        credentials: name and password, for a server that asks for them.
 
     Attributes:
         on_packet: takes a channel and a packet.
@@ -96,7 +96,7 @@ class RtspLink(asyncio.Protocol):
         return socket.AF_INET6 if ":" in str(self.peer[0]) else socket.AF_INET
 
     def fail(self, why: str) -> None:
-        """End it for a reason that :attr:`on_end` is told."""
+        """End the link for a reason that :attr:`on_end` is told."""
         self._end(why)
 
     def _of_socket(self, what: str) -> Any:
@@ -161,12 +161,12 @@ class RtspLink(asyncio.Protocol):
         return True
 
     def close(self) -> None:
-        """End it, when what was written is taken; nothing is handed on any more. Idempotent."""
+        """End the link when all written bytes are taken; nothing is handed on now. Idempotent."""
         self.on_packet, self.on_read, self.on_end = _ignore, _ignore, _ignore
         self._end("it was closed")
 
     def abort(self) -> None:
-        """End it at once. Idempotent."""
+        """End the link at once. Idempotent."""
         self.close()
         if self._transport is not None:
             self._transport.abort()
@@ -191,7 +191,7 @@ class RtspLink(asyncio.Protocol):
         self.on_read()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Tell whoever waits for an answer that none comes."""
+        """Fail all calls that wait for an answer."""
         why = getattr(exc, "strerror", None) if exc is not None else None
         self._end(f"the connection is lost: {why}" if why else "the server closed the connection")
 
@@ -214,7 +214,7 @@ class RtspLink(asyncio.Protocol):
             self._waiting[1].set_result(answer)
 
     def _requested(self, request: ServerRequest) -> None:
-        """ServerAnswer what a server asks; some see whether somebody is there."""
+        """Answer a server's request; some ask whether the client is still there."""
         known = request.method in (*_ALLOWED, *_ENDING)
         cseq = next(iter(request.headers.get("cseq", ())), "0")[:16]
         said = "200 OK" if known else "501 Not Implemented"

@@ -39,8 +39,8 @@ class ChannelWays:
 
     Args:
         link: the connection.
-        channels: of packets, and of reports.
-        payload_type: of the stream's packets.
+        channels: channels of packets and of reports.
+        payload_type: payload type of the stream's packets.
     """
 
     def __init__(self, link: RtspLink, channels: tuple[int, int], payload_type: int) -> None:

@@ -93,7 +93,7 @@ class CameraKind:
         raw_request: id of a request that is answered by something, None where there is none.
         foreign_request: an id of another kind than the protocol's.
         silent_request: id of a request that the camera leaves without an answer, None where there
-            is none; unused where there are result codes.
+            is not valid; unused where there are result codes.
         datagrams: True if messages may be lost, and nobody is told that the camera is gone.
         exclusive: True if a second client takes the camera from the first.
         has_zero: True if an application may have the id 0.

@@ -35,7 +35,7 @@ CHECK_TIMEOUT = 60.0
 """Seconds of a whole check."""
 
 GRACE_STEPS = 100
-"""Steps of the loop that what was cancelled gets to end itself."""
+"""Steps of the loop in which a cancelled task has to end."""
 
 
 def in_a_loop(

@@ -47,7 +47,7 @@ REFUSALS = (LocalProtocolError, UnsupportedError, ConfigurationError)
 ENOUGH = 1000
 """Messages after which bytes without an end are messages."""
 
-HIDDEN = 2
+MAX_HIDDEN_FACTOR = 2
 """Largest memory of a machine for bytes that wait, in multiples of the bound, events apart."""
 
 
@@ -136,7 +136,7 @@ class MachineChecks(Parameters):
         strategies.each_drawn(check)
 
     def test_end_of_the_link_is_told_once(self, stream: Conversation) -> None:
-        """Wherever it ends, in the middle of an answer as well; then nothing is read any more."""
+        """Check an end anywhere, also within an answer; nothing is read after it."""
         for place, halves in _places(stream):
             player = Player(self.protocol, stream).play(place)
             judge = _Judge(player.machine)
@@ -182,7 +182,9 @@ class MachineChecks(Parameters):
             if messages > ENOUGH:
                 break  # they are messages
         kept = tracemalloc.get_traced_memory()[0] - before
-        assert kept <= HIDDEN * self.max_waiting, f"{where}: the machine has grown by {kept} bytes"
+        assert kept <= MAX_HIDDEN_FACTOR * self.max_waiting, (
+            f"{where}: the machine has grown by {kept} bytes"
+        )
 
     # ------------------------------------------------------------------ requests
 

@@ -40,7 +40,7 @@ class OptionalFeatureChecks(Parameters):
 
     @in_a_loop
     async def test_start_and_stop(self, camera_kind: CameraKind) -> None:
-        """Twice is as good as once."""
+        """Check that start and stop may be called twice."""
         async with visiting(camera_kind) as (_, camera):
             if not camera.capabilities.start_stop:
                 await refused(camera, camera.stop())
@@ -87,7 +87,7 @@ class OptionalFeatureChecks(Parameters):
     async def test_input_that_does_not_fit_is_refused_where_there_are_codes(
         self, camera_kind: CameraKind
     ) -> None:
-        """And nothing of it is left over."""
+        """Check that the input is refused, and that nothing of it is left in the camera."""
         async with visiting(camera_kind) as (_, camera):
             if camera.capabilities.input_data and camera.capabilities.result_codes:
                 needs(camera_kind, ECHO)

@@ -34,7 +34,7 @@ class Parameters(SaysWhatWasExpected):
         """Run a check with each of what it has an argument for; pytest calls it.
 
         Raises:
-            pytest.UsageError: ``protocol`` is none.
+            pytest.UsageError: ``protocol`` is not valid.
         """
         for name in ("dialect", "conversation", "stream", "camera_kind"):
             if name in metafunc.fixturenames:

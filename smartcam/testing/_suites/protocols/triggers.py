@@ -239,7 +239,7 @@ class TriggerChecks(Parameters):
     async def test_next_result_is_the_next_one_whoever_triggers(
         self, camera_kind: CameraKind
     ) -> None:
-        """And a wait for one that does not come ends in time."""
+        """Check that it is, and that a wait for a result that does not come ends in time."""
         async with visiting(camera_kind) as (live, camera):
             waiting = asyncio.create_task(camera.next_result(timeout=SOON_TIMEOUT))
             await asyncio.sleep(0)
