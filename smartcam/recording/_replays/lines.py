@@ -53,7 +53,7 @@ class LineAnswers:
             after its answer.
         next: index of the answer that is played next, where order decides.
         asked: number of times that the line was said since the moment began.
-        asked_at: that moment.
+        asked_at: moment that `asked` counts in.
     """
 
     given: list[list[TimedLine]] = field(default_factory=list[list[TimedLine]])
