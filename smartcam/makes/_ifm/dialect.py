@@ -222,6 +222,7 @@ class PcicDialect(TicketedDialect):
 
     layout: Layout | None = None
     container: int = 0
+    names_application: bool = False
     make: str = "ifm"
 
     def with_parameters(self, parameters: Mapping[str, str]) -> PcicDialect:
