@@ -66,6 +66,7 @@ _ABILITIES: Mapping[type[m.Message], str] = {
 }
 
 _FIRST_WORD = re.compile(r"\w*")
+_COMMAND_WORD = re.compile(r"\w+\??")
 
 
 class LineRow(NamedTuple):
@@ -274,12 +275,37 @@ class LineDialect(Dialect):
         Raises:
             UnsupportedError: how another line is answered is not known.
             ConfigurationError: it is no line that can be sent.
+            LocalProtocolError: it triggers, and nothing in its answer would tell whose trigger.
         """
         if self.row(LineCommand) is None or not isinstance(message_id, str):
             raise UnsupportedError(f"dialect {self.name}: there are no other requests")
         line = self.command(message_id + payload.decode(self.encoding, "replace"))
         self.pack(line, "")
-        return RawRequest(LineCommand(line=line), LineReply, answered=True, known=True)
+        message = LineCommand(line=line)
+        twin = self._twin(message)
+        if twin is not None and twin.request in {m.Trigger, m.EndTrigger} and not self.tickets:
+            raise LocalProtocolError(
+                f"{self.make or self.name}: {line[:32]!r} is the client's own: its result could "
+                "not be told from a trigger's; call trigger()"
+            )
+        answered = twin is None or twin.answer is not None
+        return RawRequest(message, LineReply, answered=answered, known=True)
+
+    def _twin(self, message: LineCommand) -> LineRow | None:
+        """Return the row of a request of the client's own that says the same command."""
+        word = _command_word(message.line)
+        own = (row for row in self.rows if row.request not in {None, LineCommand})
+        return next((row for row in own if _command_word(row.line) == word), None)
+
+    def row_of(self, message: m.Message) -> LineRow | None:
+        """Return the row by which a message is said; a user's line is answered as its twin is."""
+        row = self.row(type(message))
+        twin = self._twin(message) if isinstance(message, LineCommand) else None
+        if row is None or twin is None:
+            return row
+        answer = None if twin.answer is None else row.answer
+        word = None if twin.script is not None else twin.word
+        return row._replace(answer=answer, word=word, echo=twin.echo, until=twin.until)
 
     def body(self, answer: m.Message) -> bytes:
         """Return the bytes of the answer to a line of the user's own.
@@ -302,6 +328,12 @@ class LineDialect(Dialect):
 def _first_word(line: str) -> str:
     found = _FIRST_WORD.match(line)
     return "" if found is None else found[0]
+
+
+def _command_word(line: str) -> str:
+    """Return the word that says what a line does, "PROGRAM?" being another one than "PROGRAM"."""
+    found = _COMMAND_WORD.match(line)
+    return line if found is None else found[0]
 
 
 def _one_line(row: LineRow, line: str) -> Script:
@@ -387,8 +419,7 @@ class LineMachine:
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)
         self._marks = trigger is not None and trigger.answer is m.ResultContainer
-        query = None if dialect.names_application else dialect.row(m.Query)
-        self._query = query and query._replace()  # a row of its own: a client's may be open, too
+        self._query = None if dialect.names_application else dialect.row(m.Query)
         self._held = HeldResults()
         self._outbox: list[bytes] = []
 
@@ -557,6 +588,7 @@ class LineMachine:
             return
         number = self._held.ask(trigger=trigger)
         self._begin(self._query, m.Query(), question=number)
+
     def _end(self, state: State, event: Event) -> None:
         """Say and read nothing more; tell the reason last."""
         self.state = state
@@ -586,12 +618,12 @@ class LineMachine:
             if self.state in {State.CONNECTING, State.CONNECTED}:
                 self.state = State.DISCONNECTED
             return
-        row = self.dialect.row(kind)
+        row = self.dialect.row_of(message)
         if row is None or self.state is not (State.IDLE if kind is m.Connect else State.CONNECTED):
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        if any(row is one.row for one in self._asked):
+        if any(row.request is one.row.request and not one.question for one in self._asked):
             if kind is m.GetStatus:
                 return
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")

@@ -40,7 +40,10 @@ async def switching(
 async def test_ifm_trigger_never_returns_a_result_of_another_application(
     named: int | None, listens: bool
 ) -> None:
-    async with switching(application=named) as (active, peer, camera), contextlib.AsyncExitStack() as on:
+    async with (
+        switching(application=named) as (active, peer, camera),
+        contextlib.AsyncExitStack() as on,
+    ):
         results = await on.enter_async_context(camera.results()) if listens else None
         trigger = asyncio.create_task(camera.trigger(timeout=PATIENCE))
         ticket, line = await peer.requests.get()
