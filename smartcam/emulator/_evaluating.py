@@ -131,6 +131,12 @@ class EvaluatingCamera(LineCamera):
 
     # ------------------------------------------------------------------ evaluations
 
+    async def start(self) -> None:
+        """Open the port, and evaluate by itself where the active application does so."""
+        await super().start()
+        if not self.busy:
+            self.activated()
+
     @property
     def evaluation_time(self) -> float:
         """Seconds of an evaluation."""
