@@ -155,6 +155,11 @@ class EvaluatingCamera(LineCamera):
     def activated(self) -> None:
         """Note that an application is active, or is again; nothing unless overridden."""
 
+    def _ends(self) -> None:
+        """Forget the evaluation under way, as a device does whose power is gone."""
+        super()._ends()
+        self.busy, self._call, self._run = False, None, self._run + 1
+
     def begin(self, call: LineClient | None) -> None:
         """Begin an evaluation, which is the answer to a request or nobody's."""
         self.busy, self._run, self._call = True, self._run + 1, call

@@ -35,7 +35,7 @@ from smartcam.backoff import Backoff
 from smartcam.camera import Camera
 from smartcam.emulator import LineClient
 from smartcam.emulator._inside import MESSAGE_NAMES
-from smartcam.exceptions import SmartCamError, WrongApplicationError
+from smartcam.exceptions import InterpretationError, SmartCamError, WrongApplicationError
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Result
 from smartcam.protocols import messages as m
@@ -205,6 +205,10 @@ class Bench:
                 last = exc
                 with contextlib.suppress(SmartCamError):  # as a user who is told of it does
                     await self.camera.switch_application(HOME, timeout=PATIENCE)
+            except InterpretationError as exc:
+                last = exc
+                if self.garbled:  # the layout, which a device keeps for the session
+                    await self.renew()
             except SmartCamError as exc:
                 last = exc
                 await asyncio.sleep(0.05)
