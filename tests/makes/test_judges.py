@@ -48,7 +48,7 @@ class _Anywhere(SimpleXMLRPCRequestHandler):
     def is_rpc_path_valid(self) -> bool:
         return True
 
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002 - its name
+    def log_message(self, format: str, *args: object) -> None:
         pass
 
 

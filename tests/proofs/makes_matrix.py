@@ -38,7 +38,6 @@ from smartcam.emulator._inside import MESSAGE_NAMES
 from smartcam.exceptions import InterpretationError, SmartCamError, WrongApplicationError
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Result
-from smartcam.protocols import messages as m
 from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import _rules as rules
 from tests.client.clientkit import imbalances, loop_reports
