@@ -36,7 +36,7 @@ class Remarks:
         self._kinds: dict[str, _Logged] = {}
 
     def log(self, kind: str, level: int, text: str, *values: object, now: float) -> None:
-        """Log a line unless there were enough of its kind; say then how many were left out.
+        """Log a line unless there were enough of its kind; later log how many were left out.
 
         Args:
             kind: name of the kind, for people.
@@ -57,7 +57,7 @@ class Remarks:
             logger.log(level, more, self._name, kind, PERIOD, MAX_REMARKS)
 
     def end(self) -> None:
-        """Say what was left out, since the session is over."""
+        """Log how many lines were left out, since the session is over."""
         for kind, found in self._kinds.items():
             self._tell_left_out(kind, logging.WARNING, found)
         self._kinds.clear()

@@ -28,7 +28,7 @@ MAX_HELD_BYTES = 1 << 26
 
 @dataclass(slots=True, eq=False)
 class _Held:
-    """What one answer or one line became, with a result in it.
+    """Messages of one answer or one line, with a result among them.
 
     Attributes:
         messages: what is told.
@@ -99,7 +99,7 @@ class HeldResults:
         """Take the application that the camera says is active now.
 
         Args:
-            application: its id.
+            application: id of the application.
             question: number of the question that this answers, 0 for one that was not put here.
 
         Returns:

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from smartcam.testing.proxy import _rules as rules
 from tests.proofs import makes_matrix
 from tests.proofs.makes_matrix import (
     CALLS,
@@ -40,7 +39,7 @@ def judged(cell: Cell) -> list[str]:
 
 
 def cut(make: str, call: str = "trigger") -> Cell:
-    return Cell(make, call, "cut", lambda bench: bench.proxy.from_now(rules.Cut(at=3)))
+    return Cell(make, call, "cut", lambda bench: bench.proxy.from_now(makes_matrix.rules.Cut(at=3)))
 
 
 @pytest.mark.parametrize("make", MAKES)

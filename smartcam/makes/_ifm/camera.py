@@ -257,7 +257,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"A\?")
     def _apps(self, call: IfmClient) -> str:
-        """Tell how many applications there are, the active one, and all their numbers."""
+        """Tell the count of applications, the active one, and all their numbers."""
         numbers = [f"{len(self.applications):03}", f"{self.active:02}"]
         return "\t".join([*numbers, *(f"{one:02}" for one in self.applications)])
 
@@ -276,7 +276,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     @request(r"S\?")
     def _stats(self, call: IfmClient) -> str:
-        """Tell how many results there were, how many of them good, and how many bad."""
+        """Tell the counts of all results, of the good ones, and of the bad ones."""
         counts = (self.results, self.good, self.results - self.good)
         return "\t".join(f"{one:010}" for one in counts) if self.active else "!"
 

@@ -181,7 +181,7 @@ def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
 
 
 def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, ...]:
-    """Return what is said; without lengths no pictures, without tickets nothing unasked."""
+    """Return the rows; without lengths no pictures, without tickets nothing unasked."""
     error = _error if trigger.answer is m.ResultContainer else _error_or_overrun
     said = (
         LineRow(None, "results", m.ResultContainer, _result, word=RESULTS),
