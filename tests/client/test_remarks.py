@@ -9,40 +9,54 @@ import pytest
 
 import smartcam
 from smartcam import NoticeReceived
-from smartcam._client.remarks import MAX_REMARKS, PERIOD, Remarks
 from smartcam.makes import EmulatedIfm
 from tests.makes.test_ifm import PATIENCE, by_hand
 
 FLOOD = 1000
+MAX_LINES = 20
+"""Lines of a kind that are logged in each minute."""
 
 
-def test_lines_of_a_kind_have_a_bound_in_each_period(caplog: pytest.LogCaptureFixture) -> None:
+def said(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the lines about what the camera says, and about what of it was left out."""
+    return [one for one in caplog.messages if "the camera says" in one or "of the kind" in one]
+
+
+@pytest.mark.asyncio
+async def test_lines_of_a_kind_have_a_bound_in_each_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     caplog.set_level(logging.INFO, "smartcam.client")
-    remarks = Remarks("left")
-    for number in range(FLOOD):
-        remarks.log("notice error", logging.WARNING, "! error %d", number, now=0.01 * number)
-    remarks.log("heat", logging.WARNING, "! hot", now=1.0)
-    lines = [one.getMessage() for one in caplog.records]
-    assert lines[:2] == ["left ! error 0", "left ! error 1"]
-    assert len(lines) == MAX_REMARKS + 2
-    assert "more of the kind 'notice error'" in lines[-2]
-    assert lines[-1] == "left ! hot"
-    caplog.clear()
-    remarks.log("notice error", logging.WARNING, "! error %d", FLOOD, now=PERIOD)
-    assert [one.getMessage() for one in caplog.records] == [
-        f"left ! {FLOOD - MAX_REMARKS} of the kind 'notice error' were not logged",
-        f"left ! error {FLOOD}",
-    ]
+    async with by_hand(liveness_timeout=None) as (peer, camera):
+        for number in range(FLOOD):
+            peer.say("0001", b"%09d:short circuit" % number)
+        peer.say("0010", b"000500002:{}")
+        await camera.query_application()
+        lines = said(caplog)
+        assert lines[0].endswith("! the camera says: error 0: short circuit")
+        assert len(lines) == MAX_LINES + 2
+        assert "more of the kind 'notice error' in 60 s than are logged: 20" in lines[-2]
+        assert lines[-1].endswith("notification 500002: {}")
+        caplog.clear()
+        await asyncio.sleep(60)
+        peer.say("0001", b"000000007:short circuit")
+        await camera.query_application()
+        left_out, line = said(caplog)
+        assert left_out.endswith(
+            f"! {FLOOD - MAX_LINES} of the kind 'notice error' were not logged"
+        )
+        assert line.endswith("error 7: short circuit")
 
 
-def test_end_of_a_session_says_what_was_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    remarks = Remarks("left")
-    for _ in range(MAX_REMARKS + 3):
-        remarks.log("heat", logging.WARNING, "! hot", now=0.0)
-    caplog.clear()
-    remarks.end()
-    remarks.end()
-    assert caplog.messages == ["left ! 3 of the kind 'heat' were not logged"]
+@pytest.mark.asyncio
+async def test_end_of_a_session_says_what_was_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    async with by_hand() as (peer, camera):
+        for _ in range(MAX_LINES + 3):
+            peer.say("0001", b"110002001:short circuit")
+        await camera.query_application()
+        caplog.clear()
+    (line,) = said(caplog)
+    assert line.endswith("! 3 of the kind 'notice error' were not logged")
 
 
 @pytest.mark.asyncio
@@ -56,8 +70,7 @@ async def test_camera_that_floods_floods_no_log_and_is_counted(
             peer.say("0010", b"000500002:{}")
         await camera.query_application()
         assert camera.statistics().notices == 2 * FLOOD
-        said = [one for one in caplog.messages if "the camera says" in one]
-        assert len(said) == 2 * MAX_REMARKS
+        assert len(said(caplog)) == 2 * MAX_LINES + 2
 
 
 @pytest.mark.asyncio
