@@ -11,7 +11,7 @@ MAX_REMARKS = 20
 """Lines of one kind that a camera may cause in each period."""
 
 PERIOD = 60.0
-"""Seconds."""
+"""Seconds in which the lines of a kind are counted together."""
 
 
 @dataclass(slots=True, eq=False)
