@@ -73,11 +73,11 @@ class HeldResults:
             FrameError: too much waits for an answer.
         """
         results = [one for one in messages if isinstance(one, m.ResultContainer)]
+        seen = set[int]() if self._named is None else {self._named}
+        if answers_trigger and self._seen is not None:
+            seen, self._seen = self._seen, None
         if results:
-            named = set[int]() if self._named is None else {self._named}
-            seen, size = named, sum(len(one.data) for one in results)
-            if answers_trigger and self._seen is not None:
-                seen, self._seen = self._seen, None
+            size = sum(len(one.data) for one in results)
             self._waiting.append(_Held(messages, size, self._asked + 1, self._front, seen))
             self._size += size
         elif self._waiting:
