@@ -34,14 +34,14 @@ import smartcam
 from smartcam.backoff import Backoff
 from smartcam.camera import Camera
 from smartcam.emulator import LineClient
-from smartcam.emulator._inside import MESSAGE_NAMES
 from smartcam.exceptions import InterpretationError, SmartCamError, WrongApplicationError
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Result
+from smartcam.protocols import BVS
 from smartcam.testing import LinkProxy
-from smartcam.testing.proxy import _rules as rules
 from tests.client.clientkit import imbalances, loop_reports
 from tests.makes.cameras import IV3_NUMBERS
+from tests.proofs.matrix_cells import rules
 from tests.timed_loop import TimedLoop
 
 HOME, AWAY = 1, 2
@@ -334,7 +334,8 @@ async def link_cells(make: str, call: str) -> list[Cell]:
 def frame_cells(make: str, call: str) -> Iterator[Cell]:
     """Give each fault of each kind of answer."""
     dialect = next(iter(MAKES[make].camera().protocol.dialects.values()))
-    answers = {row.answer.__name__ for row in dialect.rows if row.answer} & MESSAGE_NAMES.keys()
+    known = {row.type.__name__ for one in BVS.dialects.values() for row in one.table}
+    answers = known & {row.answer.__name__ for row in dialect.rows if row.answer}
     for kind, (fault, given) in itertools.product(sorted(answers), FRAMES.items()):
         what = {"kind": fault, "on": kind, **given}
 
