@@ -143,7 +143,7 @@ class EvaluatingCamera(LineCamera):
         raise NotImplementedError
 
     def evaluated(self, call: LineClient | None, part: Any) -> None:
-        """Tell the values of a part to the client that has asked for them, if any, and to others."""
+        """Tell the values of a part to the client that has asked for them, and to others."""
         raise NotImplementedError
 
     def voided(self, call: LineClient) -> None:
