@@ -56,7 +56,7 @@ class _Anywhere(SimpleXMLRPCRequestHandler):
 def parameters() -> Iterator[int]:
     """Answer the question for a device's type; give the port."""
     server = SimpleXMLRPCServer(("127.0.0.1", 0), _Anywhere)
-    server.register_function({"DeviceType": "1:2"}.__getitem__, "getParameter")
+    server.register_function(lambda name: {"DeviceType": "1:2"}[name], "getParameter")
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     yield server.server_address[1]

@@ -38,10 +38,9 @@ from smartcam.exceptions import InterpretationError, SmartCamError, WrongApplica
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.models import Result
 from smartcam.protocols import BVS
-from smartcam.testing import LinkProxy
+from smartcam.testing import LinkProxy, proxy
 from tests.client.clientkit import imbalances, loop_reports
 from tests.makes.cameras import IV3_NUMBERS
-from tests.proofs.matrix_cells import rules
 from tests.timed_loop import TimedLoop
 
 HOME, AWAY = 1, 2
@@ -256,9 +255,9 @@ async def bench_of(make: str) -> AsyncIterator[Bench]:
     """Put up a bench whose client is not open."""
     async with (
         MAKES[make].camera() as emulator,
-        LinkProxy(emulator.host, emulator.port) as proxy,
+        LinkProxy(emulator.host, emulator.port) as link,
     ):
-        bench = Bench(make, emulator, proxy)
+        bench = Bench(make, emulator, link)
         try:
             yield bench
         finally:
@@ -285,7 +284,7 @@ class Cell(NamedTuple):
         return f"{self.make}, {self.call}: {self.fault}"
 
 
-def _with_rule(rule: rules.Rule, *, garbles: bool = False) -> Callable[[Bench], None]:
+def _with_rule(rule: proxy.Rule, *, garbles: bool = False) -> Callable[[Bench], None]:
     def arm(bench: Bench) -> None:
         bench.garbled = bench.garbled or garbles
         bench.proxy.from_now(rule)
@@ -293,14 +292,14 @@ def _with_rule(rule: rules.Rule, *, garbles: bool = False) -> Callable[[Bench], 
     return arm
 
 
-LINKS: dict[str, Callable[[Any, int], tuple[rules.Rule, bool]]] = {
-    "cut": lambda way, at: (rules.Cut(direction=way, at=at), False),
-    "reset": lambda way, at: (rules.ResetConnection(direction=way, at=at), False),
-    "silent": lambda way, at: (rules.Stall(direction=way, at=at, both=True), False),
-    "split": lambda way, at: (rules.SplitBytes(direction=way, at=at, pause=0.01), False),
-    "flip": lambda way, at: (rules.Flip(direction=way, at=at, mask=1), True),
-    "lost byte": lambda way, at: (rules.DropBytes(direction=way, at=at), True),
-    "twice": lambda way, at: (rules.DuplicateBytes(direction=way, at=at), True),
+LINKS: dict[str, Callable[[Any, int], tuple[proxy.Rule, bool]]] = {
+    "cut": lambda way, at: (proxy.Cut(direction=way, at=at), False),
+    "reset": lambda way, at: (proxy.ResetConnection(direction=way, at=at), False),
+    "silent": lambda way, at: (proxy.Stall(direction=way, at=at, both=True), False),
+    "split": lambda way, at: (proxy.SplitBytes(direction=way, at=at, pause=0.01), False),
+    "flip": lambda way, at: (proxy.Flip(direction=way, at=at, mask=1), True),
+    "lost byte": lambda way, at: (proxy.DropBytes(direction=way, at=at), True),
+    "twice": lambda way, at: (proxy.DuplicateBytes(direction=way, at=at), True),
 }
 FRAMES: dict[str, dict[str, Any]] = {
     "drop": {},

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from smartcam.testing import proxy
 from tests.proofs import makes_matrix
 from tests.proofs.makes_matrix import (
     CALLS,
@@ -39,7 +40,7 @@ def judged(cell: Cell) -> list[str]:
 
 
 def cut(make: str, call: str = "trigger") -> Cell:
-    return Cell(make, call, "cut", lambda bench: bench.proxy.from_now(makes_matrix.rules.Cut(at=3)))
+    return Cell(make, call, "cut", lambda bench: bench.proxy.from_now(proxy.Cut(at=3)))
 
 
 @pytest.mark.parametrize("make", MAKES)
