@@ -72,6 +72,7 @@ if TYPE_CHECKING:
         Header,
         Histogram,
         Localization,
+        NoticeReceived,
         Pose,
         Position,
         Quaternion,
@@ -122,6 +123,7 @@ __all__ = [
     "MissingExtraError",
     "NotAllowedError",
     "NotRunningError",
+    "NoticeReceived",
     "Observer",
     "OvertriggeredError",
     "PluginError",
@@ -174,8 +176,8 @@ if not TYPE_CHECKING:
             "exceptions": " ".join(name for name in __all__ if name.endswith("Error")),
             "layout": "Layout",
             "models": "ApplicationChanged CameraEvent Capabilities Connected Disconnected Header "
-            "Histogram Localization Pose Position Quaternion Reconnected Result Statistics Status "
-            "StatusChanged",
+            "Histogram Localization NoticeReceived Pose Position Quaternion Reconnected Result "
+            "Statistics Status StatusChanged",
             "observers": "Observer",
         },
     )

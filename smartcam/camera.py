@@ -392,8 +392,9 @@ class Camera(abc.ABC, Generic[ValueT]):
     ) -> Subscription[CameraEvent]:
         """Subscribe to what happens to the camera, in order.
 
-        The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged`` and
-        ``ApplicationChanged``. Subscribe before :meth:`open` to see the first ones.
+        The events are ``Connected``, ``Disconnected``, ``Reconnected``, ``StatusChanged``,
+        ``ApplicationChanged`` and ``NoticeReceived``. Subscribe before :meth:`open` to see the
+        first ones.
         """
         stream = Subscription[CameraEvent]("events", max_queue=max_queue, overflow=overflow)
         return self._subscribed(self._listeners.events, stream)

@@ -39,6 +39,7 @@ __all__ = [
     "Header",
     "Histogram",
     "Localization",
+    "NoticeReceived",
     "Pose",
     "Position",
     "Quaternion",
@@ -377,6 +378,21 @@ class ApplicationChanged(CameraEvent):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class NoticeReceived(CameraEvent):
+    """The camera has said something that is neither a status nor a result.
+
+    Attributes:
+        kind: ``"error"``, ``"notification"`` or ``"debug"``.
+        code: the camera's number of it, 0 where it has none.
+        text: what the camera says.
+    """
+
+    kind: str
+    code: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SubscriberStatistics:
     """Account of one subscriber: ``offered == taken + dropped + queued``.
 
@@ -460,6 +476,8 @@ class Statistics:
             Waiting for Trigger went away, and not at a trigger of ours. Told over TCP where the
             status comes by itself.
         overtriggers: times the Overtriggered bit rose.
+        notices: errors, notifications and other remarks of the camera's own; the log has the first
+            ones of each minute.
         sessions: sessions made.
         reconnects: sessions made after the first.
         frames_received: whole frames from the camera.
@@ -488,6 +506,7 @@ class Statistics:
     extra_results: int = 0
     inspections_by_others: int = 0
     overtriggers: int = 0
+    notices: int = 0
     sessions: int = 0
     reconnects: int = 0
     frames_received: int = 0

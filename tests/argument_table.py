@@ -530,7 +530,14 @@ TABLE: dict[str, dict[str, str]] = {
 NOT_HERE: dict[str, tuple[str, ...]] = {
     "the package makes these, or a function that is in the table": (
         *("ApplicationChanged", "CameraEvent", "Capabilities", "Connected", "Disconnected"),
-        *("Histogram", "Reconnected", "Statistics", "StatusChanged", "Quaternion"),
+        *(
+            "Histogram",
+            "NoticeReceived",
+            "Reconnected",
+            "Statistics",
+            "StatusChanged",
+            "Quaternion",
+        ),
         *("AgentJoined", "AgentLeft", "CameraJoined", "CameraLeft", "CameraSummary"),
         *(
             "FleetChanges",

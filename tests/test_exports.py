@@ -29,7 +29,8 @@ PUBLIC = [
     "Header", "Histogram", "InputContainerError", "InspectionError", "InterpretationError",
     "Layout",
     "LayoutError", "LinkError", "LocalProtocolError", "Localization", "MessageError",
-    "MissingExtraError", "NotAllowedError", "NotRunningError", "Observer", "OvertriggeredError",
+    "MissingExtraError", "NotAllowedError", "NotRunningError", "NoticeReceived", "Observer",
+    "OvertriggeredError",
     "PluginError",
     "Pose", "Position", "ProtocolError", "Quaternion", "Reconnected", "RecordingError",
     "RemoteProtocolError", "ReservationLostError",
@@ -114,7 +115,7 @@ MAX_PUBLIC = 562
 """Names in all, a name that stands in two places counted once. A third of them are words: messages,
 faults of a camera, rules of a link, errors."""
 
-MAX_AT_THE_TOP = 73
+MAX_AT_THE_TOP = 74
 
 
 def test_top_level_exports_are_pinned() -> None:

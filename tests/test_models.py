@@ -30,6 +30,7 @@ from smartcam.models import (
     Header,
     Histogram,
     Localization,
+    NoticeReceived,
     Pose,
     Position,
     Quaternion,
@@ -188,7 +189,8 @@ def test_statistics_start_at_zero_with_a_list_of_their_own() -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", [Connected, Reconnected, Disconnected, StatusChanged, ApplicationChanged]
+    "kind",
+    [Connected, Reconnected, Disconnected, StatusChanged, ApplicationChanged, NoticeReceived],
 )
 def test_camera_events_have_one_base(kind: type[CameraEvent]) -> None:
     assert issubclass(kind, CameraEvent)

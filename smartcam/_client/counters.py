@@ -61,6 +61,7 @@ class ClientCounters:
         extra_results: containers for a trigger that had its results already.
         inspections_by_others: inspections that something else has triggered.
         overtriggers: times the Overtriggered bit rose.
+        notices: remarks of the camera's own.
         sessions: sessions made.
         last_error: text of the last error of a link.
         round_trip: request to answer, seconds.
@@ -74,6 +75,7 @@ class ClientCounters:
         self.extra_results: int = 0
         self.inspections_by_others: int = 0
         self.overtriggers: int = 0
+        self.notices: int = 0
         self.sessions: int = 0
         self.last_error: str | None = None
         self.round_trip: Times = Times()
@@ -102,6 +104,10 @@ class ClientCounters:
         """Count that the Overtriggered bit rose."""
         self.overtriggers += 1
 
+    def note_notice(self) -> None:
+        """Count a remark of the camera's own."""
+        self.notices += 1
+
     def note_loss(self, error: Exception) -> None:
         """Keep the text of a link's last error."""
         self.last_error = str(error)
@@ -129,6 +135,7 @@ class ClientCounters:
             extra_results=self.extra_results,
             inspections_by_others=self.inspections_by_others,
             overtriggers=self.overtriggers,
+            notices=self.notices,
             sessions=self.sessions,
             reconnects=max(0, self.sessions - 1),
             last_error=self.last_error,

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from smartcam._client.remarks import Remarks
 from smartcam._client.waits import told
 from smartcam.exceptions import ConnectionClosedError
-from smartcam.models import Status, StatusChanged
+from smartcam.models import NoticeReceived, Status, StatusChanged
 from smartcam.protocols import Verdict
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import ResultBurst
@@ -34,10 +35,23 @@ if TYPE_CHECKING:
     from smartcam.protocols import Dialect
     from smartcam.protocols._inside import Event
 
-logger: logging.Logger = logging.getLogger("smartcam.client")
-
 FEWEST_GATHERED = 6
 """Events of a chunk that are worth to be looked through: two results, each between statuses."""
+
+MAX_NOTICE = 4096
+"""Characters of a camera's remark that are kept."""
+
+_LOGGED = (
+    (
+        Status.OVERHEAT,
+        logging.WARNING,
+        "heat",
+        "! the camera is too hot: inspections may get worse",
+    ),
+    (Status.OVERHEAT, logging.INFO, "no heat", "= the camera is no longer too hot"),
+    (Status.SYSTEM_ERROR, logging.ERROR, "System Error", "! the camera reports System Error"),
+)
+"""Bits whose rise is logged, or with INFO their fall."""
 
 _NOTED = int(Status.OVERTRIGGERED | Status.OVERHEAT | Status.SYSTEM_ERROR)
 
@@ -56,6 +70,7 @@ class Dispatch:
 
     def __post_init__(self) -> None:
         self._dialect: Dialect | None = None
+        self._remarks = Remarks(self._name)
         self._notes_events = False  # events are seen although nobody subscribed to them
         self._takers: dict[type[Event], Callable[[Any, float, datetime], None]] = {
             m.StatusReport: self._on_status,
@@ -124,6 +139,7 @@ class Dispatch:
         The first reason stays. Streams go on until :meth:`finish`.
         """
         if self._waits.fail(error):
+            self._remarks.end()
             self._listeners.fail(told(error))
             self._results.fail(told(error))
 
@@ -160,9 +176,13 @@ class Dispatch:
             self._results.on_trigger_answer(now)
 
     def _on_notice(self, notice: m.Notice, now: float, at: datetime) -> None:
+        self._counters.note_notice()
         level = logging.WARNING if notice.kind == "error" else logging.INFO
-        text = "%s ! the camera says: %s %d: %.200s"
-        logger.log(level, text, self._name, notice.kind, notice.code, notice.text)
+        kind, code, text = notice.kind, notice.code, notice.text[:MAX_NOTICE]
+        form = "! the camera says: %s %d: %.200s"
+        self._remarks.log(f"notice {kind}", level, form, kind, code, text, now=now)
+        event = NoticeReceived(camera=self._name, at=at, kind=kind, code=code, text=text)
+        self._listeners.publish(event)
 
     def _on_status(self, report: m.StatusReport, now: float, at: datetime) -> None:
         state, waits, listeners, status = self._state, self._waits, self._listeners, report.status
@@ -170,7 +190,7 @@ class Dispatch:
         previous = state.report(report, waits.answers)
         bits, was = state.bits, previous or 0
         if (bits ^ was) & _NOTED:
-            self._note_changes(bits, was)
+            self._note_changes(bits, was, now)
         self._results.on_status(previous, bits, now)
         if status != before and (self._notes_events or listeners.events.references):
             event = StatusChanged(camera=self._name, at=at, status=status, previous=before)
@@ -179,16 +199,13 @@ class Dispatch:
         if waits.statuses:
             waits.show(status)
 
-    def _note_changes(self, bits: int, was: int) -> None:
+    def _note_changes(self, bits: int, was: int, now: float) -> None:
         risen, fallen = bits & ~was, was & ~bits
         if risen & Status.OVERTRIGGERED:
             self._counters.note_overtrigger()
-        if risen & Status.OVERHEAT:
-            logger.warning("%s ! the camera is too hot: inspections may get worse", self._name)
-        if fallen & Status.OVERHEAT:
-            logger.info("%s = the camera is no longer too hot", self._name)
-        if risen & Status.SYSTEM_ERROR:
-            logger.error("%s ! the camera reports System Error", self._name)
+        for word, level, kind, text in _LOGGED:
+            if (risen if level != logging.INFO else fallen) & word:
+                self._remarks.log(kind, level, text, now=now)
 
 
 def gathered(events: list[Event], endian: int) -> list[Event]:

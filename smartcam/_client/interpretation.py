@@ -201,7 +201,7 @@ class Interpretation:
         way = self._one or self._known(container.application)
         interpreter, simple = way.interpreter, way.simple
         data = container.data
-        if container.cells is not None:
+        if container.cells is not None or container.fault is not None:
             data = _from_cells(container, interpreter)
         if simple is not None and not way.sequenced:
             context = self._context(container.application, endian, camera, number, at)

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._camera import CONDITIONS
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._clock import Clock, RealClock, TimerHandle
+    from smartcam.emulator._evaluating import EvaluatingCamera, applications_of, request
     from smartcam.emulator._generators import Values, find_generator, wrap_number
     from smartcam.emulator._insight.job import InspectedJob
     from smartcam.emulator._inspected import InspectedApplication, InspectionOrder, Inspector
@@ -32,6 +33,7 @@ __all__ = [
     "DelayLine",
     "DeviceFault",
     "Ending",
+    "EvaluatingCamera",
     "HeardLine",
     "InspectedApplication",
     "InspectedJob",
@@ -46,11 +48,13 @@ __all__ = [
     "Transmission",
     "Values",
     "WireCodec",
+    "applications_of",
     "check_options",
     "emulated_class",
     "find_generator",
     "known_name",
     "options_of",
+    "request",
     "wrap_number",
 ]
 
@@ -61,6 +65,7 @@ if not TYPE_CHECKING:
             "_camera": "CONDITIONS",
             "_client_link": "ClientLink",
             "_clock": "Clock RealClock TimerHandle",
+            "_evaluating": "EvaluatingCamera applications_of request",
             "_generators": "Values find_generator wrap_number",
             "_insight.job": "InspectedJob",
             "_inspected": "InspectedApplication InspectionOrder Inspector",

@@ -44,10 +44,8 @@ class TicketedClient(LineClient):
         codec = self._camera.lines
         ticket = codec.answer_key(data)
         if self.ticket and ticket.isdecimal() and int(ticket) in self.dialect.tickets:
-            data = data.replace(ticket.encode(), self.ticket.encode(), 1)  # of header or content
-            header = data.find(b"\r\n") + 2
-            if data[4:5] == b"L" and data[header : header + 4] == ticket.encode():
-                data = data[:header] + self.ticket.encode() + data[header + 4 :]
+            text = codec.said(data).removeprefix(ticket)
+            data = self.frame(text, self.ticket)
         self.say_bytes(data)
 
     def frame(self, text: str, ticket: str) -> bytes:
@@ -70,7 +68,8 @@ class TicketedCodec(LineCodec):
             encoding=dialect.encoding,
             split=dialect.split,
         )
-        width = dialect.width
+        self.width: int = dialect.width
+        width = self.width
         self.header: re.Pattern[bytes] = re.compile(
             rb"([0-9]{%d})?L([0-9]{%d})\r\n" % (width, dialect.digits)
         )
@@ -112,7 +111,8 @@ class TicketedFramer(LineFramer):
         codec = self._frames
         found = codec.header.match(self._buffer)
         if found is None:
-            if self._buffer[4:5] == b"L" and len(self._buffer) < codec.header_size:
+            mark = self._buffer[codec.width : codec.width + 1]
+            if mark == b"L" and len(self._buffer) < codec.header_size:
                 return None
             return super().next_frame()
         length = int(found[2])

@@ -224,7 +224,7 @@ class Dialect(ABC):
         """Return any request by its id, for users who know it better than the table.
 
         Raises:
-            LocalProtocolError: Connect and Disconnect.
+            LocalProtocolError: what only the client itself may say, as Connect and Disconnect.
             UnsupportedError: its ids are of another kind.
         """
 

@@ -32,6 +32,7 @@ from smartcam.protocols._base import (
     Transport,
     Verdict,
 )
+from smartcam.protocols._held_results import HeldResults
 from smartcam.protocols._line_reader import LineReader
 from smartcam.protocols._machine import Counters, Frame, LinkEnded, LinkFailed, State
 
@@ -65,6 +66,7 @@ _ABILITIES: Mapping[type[m.Message], str] = {
 }
 
 _FIRST_WORD = re.compile(r"\w*")
+_COMMAND_WORD = re.compile(r"\w+\??")
 
 
 class LineRow(NamedTuple):
@@ -140,6 +142,8 @@ class LineDialect(Dialect):
             what :meth:`pack` makes of it. Empty where they carry none.
         at_once: requests are said without waiting for earlier answers; needs ``split``.
         codes: the meaning of each result code of the answers; without any all are done.
+        names_application: results say of which application they are, or all are of one. Else the
+            camera is asked in front of each trigger and behind each result, by the row of Query.
         make: name of the maker or make, for errors.
     """
 
@@ -152,6 +156,7 @@ class LineDialect(Dialect):
     tickets: range = range(0)
     at_once: bool = False
     codes: Mapping[int, CodeMeaning] = field(default_factory=dict[int, CodeMeaning])
+    names_application: bool = True
     make: str = ""
 
     in_order: ClassVar[bool] = True
@@ -270,12 +275,37 @@ class LineDialect(Dialect):
         Raises:
             UnsupportedError: how another line is answered is not known.
             ConfigurationError: it is no line that can be sent.
+            LocalProtocolError: it triggers, and nothing in its answer would tell whose trigger.
         """
         if self.row(LineCommand) is None or not isinstance(message_id, str):
             raise UnsupportedError(f"dialect {self.name}: there are no other requests")
         line = self.command(message_id + payload.decode(self.encoding, "replace"))
         self.pack(line, "")
-        return RawRequest(LineCommand(line=line), LineReply, answered=True, known=True)
+        message = LineCommand(line=line)
+        twin = self._twin(message)
+        if twin is not None and twin.request in {m.Trigger, m.EndTrigger} and not self.tickets:
+            raise LocalProtocolError(
+                f"{self.make or self.name}: {line[:32]!r} is the client's own: its result could "
+                "not be told from a trigger's; call trigger()"
+            )
+        answered = twin is None or twin.answer is not None
+        return RawRequest(message, LineReply, answered=answered, known=True)
+
+    def _twin(self, message: LineCommand) -> LineRow | None:
+        """Return the row of a request of the client's own that says the same command."""
+        word = _command_word(message.line)
+        own = (row for row in self.rows if row.request not in {None, LineCommand})
+        return next((row for row in own if _command_word(row.line) == word), None)
+
+    def row_of(self, message: m.Message) -> LineRow | None:
+        """Return the row by which a message is said; a user's line is answered as its twin is."""
+        row = self.row(type(message))
+        twin = self._twin(message) if isinstance(message, LineCommand) else None
+        if row is None or twin is None:
+            return row
+        answer = None if twin.answer is None else row.answer
+        word = None if twin.script is not None else twin.word
+        return row._replace(answer=answer, word=word, echo=twin.echo, until=twin.until)
 
     def body(self, answer: m.Message) -> bytes:
         """Return the bytes of the answer to a line of the user's own.
@@ -300,6 +330,12 @@ def _first_word(line: str) -> str:
     return "" if found is None else found[0]
 
 
+def _command_word(line: str) -> str:
+    """Return the word that says what a line does, "PROGRAM?" being another one than "PROGRAM"."""
+    found = _COMMAND_WORD.match(line)
+    return line if found is None else found[0]
+
+
 def _one_line(row: LineRow, line: str) -> Script:
     return row.read((yield line))
 
@@ -318,6 +354,7 @@ class _OpenRequest:
         echoed: whether the echo in front of the answer has come.
         lines: what came of an answer of several lines.
         size: characters of these.
+        question: number of a question for the application that the machine has put by itself.
     """
 
     row: LineRow
@@ -329,6 +366,7 @@ class _OpenRequest:
     echoed: bool = False
     lines: list[str] = field(default_factory=list[str])
     size: int = 0
+    question: int = 0
 
 
 class LineMachine:
@@ -381,7 +419,8 @@ class LineMachine:
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)
         self._marks = trigger is not None and trigger.answer is m.ResultContainer
-        self._events: list[Event] = []
+        self._query = None if dialect.names_application else dialect.row(m.Query)
+        self._held = HeldResults()
         self._outbox: list[bytes] = []
 
     def adopt(self, dialect: Dialect) -> None:
@@ -417,19 +456,16 @@ class LineMachine:
         except RemoteProtocolError as error:
             if self._trace is not None:
                 self._trace(m.Sender.CAMERA, error)
-            self._events.append(LinkFailed(error=error))
-            self._end(State.FAILED)
+            self._end(State.FAILED, LinkFailed(error=error))
 
     def receive_eof(self) -> None:
         """Take note that the camera will send no more; call :meth:`events` next."""
         if self.state not in {State.FAILED, State.CLOSED}:
-            self._events.append(LinkEnded(pending=len(self._reader)))
-            self._end(State.CLOSED)
+            self._end(State.CLOSED, LinkEnded(pending=len(self._reader)))
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; the caller owns the list."""
-        events, self._events = self._events, []
-        return events
+        return self._held.take()
 
     def _read(self, line: str) -> None:
         """Take a line; FrameError where it is neither an answer nor said unasked."""
@@ -515,21 +551,51 @@ class LineMachine:
         self._asked.remove(asked)
         if row.request is m.Connect and self.state is State.CONNECTING:
             self.state = State.CONNECTED
-        self._add(told, asked=row.request is m.Trigger)
+        if asked.question:
+            self._name(told, asked.question)
+        else:
+            self._add(told, asked=row.request is m.Trigger)
         if self._asked and not self._asked[0].said and self.state is State.CONNECTED:
             self._say(self._asked[0])
 
     def _add(self, told: Told, *, asked: bool) -> None:
         """Tell messages; containers with whether a Trigger has asked for them, if that is known."""
-        for one in told if isinstance(told, tuple) else (told,):
-            marked = self._marks and isinstance(one, m.ResultContainer)
-            self._events.append(replace(one, asked=asked) if marked else one)  # type: ignore[call-arg]
+        messages = told if isinstance(told, tuple) else (told,)
+        if self._marks:
+            messages = tuple(
+                replace(one, asked=asked) if isinstance(one, m.ResultContainer) else one
+                for one in messages
+            )
+        if self._query is None:
+            self._held.pass_on(messages)
+            return
+        if self._held.add(messages, answers_trigger=asked):
+            self._ask_application()
+        self._name(messages)
 
-    def _end(self, state: State) -> None:
-        """Say and read nothing more."""
+    def _name(self, told: Told, question: int = 0) -> None:
+        """Take which application is active, and ask again for results since the question."""
+        for one in told if isinstance(told, tuple) else (told,):
+            if not isinstance(one, m.QueryAnswer | m.SwitchAnswer):
+                continue
+            if self._held.name(one.application, question):
+                self._ask_application()
+
+    def _ask_application(self, *, trigger: bool = False) -> None:
+        """Ask which application is active, in front of a trigger or behind a result."""
+        if self._query is None or self.state not in {State.CONNECTING, State.CONNECTED}:
+            self._held.end()
+            return
+        number = self._held.ask(trigger=trigger)
+        self._begin(self._query, m.Query(), question=number)
+
+    def _end(self, state: State, event: Event) -> None:
+        """Say and read nothing more; tell the reason last."""
         self.state = state
         self._asked.clear()
         self._reader = self.dialect.reader(0)
+        self._held.end()
+        self._held.pass_on((event,))
 
     # ------------------------------------------------------------------ messages out
 
@@ -552,24 +618,29 @@ class LineMachine:
             if self.state in {State.CONNECTING, State.CONNECTED}:
                 self.state = State.DISCONNECTED
             return
-        row = self.dialect.row(kind)
+        row = self.dialect.row_of(message)
         if row is None or self.state is not (State.IDLE if kind is m.Connect else State.CONNECTED):
             raise LocalProtocolError(
                 f"{kind.__name__} cannot be sent by the client in state {self.state.value}"
             )
-        if any(row is one.row for one in self._asked):
+        if any(row.request is one.row.request and not one.question for one in self._asked):
             if kind is m.GetStatus:
                 return
             raise LocalProtocolError(f"the answer to a {kind.__name__} is still owed")
+        if kind is m.Trigger and self._query is not None:
+            self._ask_application(trigger=True)
+        self._begin(row, message)
+        if kind is m.Connect:
+            self.state = State.CONNECTING
+
+    def _begin(self, row: LineRow, message: m.Message, *, question: int = 0) -> None:
+        """Say the first line of a request, or put it in line."""
         script = self.dialect.script(row, message)
-        asked = _OpenRequest(row, script, next(script), row.word)
-        ready = self.dialect.at_once or not self._asked
-        if row.answer is None or ready:
+        asked = _OpenRequest(row, script, next(script), row.word, question=question)
+        if row.answer is None or self.dialect.at_once or not self._asked:
             self._say(asked)
         else:
             self.dialect.pack(asked.line, "")  # where it cannot be said, nothing has changed
-        if kind is m.Connect:
-            self.state = State.CONNECTING
         if row.answer is not None:
             self._asked.append(asked)
 

@@ -40,6 +40,7 @@ from smartcam.fleet import (
 )
 from smartcam.fleet._bus.bus import Handle, MemoryBus, MemoryEnd
 from smartcam.fleet._program.program_name import in_words
+from smartcam.makes import EmulatedIfm
 from tests.client.clientkit import cancelled
 from tests.handmade import until
 
@@ -615,3 +616,22 @@ async def test_reservation_ends_with_its_program() -> None:
         assert isinstance((await yours.trigger(timeout=2.0))["a"], Result)
         with pytest.raises(ReservationLostError, match="closed"):  # its block had it no more
             await reservation.__aexit__(None, None, None)
+
+
+async def test_remarks_of_a_camera_reach_the_programs_of_a_fleet() -> None:
+    slow = [{"id": 1, "processing_time": 5.0}]
+    async with EmulatedIfm(applications=slow) as emulator:
+        bus = MemoryBus()
+        server = FleetServer(file({"left": {"url": emulator.url}}), bus=bus.end())
+        async with server, fleet_on(bus) as fleet:
+            events = fleet["left"].events()
+            await fleet["left"].wait_connected(timeout=10.0)
+            emulator.device.trigger()
+            emulator.device.trigger()  # an overrun
+            async with asyncio.timeout(10.0):
+                async for event in events:
+                    if isinstance(event, smartcam.NoticeReceived):
+                        break
+        assert (event.camera, event.kind, event.code) == ("left", "error", 110001006)
+        assert event.text == "Trigger overrun"
+        assert fleet["left"].statistics().notices == 1

@@ -31,7 +31,7 @@ class Ifm(EmulatedIfm):
         super().__init__(
             applications=[{"id": 1, "processing_time": 0.05, "parts": [{"n": 0}]}], **options
         )
-        self.parts[1] = ({"n": self.runs} for _ in itertools.count())  # type: ignore[assignment]
+        self.parts[1] = ({"n": self.runs} for _ in itertools.count())
 
     @property
     def runs(self) -> int:
@@ -45,7 +45,7 @@ class Iv3(EmulatedIv3):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(processing_time=0.05, **options)
-        self.parts = ((self.runs,) for _ in itertools.count())  # type: ignore[assignment]
+        self.parts[0] = ((self.runs,) for _ in itertools.count())
 
     def hear(self, client: LineClient, line: str) -> None:
         self.runs += line == "T2"

@@ -10,6 +10,7 @@ from smartcam.protocols import messages as m
 from smartcam.testing import Came, Conversation, Sent, WireSuite
 
 READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
+APPS_7 = "003\t07\t01\t07\t12"
 WHO = "IFM ELECTRONIC\tO2D500\tname\tplace\t\t192.168.0.69\t255.255.255.0\t192.168.0.201"
 
 
@@ -22,6 +23,12 @@ def v3(ticket: int | str, content: str) -> bytes:
 def v4(content: str) -> bytes:
     """Return a frame of version 4, made here."""
     return f"L{len(content) + 2:09}\r\n{content}\r\n".encode()
+
+
+def result(application: int, data: bytes, mixed: str = "") -> m.ResultContainer:
+    """Return a result of an application, or one that may be of several."""
+    why = f"the application changed while the result was made: it may be of any of {mixed}"
+    return m.ResultContainer(application=application, data=data, fault=why if mixed else None)
 
 
 def code(line: str) -> m.ResultContainer:
@@ -50,18 +57,26 @@ class TestPcicWire(WireSuite):
                 Came(v3(1002, "000000000"), (m.StatusReport(status=READY),)),
                 Sent(m.Query(), v3(1003, "A?")),
                 Came(v3(1003, "003\t07\t01\t07\t12"), (m.QueryAnswer(application=7),)),
-                Sent(m.Trigger(), v3(1004, "T?")),
-                Sent(m.Query(), v3(1005, "A?")),
-                Came(v3("0000", "star;old;stop"), (m.ResultContainer(data=b"star;old;stop"),)),
-                Came(v3(1005, "003\t07\t01\t07\t12"), (m.QueryAnswer(application=7),)),
+                Sent(m.Trigger(), v3(1004, "A?") + v3(1005, "T?")),
+                Sent(m.Query(), v3(1006, "A?")),
+                Came(v3("0000", "star;old;stop"), ()),
+                Came(v3(1004, APPS_7), (), v3(1007, "A?")),
+                Came(v3(1006, APPS_7), ()),
+                Came(v3(1007, APPS_7), (result(7, b"star;old;stop"), m.QueryAnswer(application=7))),
                 Came(
                     v3("0001", "110001006:Trigger overrun"),
                     (m.Notice("error", 110001006, "Trigger overrun"),),
                 ),
                 Came(v3("0010", "000500000:{}"), (m.Notice("notification", 500000, "{}"),)),
+                Came(v3(1005, "star;\r\n\xff;stop"), (), v3(1008, "A?")),
+                Came(v3("0010", "000500002:{}"), ()),
                 Came(
-                    v3(1004, "star;\r\n\xff;stop"),
-                    (m.TriggerAnswer(), m.ResultContainer(data=b"star;\r\n\xff;stop")),
+                    v3(1008, APPS_7),
+                    (
+                        m.TriggerAnswer(),
+                        result(7, b"star;\r\n\xff;stop"),
+                        m.Notice("notification", 500002, "{}"),
+                    ),
                 ),
             ],
         ),
@@ -78,11 +93,11 @@ class TestPcicWire(WireSuite):
                 Came(v3(1005, "!"), (m.Image(code=1, data=b""),)),
                 Sent(m.SetInput(data=b"bolt"), v3(1006, "j00000000004bolt")),
                 Came(v3(1006, "*"), (m.SetInputAnswer(),)),
-                Sent(m.Trigger(), v3(1007, "T?")),
-                Came(v3(1007, "!"), (m.TriggerAnswer(code=4),)),
-                Sent(LineCommand(line="S?"), v3(1008, "S?")),
-                Came(v3(1008, "?"), (LineReply(code=2, data=b"?"),)),
-                Came(v3(1009, "*"), (FrameError,)),
+                Sent(m.Trigger(), v3(1007, "A?") + v3(1008, "T?")),
+                Came(v3(1008, "!"), (m.TriggerAnswer(code=4),)),
+                Sent(LineCommand(line="S?"), v3(1009, "S?")),
+                Came(v3(1009, "?"), (LineReply(code=2, data=b"?"),)),
+                Came(v3(1010, "*"), (FrameError,)),
             ],
         ),
         Conversation(
@@ -91,8 +106,9 @@ class TestPcicWire(WireSuite):
             parameters={"trigger": "async"},
             steps=[
                 *V3_SESSION,
-                Sent(m.Trigger(), v3(1002, "t")),
-                Came(v3(1002, "*"), (m.TriggerAnswer(),)),
+                Sent(m.Trigger(), v3(1002, "A?") + v3(1003, "t")),
+                Came(v3(1002, APPS_7), ()),
+                Came(v3(1003, "*"), (m.TriggerAnswer(),)),
                 Came(
                     v3("0001", "110001006:Trigger overrun"),
                     (
@@ -101,7 +117,10 @@ class TestPcicWire(WireSuite):
                         m.StatusReport(status=READY),
                     ),
                 ),
-                Came(v3("0000", "star;1;stop"), (m.ResultContainer(data=b"star;1;stop"),)),
+                Came(v3("0000", "star;1;stop"), (), v3(1004, "A?")),
+                Came(v3("0000", "star;2;stop"), ()),
+                Came(v3(1004, APPS_7), (result(7, b"star;1;stop"),), v3(1005, "A?")),
+                Came(v3(1005, "003\t12\t01\t07\t12"), (result(12, b"star;2;stop", "7, 12"),)),
             ],
         ),
         Conversation(
@@ -121,14 +140,15 @@ class TestPcicWire(WireSuite):
                 Sent(m.Connect(), b"G?\r\n"),
                 Came(v4(WHO), (), b"p0\r\n"),
                 Came(v4("*"), (m.ConnectAnswer(version=1),)),
-                Sent(m.Trigger(), b"T?\r\n"),
+                Sent(m.Trigger(), b"A?\r\n"),
                 Sent(m.Query(), b""),
+                Came(v4("001\t01\t01"), (), b"T?\r\n"),
+                Came(v4("star;1;stop"), (), b"A?\r\n"),
+                Came(v4("001\t01\t01"), (), b"A?\r\n"),
                 Came(
-                    v4("star;1;stop"),
-                    (m.TriggerAnswer(), m.ResultContainer(data=b"star;1;stop")),
-                    b"A?\r\n",
+                    v4("001\t01\t01"),
+                    (m.TriggerAnswer(), result(1, b"star;1;stop"), m.QueryAnswer(application=1)),
                 ),
-                Came(v4("001\t01\t01"), (m.QueryAnswer(application=1),)),
             ],
         ),
         Conversation(
@@ -138,9 +158,14 @@ class TestPcicWire(WireSuite):
                 Sent(m.Connect(), b"1000G?\r\n"),
                 Came(f"1000{WHO}\r\n".encode(), (), b"1001p7\r\n"),
                 Came(b"1001*\r\n", (m.ConnectAnswer(version=1),)),
-                Sent(m.Trigger(), b"1002T?\r\n"),
-                Came(b"0000star;old;stop\r\n", (m.ResultContainer(data=b"star;old;stop"),)),
-                Came(b"1002!\r\n", (m.TriggerAnswer(code=4),)),
+                Sent(m.Trigger(), b"1002A?\r\n1003T?\r\n"),
+                Came(f"1002{APPS_7}\r\n".encode(), ()),
+                Came(b"0000star;old;stop\r\n", (), b"1004A?\r\n"),
+                Came(b"1003!\r\n", ()),
+                Came(
+                    f"1004{APPS_7}\r\n".encode(),
+                    (result(7, b"star;old;stop"), m.TriggerAnswer(code=4)),
+                ),
             ],
         ),
         Conversation(
@@ -168,9 +193,11 @@ class TestIv3Wire(WireSuite):
                 Came(b"ER,RT,03\r", (m.ConnectAnswer(version=1), m.StatusReport(status=READY))),
                 Sent(m.Query(), b"PR\r"),
                 Came(b"PR,099\r", (m.QueryAnswer(application=99),)),
-                Sent(m.Trigger(), b"T2\r"),
+                Sent(m.Trigger(), b"PR\r"),
                 Sent(m.Query(), b""),
+                Came(b"PR,098\r", (), b"T2\r"),
                 Came(b"RT,00003,NG,01,OK,0000095\r", (), b"PR\r"),
+                Came(b"PR,098\r", (), b"PR\r"),
                 Came(
                     b"PR,098\r",
                     (
@@ -186,14 +213,14 @@ class TestIv3Wire(WireSuite):
                                 m.CellValue("tool 01 rate", "0000095"),
                             ),
                         ),
+                        m.QueryAnswer(application=98),
                     ),
-                    b"PR\r",
                 ),
-                Came(b"PR,099\r", (m.QueryAnswer(application=99),)),
                 Sent(m.SwitchApplication(application=7), b"PW,7\r"),
                 Came(b"ER,PW,22\r", (), b"PR\r"),
                 Came(b"PR,099\r", (m.SwitchAnswer(code=22, application=99),)),
-                Sent(m.Trigger(), b"T2\r"),
+                Sent(m.Trigger(), b"PR\r"),
+                Came(b"PR,099\r", (), b"T2\r"),
                 Came(b"ER,T2,03\r", (m.TriggerAnswer(code=3),)),
                 Sent(LineCommand(line="DR,03,0"), b"DR,03,0\r"),
                 Came(b"DR,03,0,0023250\r", (LineReply(data=b"DR,03,0,0023250"),)),

@@ -35,6 +35,7 @@ REFUSED = m.ConnectAnswer(code=-6, version=1)
 TRIGGERED = m.TriggerAnswer(code=1)
 
 # request, its command lines with their answers, what is told
+NAMES = ("A001", "Part.Name", "B002", "B003")
 CONVERSATIONS: list[tuple[m.Message, list[tuple[bytes, bytes]], list[Event]]] = [
     (m.GetStatus(), [(b"GO", b"1\r\n")], [m.StatusReport(status=ONLINE)]),
     (m.GetStatus(), [(b"GO", b"0\r\n")], [m.StatusReport(status=Status(0))]),
@@ -69,6 +70,7 @@ CONVERSATIONS: list[tuple[m.Message, list[tuple[bytes, bytes]], list[Event]]] = 
             (b"GVPart.Name", b"1\r\n\xb0 M6\r\n"),
             (b"GVB002", b"-2\r\n"),
             (b"GVB003", b"1\r\n#ERR\r\n"),
+            (b"GJ", b"1\r\n7\r\n"),
         ],
         [
             TRIGGERED,
@@ -83,6 +85,24 @@ CONVERSATIONS: list[tuple[m.Message, list[tuple[bytes, bytes]], list[Event]]] = 
                     m.CellValue("B002", None),
                     m.CellValue("B003", None),
                 ),
+            ),
+        ],
+    ),
+    (
+        m.Trigger(),
+        [
+            (b"SW8", b"1\r\n"),
+            (b"GJ", b"1\r\n7\r\n"),
+            *((b"GV" + cell.encode(), b"-2\r\n") for cell in NAMES),
+            (b"GJ", b"1\r\n8\r\n"),
+        ],
+        [
+            TRIGGERED,
+            m.ResultContainer(
+                application=7,
+                data=json.dumps(dict.fromkeys(NAMES)).encode(),
+                cells=tuple(m.CellValue(cell, None) for cell in NAMES),
+                fault="job 8 was loaded while the cells of job 7 were read",
             ),
         ],
     ),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,8 +11,10 @@ from smartcam.exceptions import FrameError, LocalProtocolError
 from smartcam.models import Status
 from smartcam.protocols import (
     CodeMeaning,
+    LineCommand,
     LineDialect,
     LineMachine,
+    LineReply,
     LineRow,
     LinkFailed,
     Protocol,
@@ -268,3 +271,69 @@ def test_no_frame_of_a_ticket_ends_the_link_at_once(data: bytes) -> None:
     (failed,) = made.events()
     assert isinstance(failed, LinkFailed)
     assert isinstance(failed.error, FrameError)
+
+
+@pytest.mark.parametrize(("tickets", "digits"), [(range(100, 1000), 5), (range(1), 12)])
+def test_frames_have_as_many_digits_as_their_dialect_says(tickets: range, digits: int) -> None:
+    dialect = TicketedDialect(
+        name="frames",
+        rows=(
+            LineRow(m.Connect, "G?", m.ConnectAnswer, connected),
+            LineRow(m.Query, "A?", m.QueryAnswer, query),
+        ),
+        tickets=tickets,
+        digits=digits,
+        **COMMON,
+    )
+    frame = dialect.frame(b"Model 1", str(tickets[0]), length=True)
+    assert frame == b"%dL%0*d\r\n%dModel 1\r\n" % (
+        *(tickets[0], digits, 9 + dialect.width, tickets[0]),
+    )
+    for size in range(len(frame) + 1):
+        made = LineMachine(dialect, Role.CLIENT, Transport.TCP, max_length=4096)
+        made.send(m.Connect())
+        for part in (frame[:size], frame[size:]):
+            made.receive_data(part)
+        assert made.events() == [m.ConnectAnswer(version=1)]
+    for place in range(dialect.width + 1 + digits + 2):
+        made = LineMachine(dialect, Role.CLIENT, Transport.TCP, max_length=4096)
+        made.send(m.Connect())
+        made.receive_data(frame[:place] + b"x")  # which nothing can follow any more
+        assert isinstance(made.events()[0], LinkFailed)
+
+
+# ---------------------------------------------------------------------- lines of the user's own
+
+
+OWN = (
+    LineRow(m.Reboot, "RESTART", None, unread),
+    LineRow(LineCommand, "{line}", LineReply, lambda line: LineReply(data=line.encode())),
+)
+
+
+@pytest.mark.parametrize("line", ["MEASURE", "MEASURE 1", "MEASURE,2"])
+def test_trigger_by_hand_is_the_clients_own(line: str) -> None:
+    dialect = replace(SEVERAL, rows=(*SEVERAL.rows, *OWN), make="Acme")
+    with pytest.raises(LocalProtocolError, match=r"Acme: .* call trigger\(\)"):
+        dialect.raw_request(line, b"")
+    assert dialect.raw_request("MEASURE?", b"").answered
+
+
+def test_line_of_ones_own_is_answered_in_the_shape_of_the_row_that_says_it() -> None:
+    made = machine(replace(SEVERAL, rows=(*SEVERAL.rows, *OWN)))
+    raw = made.dialect.raw_request("VER", b"")
+    made.send(raw.message)
+    made.send(m.Query())
+    made.receive_data(b"Model 2\nOK\n7\n")
+    assert made.events() == [LineReply(data=b"Model 2\nOK"), m.QueryAnswer(application=7)]
+
+
+def test_line_of_ones_own_that_is_never_answered_is_not_waited_for() -> None:
+    made = machine(replace(SEVERAL, rows=(*SEVERAL.rows, *OWN)))
+    raw = made.dialect.raw_request("RESTART", b" NOW")
+    assert not raw.answered
+    made.send(raw.message)
+    made.send(m.Query())
+    assert b"".join(made.data_to_send()) == b"RESTART NOW\nSCENE\n"
+    made.receive_data(b"7\n")
+    assert made.events() == [m.QueryAnswer(application=7)]

@@ -303,6 +303,7 @@ def test_recorder_events_come_back_as_they_were(tmp_path: Path) -> None:
         ),
         smartcam.ApplicationChanged(camera="left", at=at(2), application=7, previous=None),
         smartcam.ApplicationChanged(camera="left", at=at(2), application=8, previous=7),
+        smartcam.NoticeReceived(camera="left", at=at(2), kind="error", code=7, text="hot"),
         Disconnected(camera="left", at=at(3), reason="gone", expected=False),
         smartcam.Reconnected(camera="left", at=at(4), url="bvs://192.168.0.10:36701"),
     ]

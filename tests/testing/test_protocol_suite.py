@@ -146,8 +146,9 @@ class TestInSight(WireSuite):
                 Came(b"1\r\n", (m.TriggerAnswer(code=1),), b"GJ\r\n"),
                 Came(b"1\r\n12\r\n", (), b"GVA001\r\n"),
                 Came(b"1\r\n12.5\r\n", (), b"GVB001\r\n"),
+                Came(b"-1\r\n", (), b"GJ\r\n"),
                 Came(
-                    b"-1\r\n",
+                    b"1\r\n12\r\n",
                     (
                         m.ResultContainer(
                             application=12, data=b'{"A001": "12.5", "B001": null}', cells=CELLS

@@ -46,6 +46,7 @@ from smartcam.models import (
     Capabilities,
     Connected,
     Disconnected,
+    NoticeReceived,
     Reconnected,
     Result,
     Status,
@@ -458,6 +459,8 @@ class FleetCamera(Camera[ValueT]):
         linked = bool(said.get("connected"))
         if said["kind"] == "Removed":
             self._caller.removed(str(said.get("why")))
+        elif said["kind"] == "NoticeReceived":
+            self._take_notice(said.get("event", {}), at)
         elif said["kind"] == "ReservationLost":
             self._take_reservation_lost(str(said.get("by")), at)
         if self._trying and not said.get("trying"):
@@ -485,6 +488,13 @@ class FleetCamera(Camera[ValueT]):
             )
         if status is not None and linked:
             self._take_status(Status(int(status)), at, said["kind"])
+
+    def _take_notice(self, said: dict[str, Any], at: datetime) -> None:
+        """Publish a remark of the camera's own."""
+        self._counters.note_notice()
+        kind, code, text = str(said.get("kind")), int(said.get("code", 0)), str(said.get("text"))
+        event = NoticeReceived(camera=self.name, at=at, kind=kind, code=code, text=text)
+        self._listeners.publish(event)
 
     def _take_reservation_lost(self, program: str, at: datetime) -> None:
         """Note whose reservation is lost, by the agent's word; ours may have been told before."""

@@ -14,11 +14,13 @@ import numpy as np
 
 from smartcam._arguments import check_integer, check_seconds
 from smartcam.emulator import TicketedCamera, TicketedClient
+from smartcam.emulator._inside import EvaluatingCamera, applications_of, request
 from smartcam.exceptions import ConfigurationError
 from smartcam.makes._ifm.chunks import JPEG, MONO8, ImageChunk
 from smartcam.makes._ifm.dialect import (
     ASYNCHRONOUS,
     ERRORS,
+    NOTIFICATIONS,
     OVERRUN,
     PCIC,
     RESULTS,
@@ -39,31 +41,7 @@ VERSIONS: Mapping[int, TicketedDialect] = {1: V1, 2: V2, 3: V3, 4: V4}
 SOURCES = ("process", "continuous", "hardware")
 CONTAINERS, MAX_TEXT = 10, 256
 _KINDS: Mapping[type, str] = {str: "string", bool: "uint8", int: "int32"}
-
-COMMANDS: Mapping[str, str] = {
-    r"t": "start an evaluation; its result is sent to whoever has results switched on",
-    r"T\?": "start an evaluation and answer with its result",
-    r"p([0-7])": "switch the output of results (1), errors (2) and notifications (4) of a session",
-    r"A\?": "tell how many applications there are, which one is active, and all their numbers",
-    r"a(\d\d)": "make another application the active one",
-    r"E\?": "tell the present error as nine digits, all zeros for none",
-    r"S\?": "tell how many results there were, how many of them good, and how many bad",
-    r"G\?": "tell maker, article, name, place, description, address, ports and time settings",
-    r"H\?": "tell this list",
-    r"I(\d\d)\?": "tell the last image: 01 as JPEG files, 02 as grey levels",
-    r"c(\d{9})(.*)": "take a layout for the results of this session, as JSON with its length",
-    r"C\?": "tell the layout of this session with its length",
-    r"j(\d\d)(\d{9})(.*)": "put a text with its length into an input container, 00 to 09",
-    r"J(\d\d)\?": "tell the text in an input container, with its length",
-    r"g([01])": "open or close the gate of a trigger that lasts",
-    r"o(\d\d)([01])": "set an output",
-    r"O(\d\d)\?": "tell the state of an output",
-    r"d([01])(\d{3})": "switch the view indicators on for some seconds, or off",
-    r"L\?": "tell the number of this session",
-    r"V\?": "tell the version of the protocol, and those that can be set",
-    r"v(\d\d)": "set the version of the protocol for this session",
-}
-"""Requests, each a form of its whole content, and what it does; the method in the same place."""
+_NETWORK = ("255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa: S104
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +71,6 @@ class IfmApplication:
         if self.trigger not in SOURCES:
             known = ", ".join(SOURCES)
             raise ConfigurationError(f"trigger: one of {known} was expected, got {self.trigger!r}")
-        if not self.parts:
-            raise ConfigurationError("parts: at least one was expected")
         if isinstance(self.jpeg, str):
             try:
                 object.__setattr__(self, "jpeg", Path(self.jpeg).read_bytes())
@@ -120,22 +96,7 @@ class IfmClient(TicketedClient):
     layout: Mapping[str, Any]
 
 
-class IfmDevice:
-    """The operator of an emulated camera: what is done at the device itself."""
-
-    def __init__(self, camera: EmulatedIfm) -> None:
-        self._camera = camera
-
-    def trigger(self) -> None:
-        """Trigger at the input; while an evaluation is under way it is an overrun."""
-        self._camera.overrun() if self._camera.busy else self._camera.begin(None)
-
-    def switch_application(self, application: int, running: bool = False) -> None:
-        """Make another application the active one."""
-        self._camera.activate(application)
-
-
-class EmulatedIfm(TicketedCamera):
+class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     """An emulated sensor of ifm that evaluates the same parts over and over.
 
     Args:
@@ -152,7 +113,6 @@ class EmulatedIfm(TicketedCamera):
 
     protocol = PCIC
     also_hears: ClassVar[tuple[LineRow, ...]] = (ASYNCHRONOUS,)
-    busy: bool = False
 
     def __init__(
         self,
@@ -163,20 +123,9 @@ class EmulatedIfm(TicketedCamera):
         defaults: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        given = [{"id": one} if isinstance(one, int) else one for one in applications]
-        try:
-            made = [IfmApplication(**{**(defaults or {}), **one}) for one in given]
-        except TypeError as exc:
-            raise ConfigurationError(f"applications: {exc}") from exc
+        made = applications_of(IfmApplication, applications, defaults)
+        self.set_up({one.id: one.parts for one in made}, active, 0)
         self.applications: Mapping[int, IfmApplication] = {one.id: one for one in made}
-        self.active: int = next(iter(self.applications), 0) if active is None else active
-        if self.active not in {0, *self.applications}:
-            raise ConfigurationError(
-                f"active: one of {[*self.applications]} was expected, got {active!r}"
-            )
-        self.parts: dict[int, itertools.cycle[Mapping[str, Any]]] = {
-            one.id: itertools.cycle(one.parts) for one in made
-        }
         self.version: int = check_integer(version, "version", 1, 4)
         self.error = 0
         self.results: int = 0
@@ -185,36 +134,7 @@ class EmulatedIfm(TicketedCamera):
         self.values: Mapping[str, Any] = {}
         self._outputs: dict[str, str] = {}
         self._sessions = itertools.count(1)
-        self._call: IfmClient | None = None  # which the evaluation under way answers
-        self._run = 0  # an application that is switched voids the evaluation under way
-        self.device: Any = IfmDevice(self)
-        handlers: tuple[Callable[..., str | None], ...] = (
-            *(self._t, self._trigger, self._p, self._apps, self._a, self._error, self._stats),
-            *(self._who, self._help, self._image, self._c, self._layout, self._j, self._text),
-            *(
-                self._star,
-                self._o,
-                self._output,
-                self._star,
-                self._session,
-                self._versions,
-                self._v,
-            ),
-        )
-        self._handlers = [
-            (re.compile(form, re.DOTALL), one) for form, one in zip(COMMANDS, handlers, strict=True)
-        ]
         super().__init__(**options)
-
-    @classmethod
-    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
-        """Return the options with which an application is active."""
-        return {"active": active}
-
-    @property
-    def application_ids(self) -> list[int]:
-        """Numbers of its applications."""
-        return list(self.applications)
 
     @property
     def application(self) -> IfmApplication:
@@ -233,71 +153,53 @@ class EmulatedIfm(TicketedCamera):
     def own_layout(self) -> Mapping[str, Any]:
         """Return the device's own layout: the values of a part as ASCII, between two words."""
         semicolon = {"type": "string", "id": "delimiter", "value": ";"}
-        part = self.application.parts[0]
-        values = [
-            one
-            for key, value in part.items()
-            if not isinstance(value, (list, tuple, bytes))
-            for one in (
-                {"type": _KINDS.get(type(value), "float32"), "id": key},
-                semicolon,
-            )
-        ]
-        words = [
-            {"type": "string", "id": f"{one}_string", "value": one} for one in ("star", "stop")
-        ]
-        return {
-            "layouter": "flexible",
-            "format": {"dataencoding": "ascii"},
-            "elements": [words[0], semicolon, *values, words[1]],
-        }
+        elements: list[dict[str, Any]] = [{"type": "string", "id": "begin", "value": "star"}]
+        for key, value in self.application.parts[0].items():
+            if not isinstance(value, (list, tuple, bytes)):
+                elements += (semicolon, {"type": _KINDS.get(type(value), "float32"), "id": key})
+        elements += (semicolon, {"type": "string", "id": "end", "value": "stop"})
+        form = {"dataencoding": "ascii"}
+        return {"layouter": "flexible", "format": form, "elements": elements}
 
     def hear(self, client: LineClient, line: str) -> None:
         """Do what a request says; a long one is answered while the next ones are heard."""
         call = cast("IfmClient", client.keep())
-        answer: str | None = "?"
         if call.dialect.tickets and not call.ticket:
             call.answer("?")
             return
-        for form, handler in self._handlers:
-            found = form.fullmatch(line)
-            if found is not None:
-                answer = handler(call, *found.groups())
-                break
+        answer = self.answer_to(call, line, "?")
         if answer is not None:
             call.answer(answer)
         if line.startswith("v") and answer == "*":
             cast("IfmClient", client).dialect = VERSIONS[int(line[1:])]
 
-    def _tell(self, bit: int, ticket: str, content: Callable[[IfmClient], str], but: Any) -> None:
+    def _tell(self, bit: int, ticket: str, content: Callable[[IfmClient], str], but: int) -> None:
+        row = next(at for at, one in enumerate(V3.rows, 1) if one.word == ticket)
         for one in list(self._clients.values()):
             client = cast("IfmClient", one)
             if client.outputs & bit and client.number != but:
-                client.say_bytes(client.frame(content(client), ticket), row=self._said[ticket])
+                client.say_bytes(client.frame(content(client), ticket), row=row)
 
-    @property
-    def _said(self) -> Mapping[str, int]:
-        return {row.word: at for at, row in enumerate(V3.rows, 1) if row.word}
+    def _of(self, call: IfmClient) -> IfmClient:
+        """Return the client whose request a call is."""
+        clients = cast("Iterable[IfmClient]", self._clients.values())
+        return next((one for one in clients if one.number == call.number), call)
 
     # ------------------------------------------------------------------ evaluations
 
-    def begin(self, call: IfmClient | None) -> None:
-        """Begin an evaluation; its result answers ``call``, and goes to who has results on."""
-        self.busy, self._run = True, self._run + 1
-        run, self._call = self._run, call
-        self.after(self.application.processing_time, lambda: self._end(call, run))
+    @property
+    def evaluation_time(self) -> float:
+        """Seconds of an evaluation."""
+        return self.application.processing_time
 
-    def _end(self, call: IfmClient | None, run: int) -> None:
-        if run != self._run:
-            return
-        self.busy, self._call = False, None
-        self.values = next(self.parts[self.active])
+    def evaluated(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
+        """Answer with the result, and tell it to who has results switched on."""
+        self.values = part
         self.results += 1
-        self.good += bool(self.values.get("passed", True))
-        if call is not None and not call.gone:
-            call.answer(self._encoded(call))
-        self._tell(1, RESULTS, self._encoded, None if call is None else call.number)
-        self._began()
+        self.good += bool(part.get("passed", True))
+        if call is not None:
+            call.answer(self._encoded(cast("IfmClient", call)))
+        self._tell(1, RESULTS, self._encoded, 0 if call is None else cast("IfmClient", call).number)
 
     def _encoded(self, client: IfmClient) -> str:
         try:
@@ -305,20 +207,22 @@ class EmulatedIfm(TicketedCamera):
         except (TypeError, ValueError, AttributeError, struct.error):
             return "!"
 
+    def voided(self, call: LineClient) -> None:
+        """Refuse a trigger whose evaluation is cut off by a switch."""
+        call.answer("!")
+
     def overrun(self) -> None:
         """Tell that a trigger came too early."""
-        self._tell(2, ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", None)
+        self._tell(2, ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", 0)
 
     def activate(self, application: int) -> None:
-        """Make another application the active one; the evaluation under way gives no result."""
-        self.active, self.busy = application, False
-        self._run += 1
-        call, self._call = self._call, None
-        if call is not None and not call.gone:
-            call.answer("!")
-        self._began()
+        """Make another application the active one, and notify of it."""
+        super().activate(application)
+        text = json.dumps({"Index": application})
+        self._tell(4, NOTIFICATIONS, lambda _: f"000500000:{text}", 0)
 
-    def _began(self) -> None:
+    def activated(self) -> None:
+        """Go on by itself where the active application does so."""
         if self.active and self.application.trigger == "continuous":
             self.begin(None)
 
@@ -327,66 +231,82 @@ class EmulatedIfm(TicketedCamera):
         """True if the process interface may trigger."""
         return not self.busy and self.active != 0 and self.application.trigger == "process"
 
-    def _t(self, call: IfmClient) -> str:
+    # ------------------------------------------------------------------ requests
+
+    @request(r"t")
+    def _start(self, call: IfmClient) -> str:
+        """Start an evaluation; its result is sent to whoever has results switched on."""
         if not self.takes_trigger:
             return "!"
         self.begin(None)
         return "*"
 
+    @request(r"T\?")
     def _trigger(self, call: IfmClient) -> str | None:
+        """Start an evaluation and answer with its result."""
         if not self.takes_trigger:
             return "!"
         self.begin(call)
         return None
 
-    # ------------------------------------------------------------------ other requests
-
-    def _star(self, call: IfmClient, *said: str) -> str:
-        return "*"
-
+    @request(r"p([0-7])")
     def _p(self, call: IfmClient, outputs: str) -> str:
+        """Switch results (1), errors (2) and notifications (4) of this session."""
         self._of(call).outputs = int(outputs)
         return "*"
 
-    def _of(self, call: IfmClient) -> IfmClient:
-        """Return the client whose request a call is."""
-        clients = cast("Iterable[IfmClient]", self._clients.values())
-        return next((one for one in clients if one.number == call.number), call)
-
+    @request(r"A\?")
     def _apps(self, call: IfmClient) -> str:
+        """Tell the count of applications, the active one, and all their numbers."""
         numbers = [f"{len(self.applications):03}", f"{self.active:02}"]
         return "\t".join([*numbers, *(f"{one:02}" for one in self.applications)])
 
+    @request(r"a(\d\d)")
     def _a(self, call: IfmClient, number: str) -> str:
+        """Make another application the active one."""
         if int(number) not in self.applications:
             return "!"
         self.activate(int(number))
         return "*"
 
+    @request(r"E\?")
     def _error(self, call: IfmClient) -> str:
+        """Tell the present error as nine digits, all zeros for none."""
         return f"{self.error:09}"
 
+    @request(r"S\?")
     def _stats(self, call: IfmClient) -> str:
+        """Tell the counts of all results, of the good ones, and of the bad ones."""
         counts = (self.results, self.good, self.results - self.good)
         return "\t".join(f"{one:010}" for one in counts) if self.active else "!"
 
+    @request(r"G\?")
     def _who(self, call: IfmClient) -> str:
-        network = (self.host, "255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa: S104
-        return "\t".join(("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", *network))
+        """Tell maker, article, name, place, description, address, ports and time settings."""
+        return "\t".join(
+            ("IFM ELECTRONIC", "O2D500", self.name, "emulated", "", self.host, *_NETWORK)
+        )
 
+    @request(r"H\?")
     def _help(self, call: IfmClient) -> str:
+        """Tell this list."""
         words = re.compile(r"\\d\{\d\}|\\d\\d|\(\S*?\)|\\")
-        return "\n".join(f"{words.sub('', form):<4} {text}" for form, text in COMMANDS.items())
+        each = {words.sub("", form.pattern): one.__doc__ for form, one in self.requests.items()}
+        return "\n".join(f"{form:<4} {text}" for form, text in each.items())
 
+    @request(r"I(\d\d)\?")
     def _image(self, call: IfmClient, kind: str) -> str:
+        """Tell the last image: 01 as JPEG files, 02 as grey levels."""
         application, now = self.application, self.clock.now
         if kind != ("01" if application.jpeg else "02"):
             return "!"
         counts = range(self.results, self.results + application.images)
         data = b"".join(application.picture(one, now).encoded for one in counts).decode("latin-1")
-        return f"{len(data):09}{data}" if data else "!"
+        return _counted(data) if data else "!"
 
+    @request(r"c(\d{9})(.*)")
     def _c(self, call: IfmClient, length: str, text: str) -> str:
+        """Take a layout for the results of this session, as JSON with its length."""
         if int(length) != len(text):
             return "!"
         try:
@@ -395,36 +315,62 @@ class EmulatedIfm(TicketedCamera):
             return "!"
         return "*"
 
+    @request(r"C\?")
     def _layout(self, call: IfmClient) -> str:
-        text = json.dumps(call.layout)
-        return f"{len(text):09}{text}"
+        """Tell the layout of this session with its length."""
+        return _counted(json.dumps(call.layout))
 
+    @request(r"j(0\d)(\d{9})(.*)")
     def _j(self, call: IfmClient, number: str, length: str, text: str) -> str:
-        if int(number) >= CONTAINERS or int(length) != len(text) or len(text) > MAX_TEXT:
+        """Put a text with its length into an input container, 00 to 09."""
+        if int(length) != len(text) or len(text) > MAX_TEXT:
             return "!"
         self.inputs[int(number)] = text
         return "*"
 
+    @request(r"J(0\d)\?")
     def _text(self, call: IfmClient, number: str) -> str:
-        if int(number) >= CONTAINERS:
-            return "!"
-        return f"{len(self.inputs[int(number)]):09}{self.inputs[int(number)]}"
+        """Tell the text in an input container, with its length."""
+        return _counted(self.inputs[int(number)])
 
+    @request(r"g[01]|d[01]\d{3}")
+    def _star(self, call: IfmClient) -> str:
+        """Open or close the gate of a trigger that lasts; switch the view indicators."""
+        return "*"
+
+    @request(r"o(0[1-4])([01])")
     def _o(self, call: IfmClient, pin: str, state: str) -> str:
-        if not 1 <= int(pin) <= 4:
-            return "!"
+        """Set an output."""
         self._outputs[pin] = state
         return "*"
 
+    @request(r"O(0[1-4])\?")
     def _output(self, call: IfmClient, pin: str) -> str:
-        return f"{pin}{self._outputs.get(pin, '0')}" if 1 <= int(pin) <= 4 else "!"
+        """Tell the state of an output."""
+        return pin + self._outputs.get(pin, "0")
 
+    @request(r"[jJoO]\d\d.*")
+    def _no_such(self, call: IfmClient) -> str:
+        """Refuse an input container or an output that the device has not."""
+        return "!"
+
+    @request(r"L\?")
     def _session(self, call: IfmClient) -> str:
+        """Tell the number of this session."""
         return f"{call.number:03}"
 
+    @request(r"V\?")
     def _versions(self, call: IfmClient) -> str:
+        """Tell the version of the protocol, and those that can be set."""
         version = next(number for number, one in VERSIONS.items() if one is call.dialect)
         return f"{version:02} 01 02 03" if version < 4 else "04 01 04"
 
+    @request(r"v(\d\d)")
     def _v(self, call: IfmClient, version: str) -> str:
+        """Set the version of the protocol for this session."""
         return "*" if int(version) in VERSIONS else "!"
+
+
+def _counted(text: str) -> str:
+    """Return a text behind its length."""
+    return f"{len(text):09}{text}"

@@ -10,9 +10,9 @@ from smartcam.exceptions import FrameError
 JPEG, MONO8 = 260, 251
 """Types of chunks: a JPEG file; grey levels of a byte each."""
 
-HEADER = struct.Struct("<13i")
+HEADER = struct.Struct("<12i")
 """Type, size, size of the header, version, width, height, pixel format, microseconds, count,
-status, seconds, nanoseconds, and the first bytes of the texts behind it."""
+status, seconds and nanoseconds; JSON stands behind it, ended by a zero byte."""
 
 LEAST_HEADER_SIZE, VERSION = 0x40, 3
 
@@ -50,9 +50,9 @@ class ImageChunk(NamedTuple):
         seconds, rest = divmod(round(self.time * 1e9), 1_000_000_000)
         numbers = (
             *(self.type, header_size + len(self.data), header_size, VERSION, self.width),
-            *(self.height, 0, rest // 1000, self.number, 0, seconds & 0x7FFFFFFF, rest, 0),
+            *(self.height, 0, rest // 1000, self.number, 0, seconds & 0x7FFFFFFF, rest),
         )
-        return HEADER.pack(*numbers).ljust(header_size, b"\0") + self.data
+        return (HEADER.pack(*numbers) + b"{}").ljust(header_size, b"\0") + self.data
 
 
 def read_chunks(data: bytes) -> list[ImageChunk]:
@@ -69,7 +69,7 @@ def read_chunks(data: bytes) -> list[ImageChunk]:
     while at < len(rest):
         if len(rest) - at < LEAST_HEADER_SIZE:
             raise FrameError(f"{len(rest) - at} bytes are no image chunk", data=rest[at : at + 64])
-        kind, size, header, _, width, height, _, _, count, _, seconds, nano, _ = HEADER.unpack_from(
+        kind, size, header, _, width, height, _, _, count, _, seconds, nano = HEADER.unpack_from(
             rest, at
         )
         if not LEAST_HEADER_SIZE <= header <= size <= len(rest) - at:

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from smartcam.exceptions import ConfigurationError, FrameError
+from smartcam.exceptions import ConfigurationError, FrameError, UnsupportedError
 from smartcam.makes._ifm.chunks import read_chunks
 from smartcam.makes._ifm.layouts import MARK, layout_json, with_bools
 from smartcam.models import Status
@@ -180,7 +180,8 @@ def _input(dialect: PcicDialect, message: m.SetInput) -> Script:
     return m.SetInputAnswer(code=CODES[answer])
 
 
-def _rows(trigger: LineRow, *, unasked: bool) -> tuple[LineRow, ...]:
+def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, ...]:
+    """Return the rows; without lengths no pictures, without tickets nothing unasked."""
     error = _error if trigger.answer is m.ResultContainer else _error_or_overrun
     said = (
         LineRow(None, "results", m.ResultContainer, _result, word=RESULTS),
@@ -196,9 +197,9 @@ def _rows(trigger: LineRow, *, unasked: bool) -> tuple[LineRow, ...]:
         ),
         LineRow(m.SwitchApplication, "a{application}", m.SwitchAnswer, unread, script=_switch),
         trigger,
-        LineRow(m.ReadImage, "I01?", m.Image, unread, script=_image),
+        *((LineRow(m.ReadImage, "I01?", m.Image, unread, script=_image),) if lengths else ()),
         LineRow(m.SetInput, "j{data}", m.SetInputAnswer, unread, script=_input),
-        *(said if unasked else ()),
+        *(said if tickets else ()),
         LineRow(LineCommand, "{line}", LineReply, _reply),
     )
 
@@ -222,6 +223,7 @@ class PcicDialect(TicketedDialect):
 
     layout: Layout | None = None
     container: int = 0
+    names_application: bool = False
     make: str = "ifm"
 
     def with_parameters(self, parameters: Mapping[str, str]) -> PcicDialect:
@@ -237,7 +239,8 @@ class PcicDialect(TicketedDialect):
                 f"trigger: sync or async was expected, got {kind!r}; "
                 f"input: 0 to 99 was expected, got {container!r}"
             )
-        rows = self.rows if kind == "sync" else _rows(ASYNCHRONOUS, unasked=bool(self.tickets))
+        trigger = SYNCHRONOUS if kind == "sync" else ASYNCHRONOUS
+        rows = _rows(trigger, tickets=bool(self.tickets), lengths=bool(self.digits))
         return replace(self, container=int(container), rows=rows, split=None)
 
     def for_layout(self, layout: Layout | None) -> PcicDialect:
@@ -272,8 +275,19 @@ class PcicDialect(TicketedDialect):
         """Return a command of one's own.
 
         Raises:
-            ConfigurationError: it is none, or sets the version, which would end the session.
+            ConfigurationError: it is none, or would end the session: one that sets the version or
+                another layout than the session's.
+            UnsupportedError: its answer needs a length.
         """
+        if line[:1] in {"I", "H"} and not self.digits:
+            raise UnsupportedError(
+                f"ifm: dialect {self.name} has no length, so the end of the answer to {line[:8]!r} "
+                "could not be found; use v3 or v4"
+            )
+        if line[:1] == "c" and self.layout is not None:
+            raise ConfigurationError(
+                f"ifm: the session's layout is that of interpret_as: {self.layout.text}"
+            )
         if not _COMMAND.fullmatch(line):
             raise ConfigurationError(
                 f"ifm: {line[:32]!r} is no command; smartcam.makes has them in docs/ifm.md; "
@@ -305,7 +319,7 @@ def _version(name: str, about: str, *, tickets: bool, digits: int, header: bool)
         about=about,
         source="docs/ifm.md, published",
         ids=range(1, MAX_APPLICATION + 1),
-        rows=_rows(SYNCHRONOUS, unasked=tickets),
+        rows=_rows(SYNCHRONOUS, tickets=tickets, lengths=bool(digits)),
         codes=_MEANINGS,
         tickets=range(1000, 10000) if tickets else range(0),
         at_once=tickets,

@@ -5,7 +5,6 @@ What is known of them, and who says so, stands in ``docs/keyence.md``.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from smartcam.makes._keyence.words import (
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Generator
 
     Script = Generator[str, str, m.Message]
-    TriggerScript = Generator[str, str, tuple[m.Message, ...]]
 
 DEFAULT_PORT = 8500
 LAST_PROGRAM = 127
@@ -71,15 +69,11 @@ def _passed(word: str) -> str:
     return {"OK": "1", "NG": "0"}[word]
 
 
-def _trigger(dialect: LineDialect, message: m.Trigger) -> TriggerScript:
-    """Ask for the program behind each result, which does not say it."""
-    line = yield "T2"
+def _triggered(line: str) -> tuple[m.Message, ...]:
     code = error_code(line)
     if code is not None:
         return (m.TriggerAnswer(code=code),)
-    result = read_result(line)
-    program = _program((yield "PR")).application
-    return m.TriggerAnswer(), replace(result, application=program)
+    return m.TriggerAnswer(), read_result(line)
 
 
 def _unasked(line: str) -> m.Notice:
@@ -120,15 +114,7 @@ LINES = LineDialect(
         LineRow(m.Connect, "RT", m.ConnectAnswer, _connected, also=(m.StatusReport,)),
         LineRow(m.Query, "PR", m.QueryAnswer, _program),
         LineRow(m.SwitchApplication, "PW,{application}", m.SwitchAnswer, unread, script=_switch),
-        LineRow(
-            m.Trigger,
-            "T2",
-            m.ResultContainer,
-            unread,
-            word="RT",
-            also=(m.TriggerAnswer,),
-            script=_trigger,
-        ),
+        LineRow(m.Trigger, "T2", m.ResultContainer, _triggered, word="RT", also=(m.TriggerAnswer,)),
         LineRow(None, "result", m.Notice, _unasked, word="RT"),
         LineRow(LineCommand, "{line}", LineReply, _reply),
     ),
@@ -138,6 +124,7 @@ LINES = LineDialect(
     encoding=ENCODING,
     split=lambda line: (asked_word(line, {"T2": "RT"}), line),
     codes=CODES,
+    names_application=False,
     make="Keyence IV3",
     shows_triggers=False,
 )

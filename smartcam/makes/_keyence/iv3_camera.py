@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import TYPE_CHECKING, Any
 
 from smartcam._arguments import check_integer, check_seconds
-from smartcam.emulator import LineCamera
-from smartcam.exceptions import ConfigurationError
+from smartcam.emulator._inside import EvaluatingCamera, request
 from smartcam.makes._keyence.iv3 import IV3, LAST_PROGRAM
 
 if TYPE_CHECKING:
@@ -18,23 +16,11 @@ if TYPE_CHECKING:
 LAST_COUNT = 32_767
 """The largest count of triggers; the next one is 1."""
 
-
-class Iv3Device:
-    """The operator of an emulated camera: what is done at the device itself."""
-
-    def __init__(self, camera: EmulatedIv3) -> None:
-        self._camera = camera
-
-    def trigger(self) -> None:
-        """Trigger at the input; nobody is told of its result."""
-        self._camera.judge()
-
-    def switch_application(self, application: int, running: bool = False) -> None:
-        """Make another program the active one."""
-        self._camera.active = application
+LEAST_RATE = 70
+"""The rate from which on a tool says OK."""
 
 
-class EmulatedIv3(LineCamera):
+class EmulatedIv3(EvaluatingCamera):
     """An emulated IV3 that judges the same parts over and over.
 
     Args:
@@ -59,61 +45,73 @@ class EmulatedIv3(LineCamera):
         processing_time: float = 0.01,
         **options: Any,
     ) -> None:
-        self.programs: list[int] = [
-            check_integer(one, "programs", 0, LAST_PROGRAM) for one in programs
-        ]
-        self.active: int = self.programs[0] if active is None else active
-        if self.active not in self.programs:
-            raise ConfigurationError(f"active: one of {self.programs} was expected, got {active!r}")
-        self.parts: itertools.cycle[Sequence[int]] = itertools.cycle(tuple(parts) or ((),))
+        some = tuple(parts) or ((),)
+        numbers = [check_integer(one, "programs", 0, LAST_PROGRAM) for one in programs]
+        self.set_up(dict.fromkeys(numbers, some), active)
         self.processing_time: float = check_seconds(processing_time, "processing_time")
         self.count: int = 0
         self.last: str = "RT,00000,NG"
-        self.device: Any = Iv3Device(self)
         super().__init__(**options)
 
-    @classmethod
-    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
-        """Return the options with which a program is active."""
-        return {"active": active}
-
     @property
-    def application_ids(self) -> list[int]:
-        """Numbers of its programs."""
-        return list(self.programs)
+    def evaluation_time(self) -> float:
+        """Seconds of an inspection."""
+        return self.processing_time
 
-    def judge(self) -> str:
-        """Inspect the next part; return the result as a line."""
+    def evaluated(self, call: LineClient | None, part: Sequence[int]) -> None:
+        """Judge a part; tell who has asked for it, and nobody else."""
         self.count = self.count % LAST_COUNT + 1
-        rates = [check_integer(rate, "a rate", 0, 9_999_999) for rate in next(self.parts)]
+        rates = [check_integer(rate, "a rate", 0, 9_999_999) for rate in part]
         tools = [
-            f"{tool:02},{'OK' if rate >= 70 else 'NG'},{rate:07}"
+            f"{tool:02},{'OK' if rate >= LEAST_RATE else 'NG'},{rate:07}"
             for tool, rate in enumerate(rates, 1)
         ]
-        judged = "OK" if all(rate >= 70 for rate in rates) else "NG"
+        judged = "OK" if all(rate >= LEAST_RATE for rate in rates) else "NG"
         self.last = ",".join([f"RT,{self.count:05},{judged}", *tools])
-        return self.last
+        if call is not None:
+            call.answer(self.last)
+
+    def voided(self, call: LineClient) -> None:
+        """Refuse a trigger that a switch at the sensor cuts off."""
+        call.answer("ER,T2,03")
 
     def hear(self, client: LineClient, line: str) -> None:
         """Answer a line; a trigger when its inspection is over, and no other line before it."""
-        if line == "T2":
-            self.after(self.processing_time, lambda: client.answer(self.judge()))
-        else:
-            client.answer(self.answer(line))
+        answer = self.answer_to(client, line, f"ER,{line.partition(',')[0]},02")
+        if answer is not None:
+            client.answer(answer)
 
-    def answer(self, line: str) -> str:
-        """Return the answer to another line than a trigger with a result."""
-        word, _, rest = line.partition(",")
-        if line == "T1":
-            self.judge()
-            return "T1"
-        if line == "RT":
-            return self.last
-        if line == "PR":
-            return f"PR,{self.active:03}"
-        if word != "PW":
-            return f"ER,{word},02"
-        if not rest.isdecimal() or int(rest[:9]) not in self.programs:
+    @request("T2")
+    def _trigger(self, client: LineClient) -> str | None:
+        """Inspect, and answer with the result."""
+        if self.busy:
+            return "ER,T2,03"
+        self.begin(client)
+        return None
+
+    @request("T1")
+    def _blind(self, client: LineClient) -> str:
+        """Inspect; the result can be asked for."""
+        if self.busy:
+            return "ER,T1,03"
+        self.begin(None)
+        return "T1"
+
+    @request("RT")
+    def _result(self, client: LineClient) -> str:
+        """Tell the last result."""
+        return self.last
+
+    @request("PR")
+    def _program(self, client: LineClient) -> str:
+        """Tell the active program."""
+        return f"PR,{self.active:03}"
+
+    @request("PW(?:,(.*))?")
+    def _switch(self, client: LineClient, number: str | None) -> str:
+        """Make another program the active one."""
+        text = number or ""
+        if not (text.isascii() and text.isdecimal()) or int(text[:9]) not in self.application_ids:
             return "ER,PW,22"
-        self.active = int(rest)
+        self.activate(int(text[:9]))
         return "PW"

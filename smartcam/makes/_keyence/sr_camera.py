@@ -87,6 +87,11 @@ class EmulatedSr(LineCamera):
         }
         return said.get(line, f"ER,{word},{'02' if word == 'LON' else '00'}")
 
+    def _ends(self) -> None:
+        """Forget the reading under way, as a reader does whose power is gone."""
+        super()._ends()
+        self._reading, self._code, self._run = None, None, self._run + 1
+
     def _begin(self, call: LineClient) -> None:
         if self._reading is not None:
             call.answer("ER,LON,20")

@@ -417,8 +417,10 @@ class InSightMachine:
             m.CellValue(cell, None if said[cell] == ERROR_VALUE else said[cell])
             for cell in self.dialect.cells
         ]
-        fault = None
-        if before != after:
+        fault, now = None, (yield from self._name_job()) if cells else job
+        if now != job:
+            fault = f"job {now} was loaded while the cells of job {job} were read"
+        elif before != after:
             fault = (
                 f"cell {counter}, which counts runs, went from {before} to {after} while the cells "
                 "were read: they may be of more than one run"

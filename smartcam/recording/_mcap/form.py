@@ -23,6 +23,7 @@ from smartcam.models import (
     CameraEvent,
     Connected,
     Disconnected,
+    NoticeReceived,
     Reconnected,
     Result,
     Status,
@@ -403,6 +404,14 @@ def _event(fields: dict[str, Any]) -> CameraEvent:
                 application=_get(fields, "application", int),
                 previous=optional(fields, "previous_application", int),
             )
+        case "NoticeReceived":
+            return NoticeReceived(
+                camera=camera,
+                at=at,
+                kind=_get(fields, "kind", str),
+                code=_get(fields, "code", int),
+                text=_get(fields, "text", str),
+            )
         case _:
             return CameraEvent(camera=camera, at=at)
 
@@ -484,7 +493,8 @@ KINDS: dict[str, Kind] = {
         "Something happened to the camera.",
         {
             "event": _text(
-                "Connected, Reconnected, Disconnected, StatusChanged or ApplicationChanged"
+                "Connected, Reconnected, Disconnected, StatusChanged, ApplicationChanged or "
+                "NoticeReceived"
             ),
             "camera": _CAMERA,
             "at": _AT,
@@ -498,6 +508,9 @@ KINDS: dict[str, Kind] = {
             "previous_status": _BITS,
             "application": _integer("ApplicationChanged: id of the active application"),
             "previous_application": _integer("ApplicationChanged: id of the one before"),
+            "kind": _text("NoticeReceived: error, notification or debug"),
+            "code": _integer("NoticeReceived: the camera's number of it"),
+            "text": _text("NoticeReceived: what the camera says"),
         },
         ("event", "camera", "at"),
         _event_text,

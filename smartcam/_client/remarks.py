@@ -1,0 +1,69 @@
+"""Log what a camera can cause, at a bounded rate: a camera that floods does not flood the log."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+logger: logging.Logger = logging.getLogger("smartcam.client")
+
+MAX_REMARKS = 20
+"""Lines of one kind that a camera may cause in each period."""
+
+PERIOD = 60.0
+"""Seconds in which the lines of a kind are counted together."""
+
+
+@dataclass(slots=True, eq=False)
+class _Logged:
+    """Count of the lines of one kind in the period that began at ``begun``."""
+
+    begun: float
+    count: int = 0
+
+
+class Remarks:
+    """The log lines that one camera causes, each of a kind that has its own count.
+
+    Whoever calls it uses a handful of kinds, never a text of the camera's.
+
+    Args:
+        name: the camera's name, which begins each line.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._kinds: dict[str, _Logged] = {}
+
+    def log(self, kind: str, level: int, text: str, *values: object, now: float) -> None:
+        """Log a line unless there were enough of its kind; later log how many were left out.
+
+        Args:
+            kind: name of the kind, for people.
+            level: level of the line.
+            text: form of the line.
+            values: what stands in the form.
+            now: seconds since any beginning.
+        """
+        found = self._kinds.setdefault(kind, _Logged(now))
+        if now - found.begun >= PERIOD:
+            self._tell_left_out(kind, level, found)
+            found.begun, found.count = now, 0
+        found.count += 1
+        if found.count <= MAX_REMARKS:
+            logger.log(level, "%s %s", self._name, text % values)
+        elif found.count == MAX_REMARKS + 1:
+            more = "%s ! more of the kind %r in %g s than are logged: %d; the others are counted"
+            logger.log(level, more, self._name, kind, PERIOD, MAX_REMARKS)
+
+    def end(self) -> None:
+        """Log how many lines were left out, since the session is over."""
+        for kind, found in self._kinds.items():
+            self._tell_left_out(kind, logging.WARNING, found)
+        self._kinds.clear()
+
+    def _tell_left_out(self, kind: str, level: int, found: _Logged) -> None:
+        left_out = found.count - MAX_REMARKS
+        if left_out > 0:
+            text = "%s ! %d of the kind %r were not logged"
+            logger.log(level, text, self._name, left_out, kind)

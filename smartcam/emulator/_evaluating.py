@@ -1,0 +1,182 @@
+"""Emulated cameras that evaluate one part after the other: what those of a make have in common."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from smartcam.emulator._line_camera import LineCamera
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from smartcam.emulator._line_camera import LineClient
+
+    Handler = Callable[..., str | None]
+
+HandlerT = TypeVar("HandlerT", bound="Handler")
+KindT = TypeVar("KindT")
+
+
+def request(form: str) -> Callable[[HandlerT], HandlerT]:
+    """Have a method of an :class:`EvaluatingCamera` answer the requests of a form.
+
+    The method is given the client and the groups of the form, and returns the answer, None for one
+    that is said later. The first line of its text says what the request does.
+    """
+
+    def mark(method: HandlerT) -> HandlerT:
+        method.form = re.compile(form, re.DOTALL)  # type: ignore[attr-defined]
+        return method
+
+    return mark
+
+
+def applications_of(
+    kind: Callable[..., KindT],
+    given: Iterable[int | Mapping[str, Any]],
+    defaults: Mapping[str, Any] | None,
+) -> list[KindT]:
+    """Return applications made of their numbers, or of mappings of their fields.
+
+    Raises:
+        ConfigurationError: a field is unknown or wrong.
+    """
+    fields = [{"id": one} if isinstance(one, int) else one for one in given]
+    try:
+        return [kind(**{**(defaults or {}), **one}) for one in fields]
+    except TypeError as exc:
+        raise ConfigurationError(f"applications: {exc}") from exc
+
+
+class Operator:
+    """The operator of an emulated camera: what is done at the device itself."""
+
+    def __init__(self, camera: EvaluatingCamera) -> None:
+        self._camera = camera
+
+    def trigger(self) -> None:
+        """Trigger at the input; while an evaluation is under way it is an overrun."""
+        self._camera.overrun() if self._camera.busy else self._camera.begin(None)
+
+    def switch_application(self, application: int, running: bool = False) -> None:
+        """Make another application the active one."""
+        self._camera.activate(application)
+
+
+class EvaluatingCamera(LineCamera):
+    """An emulated camera with applications, each with parts that it evaluates over and over.
+
+    A subclass calls :meth:`set_up` before ``super().__init__()``, and says in :meth:`evaluated`
+    what becomes of a result.
+
+    Attributes:
+        active: number of the active application, 0 or another number of none where none is.
+        busy: an evaluation is under way.
+        parts: the parts of each application, one after the other.
+    """
+
+    requests: ClassVar[Mapping[re.Pattern[str], Handler]] = {}
+    busy: bool = False
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        """Collect the methods that answer requests, in order."""
+        super().__init_subclass__(**given)
+        own = {one.form: one for one in vars(cls).values() if hasattr(one, "form")}
+        cls.requests = {**cls.requests, **own}
+
+    def set_up(self, parts: Mapping[int, Sequence[Any]], active: int | None, *none: int) -> None:
+        """Take the parts of each application by its number.
+
+        Args:
+            parts: by the number of the application.
+            active: number of the active one; None for the first one.
+            none: numbers that say that no application is active.
+
+        Raises:
+            ConfigurationError: there is no such application, or one has no parts.
+        """
+        self.active: int = next(iter(parts), 0) if active is None else active
+        if self.active not in {*none, *parts}:
+            raise ConfigurationError(f"active: one of {[*parts]} was expected, got {active!r}")
+        if not all(parts.values()):
+            raise ConfigurationError("parts: at least one was expected")
+        self.parts: dict[int, Iterator[Any]] = {
+            number: itertools.cycle(some) for number, some in parts.items()
+        }
+        self._numbers_of_applications = [*parts]
+        self._call: LineClient | None = None  # that the evaluation under way answers
+        self._run = 0  # an application that is switched voids the evaluation under way
+        self.device: Any = Operator(self)
+
+    @classmethod
+    def state_options(cls, active: int | None, *, running: bool) -> dict[str, Any]:
+        """Return the options with which an application is active."""
+        return {"active": active}
+
+    @property
+    def application_ids(self) -> list[int]:
+        """Numbers of its applications."""
+        return list(self._numbers_of_applications)
+
+    def answer_to(self, client: LineClient, line: str, unknown: str) -> str | None:
+        """Return the answer to a request of one of the forms; None where it comes later."""
+        for form, method in self.requests.items():
+            found = form.fullmatch(line)
+            if found is not None:
+                return method(self, client, *found.groups())
+        return unknown
+
+    # ------------------------------------------------------------------ evaluations
+
+    async def start(self) -> None:
+        """Open the port, and evaluate by itself where the active application does so."""
+        await super().start()
+        if not self.busy:
+            self.activated()
+
+    @property
+    def evaluation_time(self) -> float:
+        """Seconds of an evaluation."""
+        raise NotImplementedError
+
+    def evaluated(self, call: LineClient | None, part: Any) -> None:
+        """Tell the values of a part to the client that has asked for them, and to others."""
+        raise NotImplementedError
+
+    def voided(self, call: LineClient) -> None:
+        """Answer a request whose evaluation gives no result; nothing unless overridden."""
+
+    def overrun(self) -> None:
+        """Note a trigger that came too early; nothing unless overridden."""
+
+    def activated(self) -> None:
+        """Note that an application is active, or is again; nothing unless overridden."""
+
+    def _ends(self) -> None:
+        """Forget the evaluation under way, as a device does whose power is gone."""
+        super()._ends()
+        self.busy, self._call, self._run = False, None, self._run + 1
+
+    def begin(self, call: LineClient | None) -> None:
+        """Begin an evaluation, which is the answer to a request or nobody's."""
+        self.busy, self._run, self._call = True, self._run + 1, call
+        run = self._run
+        self.after(self.evaluation_time, lambda: self._end(run))
+
+    def _end(self, run: int) -> None:
+        if run != self._run:
+            return
+        call, self._call, self.busy = self._call, None, False
+        self.evaluated(None if call is None or call.gone else call, next(self.parts[self.active]))
+        self.activated()
+
+    def activate(self, application: int) -> None:
+        """Make another application the active one; the evaluation under way gives no result."""
+        call, self._call, self.busy = self._call, None, False
+        self.active, self._run = application, self._run + 1
+        if call is not None and not call.gone:
+            self.voided(call)
+        self.activated()

@@ -1,0 +1,156 @@
+"""Results that do not say of which application they are, held until the camera has said it.
+
+The camera is asked for its application behind each result, and in front of each trigger. A result
+is told when the question behind it is answered. Where all that the camera has said of its
+application around the result is one number, that is the result's; else it has a fault, so that it
+is no value of any application. Everything that comes behind a held result waits with it: what
+comes keeps its order.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from smartcam.exceptions import FrameError
+from smartcam.protocols import messages as m
+
+if TYPE_CHECKING:
+    from smartcam.protocols._machine import Event
+
+MAX_HELD = 4096
+"""Events that may wait for a result's application: the camera answers within a round trip."""
+
+MAX_HELD_BYTES = 1 << 26
+"""Bytes of the results among them: four pictures of 16 MB."""
+
+
+@dataclass(slots=True, eq=False)
+class _Held:
+    """Messages of one answer or one line, with a result among them.
+
+    Attributes:
+        messages: what is told.
+        size: bytes of the results.
+        question: number of the question that will tell the application.
+        front: number of the question in front of the trigger, 0 for none.
+        seen: applications that the camera has named around the result.
+    """
+
+    messages: tuple[Event, ...]
+    size: int
+    question: int
+    front: int
+    seen: set[int]
+
+
+class HeldResults:
+    """The events of one link, in order, up to the first result whose application is not known."""
+
+    def __init__(self) -> None:
+        self._ready: list[Event] = []
+        self._waiting: deque[Event | _Held] = deque()
+        self._size = 0
+        self._asked = 0  # number of the last question
+        self._open: set[int] = set()  # numbers of questions without an answer
+        self._named: int | None = None  # the application that the camera named last
+        self._front = 0  # number of the question in front of the last trigger
+        self._seen: set[int] | None = None  # applications named since that question
+
+    def ask(self, *, trigger: bool = False) -> int:
+        """Return the number of the question that is put now, maybe in front of a trigger."""
+        self._asked += 1
+        self._open.add(self._asked)
+        if trigger:
+            self._front, self._seen = self._asked, set()
+        return self._asked
+
+    def add(self, messages: tuple[Event, ...], *, answers_trigger: bool) -> bool:
+        """Take what came; return True if a question is to be put now for a result in it.
+
+        Raises:
+            FrameError: too much waits for an answer.
+        """
+        results = [one for one in messages if isinstance(one, m.ResultContainer)]
+        seen = set[int]() if self._named is None else {self._named}
+        if answers_trigger and self._seen is not None:
+            seen, self._seen = self._seen, None
+        if results:
+            size = sum(len(one.data) for one in results)
+            self._waiting.append(_Held(messages, size, self._asked + 1, self._front, seen))
+            self._size += size
+        elif self._waiting:
+            self._waiting.extend(messages)
+        else:
+            self._ready += messages
+        if len(self._waiting) > MAX_HELD or self._size > MAX_HELD_BYTES:
+            raise FrameError(
+                f"{len(self._waiting)} events came, with results of {self._size} bytes, and no "
+                "answer to the question for the application that they are of"
+            )
+        return bool(results) and not self._open
+
+    def pass_on(self, events: tuple[Event, ...]) -> None:
+        """Take what can be told as it is."""
+        self._ready += events
+
+    def name(self, application: int, question: int = 0) -> bool:
+        """Take the application that the camera says is active now.
+
+        Args:
+            application: id of the application.
+            question: number of the question that this answers, 0 for one that was not put here.
+
+        Returns:
+            Whether a question is to be put now for a result that came since the last one.
+        """
+        self._named = application
+        self._open.discard(question)
+        held = [one for one in self._waiting if isinstance(one, _Held)]
+        for seen in (self._seen, *(one.seen for one in held)):
+            if seen is not None:
+                seen.add(application)
+        self._release()
+        return bool(self._waiting) and held[-1].question > self._asked and not self._open
+
+    def take(self) -> list[Event]:
+        """Return the events that can be told, in order; the caller owns the list."""
+        ready, self._ready = self._ready, []
+        return ready
+
+    def end(self) -> None:
+        """Note that nothing is answered any more: what waits is told with a fault."""
+        self._release(ended=True)
+
+    def _release(self, *, ended: bool = False) -> None:
+        while self._waiting:
+            first = self._waiting[0]
+            if isinstance(first, _Held):
+                waits = first.question > self._asked or not self._open.isdisjoint(
+                    {first.front, first.question}
+                )
+                if waits and not ended:
+                    return
+                self._ready += _with_application(first, self._named, unknown=waits)
+                self._size -= first.size
+            else:
+                self._ready.append(first)
+            self._waiting.popleft()
+
+
+def _with_application(held: _Held, named: int | None, *, unknown: bool) -> tuple[Event, ...]:
+    """Return messages whose results have their application, or a fault."""
+    fault = None
+    if unknown or named is None:
+        fault = "the link ended before the camera said of which application the result is"
+    elif len(held.seen) > 1:
+        which = ", ".join(map(str, sorted(held.seen)))
+        fault = f"the application changed while the result was made: it may be of any of {which}"
+    application = m.UNNAMED_APPLICATION if named is None else named
+    return tuple(
+        replace(one, application=application, fault=one.fault or fault)
+        if isinstance(one, m.ResultContainer)
+        else one
+        for one in held.messages
+    )
