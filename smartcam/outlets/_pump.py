@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.backoff import Backoff
 from smartcam.outlets._entry import EntryRefusedError, OutletAccount, OutletEntry
+from smartcam.outlets._spool import is_damage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -104,7 +105,7 @@ class Pump:
             sqlite3.Error: its file cannot be made.
         """
         try:
-            await self._run(self.spool.open)
+            await self._run(lambda: None)  # which opens it
         except BaseException:
             await self._end_thread()
             raise
@@ -122,7 +123,7 @@ class Pump:
         try:
             await self._end(self._tasks[:1])
             if self._open:
-                with contextlib.suppress(TimeoutError, sqlite3.Error):
+                with contextlib.suppress(Exception):  # what stays is told by the next start
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._lost:
                             await self._keep_some()
@@ -145,9 +146,13 @@ class Pump:
             await asyncio.wait(tasks)
 
     async def _end_thread(self) -> None:
+        ended = not (self._waiting or self._lost)
         with contextlib.suppress(RuntimeError, TimeoutError):
+            closing = asyncio.wrap_future(
+                self._thread.submit(lambda: self.spool.close(ended=ended))
+            )
             async with asyncio.timeout(STOP_TIMEOUT):
-                await self._run(self.spool.close)
+                await asyncio.shield(closing)
         self._thread.shutdown(wait=False)
 
     def offer(
@@ -188,11 +193,8 @@ class Pump:
             while self._waiting or self._lost:
                 try:
                     await self._keep_some()
-                except sqlite3.OperationalError as exc:
-                    self._say_disk(f"the spool {self.spool.path}: {exc}")
-                    await asyncio.sleep(DISK_RETRY_SECONDS)
-                except sqlite3.Error as exc:
-                    self._say_disk(f"the spool {self.spool.path} was damaged: {exc}")
+                except Exception as exc:  # noqa: BLE001 - whatever it is, what waits is kept
+                    self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                     self._account = self.spool.account
                     await asyncio.sleep(DISK_RETRY_SECONDS)
                 else:
@@ -243,12 +245,13 @@ class Pump:
         """Have work done in the spool's thread, and what follows, also for a cancelled caller."""
 
         def guarded() -> T:
+            if self.spool.closed:
+                self.spool.open()
             try:
                 return work()
-            except sqlite3.OperationalError:
-                raise  # the disk is full or away
-            except sqlite3.DatabaseError:
-                self.spool.reopen()
+            except sqlite3.Error as exc:
+                if is_damage(exc):
+                    self.spool.renew(text_of(exc))
                 raise
 
         running = asyncio.wrap_future(self._thread.submit(guarded))
@@ -340,8 +343,8 @@ class Pump:
         while True:
             try:
                 await self._run(work, self._set_account)
-            except sqlite3.OperationalError as exc:
-                self._say_disk(f"the spool {self.spool.path}: {exc}")
+            except sqlite3.Error as exc:
+                self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                 await asyncio.sleep(DISK_RETRY_SECONDS)
             else:
                 return
