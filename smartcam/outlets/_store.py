@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._outlet import Column, OutletDesk
 
-VERSION = 1
+VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
 
 MAX_COLUMNS = 500
@@ -41,7 +41,7 @@ CREATE TABLE IF NOT EXISTS results(
     id TEXT PRIMARY KEY, camera TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL,
     kind TEXT NOT NULL, at TEXT NOT NULL, application INTEGER, sequence INTEGER,
     triggered_at TEXT, latency REAL, error TEXT, error_kind TEXT, lost INTEGER, value TEXT,
-    records INTEGER, picture TEXT);
+    records INTEGER, picture TEXT, at_least INTEGER);
 CREATE INDEX IF NOT EXISTS results_at ON results(at);
 CREATE TABLE IF NOT EXISTS fields(
     application INTEGER NOT NULL, name TEXT NOT NULL, column_name TEXT NOT NULL,
@@ -132,6 +132,8 @@ class ResultStore(Outlet[StoreSettings]):
         with _transaction(database):
             for statement in filter(str.strip, _TABLES.split(";")):
                 database.execute(statement)
+            if version == 1:
+                database.execute("ALTER TABLE results ADD COLUMN at_least INTEGER")
             database.execute(f"PRAGMA user_version = {VERSION}")
         self._expired = 0.0
 
@@ -170,6 +172,7 @@ class ResultStore(Outlet[StoreSettings]):
             None if value is None else json.dumps(value, separators=(",", ":")),
             None if records is None else len(records),
             self._picture(entry, said),
+            said.get("at_least"),
         )
         marks = ", ".join("?" * len(row))
         written = database.execute(f"INSERT OR IGNORE INTO results VALUES ({marks})", row).rowcount  # noqa: S608
