@@ -13,8 +13,12 @@ from pydantic import AfterValidator, Field
 
 from smartcam._extras import load
 from smartcam._json import object_text
-from smartcam.exceptions import ConfigurationError, SmartCamError
-from smartcam.outlets._entry import EntryRefusedError, OutletError
+from smartcam.exceptions import (
+    ConfigurationError,
+    EntryRefusedError,
+    OutletError,
+    SmartCamError,
+)
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._settings import OutletSettings, Secret
 

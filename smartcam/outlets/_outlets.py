@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from smartcam.models import Result
     from smartcam.outlets._entry import OutletAccount
     from smartcam.outlets._settings import OutletSettings, Section
+    from smartcam.outlets._stored import StoredResults, StoreQuestion
 
 RESULT_BYTES = 600
 """Bytes that a result keeps in memory beside its container, about."""
@@ -118,6 +119,15 @@ class Outlets(Server):
             name: OutletState(pump.account, pump.disk_trouble or pump.trouble)
             for name, pump in self._pumps.items()
         }
+
+    def stored(self, question: StoreQuestion) -> dict[str, StoredResults]:
+        """Return what far ends keep, by the outlet's name; of those that can be asked. Blocks.
+
+        Raises:
+            ConfigurationError: one cannot be read now.
+        """
+        answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
+        return {name: found for name, found in answers.items() if found is not None}
 
     # ------------------------------------------------------------------ what cameras bring
 

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.backoff import Backoff
-from smartcam.outlets._entry import EntryRefusedError, OutletAccount, OutletEntry
+from smartcam.exceptions import EntryRefusedError
+from smartcam.outlets._entry import OutletAccount, OutletEntry
 from smartcam.outlets._spool import is_damage
 
 if TYPE_CHECKING:

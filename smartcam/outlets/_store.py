@@ -17,6 +17,7 @@ from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._settings import OutletSettings
+from smartcam.outlets._stored import read_store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._outlet import Column, OutletDesk
+    from smartcam.outlets._stored import StoredResults, StoreQuestion
 
 VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
@@ -98,6 +100,14 @@ class ResultStore(Outlet[StoreSettings]):
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Write entries, all or none."""
         await self._run(lambda: self._write(entries))
+
+    def stored(self, question: StoreQuestion) -> StoredResults | None:
+        """Return what is in the file.
+
+        Raises:
+            ConfigurationError: it cannot be read.
+        """
+        return read_store(self.path, question)
 
     async def close(self) -> None:
         """Close the file."""

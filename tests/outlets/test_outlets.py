@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from smartcam.exceptions import ConfigurationError
-from smartcam.outlets import EntryRefusedError, OutletEntry, Outlets, OutletsFile
+from smartcam.exceptions import ConfigurationError, EntryRefusedError
+from smartcam.outlets import OutletEntry, Outlets, OutletsFile
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import FarEnd, ListOutlet, numbers, result, until
 

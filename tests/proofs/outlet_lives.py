@@ -25,7 +25,8 @@ from typing import Any
 
 import smartcam.outlets
 from smartcam.backoff import Backoff
-from smartcam.outlets import Outlet, OutletEntry, OutletError, Outlets, OutletSettings
+from smartcam.exceptions import OutletError
+from smartcam.outlets import Outlet, OutletEntry, Outlets, OutletSettings
 from smartcam.outlets import _pump as pumps
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import result
