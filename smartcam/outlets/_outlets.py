@@ -6,6 +6,7 @@ import contextlib
 import sqlite3
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._arguments import check_callable, check_kind, check_path
 from smartcam._json import object_text
 from smartcam._server import Server
 from smartcam._user_code import ENDS_PROGRAM, text_of
@@ -15,6 +16,7 @@ from smartcam.outlets._outlet import Column, OutletDesk
 from smartcam.outlets._pump import Pump
 from smartcam.outlets._settings import mistakes_of, outlet_class
 from smartcam.outlets._spool import Spool, read_account
+from smartcam.outlets._stored import StoreQuestion
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.models import Result
     from smartcam.outlets._entry import OutletAccount
     from smartcam.outlets._settings import OutletSettings, Section
-    from smartcam.outlets._stored import StoredResults, StoreQuestion
+    from smartcam.outlets._stored import StoredResults
 
 RESULT_BYTES = 600
 """Bytes that a result keeps in memory beside its container, about."""
@@ -60,12 +62,20 @@ class Outlets(Server):
     def __init__(
         self,
         section: Section,
-        folder: Path,
+        folder: str | Path,
         *,
         columns: Callable[[str, int], Sequence[Column]] = lambda _camera, _application: (),
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         tell: Callable[[str, str], None] = lambda _name, _why: None,
     ) -> None:
+        check_kind(
+            section, dict, "section", "a mapping of settings by the outlet's name", "Outlets"
+        )
+        folder = check_path(folder, "folder", "Outlets")
+        check_callable(columns, "columns", "Outlets")
+        check_callable(tell, "tell", "Outlets")
+        if command is not None:
+            check_callable(command, "command", "Outlets")
         for place, text in mistakes_of(section):
             raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
         desk = OutletDesk(columns, command)
@@ -126,6 +136,7 @@ class Outlets(Server):
         Raises:
             ConfigurationError: one cannot be read now.
         """
+        check_kind(question, StoreQuestion, "question", "a StoreQuestion", "stored")
         answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
         return {name: found for name, found in answers.items() if found is not None}
 

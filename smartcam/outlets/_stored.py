@@ -93,7 +93,9 @@ def read_store(path: Path, question: StoreQuestion) -> StoredResults:
 
 
 def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResults:
-    database.create_function("chosen", 1, lambda name: name == "" or chosen((question.camera,), name))
+    database.create_function(
+        "chosen", 1, lambda name: name == "" or chosen((question.camera,), name)
+    )
     bad = _failure_condition(database)
     which, values = ["1"], list[Any]()
     if question.since is not None:
