@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-
 Kind: TypeAlias = Literal["result", "error", "gap"]
 
 

@@ -84,7 +84,7 @@ class Outlet(ABC, Generic[SettingsT]):
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Hear of a camera's state: ``connected``, ``application``, ``reason``; return at once."""
 
-    def stored(self, question: StoreQuestion) -> StoredResults | None:  # noqa: ARG002 - a base
+    def stored(self, question: StoreQuestion) -> StoredResults | None:
         """Return what the far end keeps; None where it cannot be asked. Called in a thread."""
         return None
 

@@ -255,8 +255,8 @@ async def _outlets(site: FleetSite, _call: CallRequest) -> object:
     "GET",
     f"{API}/stored",
     query=StoredRows,
-    about="What agents' stores of results have: the query may have `hours`, `failed` (errors, gaps, "
-    "what did not pass), `camera` (a pattern), `most`.",
+    about="What agents' stores of results have: the query may have `hours`, `failed` (errors, "
+    "gaps, what did not pass), `camera` (a pattern), `most`.",
 )
 async def _stored(site: FleetSite, call: CallRequest) -> object:
     return {"stores": [one._asdict() for one in await site.outlets.stored(call.query)]}

@@ -49,7 +49,7 @@ async def triggered(fleet: Fleet, count: int) -> None:
     async def all_there() -> bool:
         return [one.delivered for one in await fleet.outlets()] == [count]
 
-    while not await all_there():  # noqa: ASYNC110 - bounded by the test's own timeout
+    while not await all_there():
         pass
 
 

@@ -1,4 +1,4 @@
-"""Outlets over the bus: agents tell the accounts of theirs, and what their stores of results say."""
+"""Outlets over the bus: agents tell the accounts of theirs, and what their stores say."""
 
 from __future__ import annotations
 
