@@ -35,6 +35,10 @@ MAX_WAITING_BYTES = 1 << 26
 MAX_WRITTEN_TOGETHER = 500
 """Entries of one write to the spool."""
 
+GATHER_SECONDS = 0.01
+"""Seconds in which entries gather in memory before they are written together: a write is out of the
+way of the trigger whose result it has, and many results cost one write."""
+
 DISK_RETRY_SECONDS = 1.0
 """Seconds until a disk that was full or away is tried again."""
 
@@ -190,6 +194,7 @@ class Pump:
     async def _write(self) -> None:
         while True:
             await self._came.wait()
+            await asyncio.sleep(GATHER_SECONDS)
             self._came.clear()
             while self._waiting or self._lost:
                 try:

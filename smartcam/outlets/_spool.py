@@ -26,6 +26,9 @@ ROW_BYTES = 200
 MAX_PLACE = (1 << 63) - 1
 """The last place that an entry may have."""
 
+MAX_REASON_CHARACTERS = 500
+"""Characters of the reasons of a gap, which may be several gaps in one."""
+
 MAX_DAMAGED_FILES = 3
 """Damaged spools that are kept beside the new one."""
 
@@ -532,7 +535,7 @@ def _add_gap(
         place: place of the gap; None: the end.
         unknown: whether more may be missing than the count tells.
     """
-    unknown, gone = unknown or count == 0, list[tuple[int]]()
+    unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
     for there, checksum, *fields in database.execute(
         f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
         "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
@@ -544,9 +547,12 @@ def _add_gap(
         said = json.loads(entry.body)
         count += said["lost"]
         unknown = unknown or said["at_least"]
+        reasons.append(said["error"])
         gone.append((there,))
     database.executemany("DELETE FROM entries WHERE place = ?", gone)
-    body = json.dumps({"error": why, "kind": "Gap", "lost": count, "at_least": unknown})
+    each = dict.fromkeys(one for text in reversed(reasons) for one in text.split("; "))
+    error = "; ".join(each)[:MAX_REASON_CHARACTERS]
+    body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": unknown})
     gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)
     database.execute(_INSERT, _row(gap, place))
 

@@ -54,6 +54,7 @@ class Life:
         room: bytes of the spool.
         policy: policy beyond that.
         drains: whether the life ends when everything is delivered, not before.
+        gather: seconds in which entries gather before they are written.
         seed: seed of its pauses.
     """
 
@@ -67,6 +68,7 @@ class Life:
     room: int = 1 << 30
     policy: str = "drop_oldest"
     drains: bool = False
+    gather: float = 0.0
     seed: int = 0
 
 
@@ -153,6 +155,7 @@ def live(number: int, life: Life, section: dict[str, Any], folder: Path, say: in
     """Live as planned, and say into a pipe what was done; return the exit code."""
     _step_clock(life.clock[0])
     pumps.DISK_RETRY_SECONDS = 0.005
+    pumps.GATHER_SECONDS = life.gather
     pumps.MAX_WAITING = life.waiting
     pumps.LINGER = 0.05
     pumps.Backoff = lambda: Backoff(initial=0.002, maximum=0.02)  # type: ignore[misc,assignment]

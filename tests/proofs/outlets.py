@@ -75,6 +75,7 @@ def plan(seed: int, number: int) -> Cell:
             waiting=dice.randrange(3, 12) if kind == "memory" else 20_000,
             room=room,
             policy=policy,
+            gather=dice.choice([0.0, 0.0, 0.001, 0.01]),
             seed=dice.randrange(1 << 30),
         )
         lives.append(life)
@@ -245,6 +246,10 @@ def damage(folder: Path, dice: random.Random) -> str:
 # ---------------------------------------------------------------------- the judge
 
 
+Entry = tuple[int, int]
+"""Epoch and number of an entry of one camera."""
+
+
 class Arrived(NamedTuple):
     """Something that the far end has."""
 
@@ -295,8 +300,19 @@ def store_of(folder: Path) -> dict[str, Arrived]:
 def judge(cell: Cell, lives: list[Lived], found: dict[str, Arrived]) -> collections.Counter[str]:
     """Compare what arrived with what was offered; return figures."""
     figures: collections.Counter[str] = collections.Counter()
-    for life, said in enumerate(lives):
-        _judge_life(life, said, found, figures, disturbed=_disturbed(lives, life))
+    unknown: list[tuple[str, Entry]] = []
+    for camera in {name for said in lives for name in said.offers}:
+        missing = _missing(camera, lives, found)
+        left = _uncovered(missing, camera, found)
+        figures["told by a number"] += len(missing) - len(left)
+        unknown += [(camera, one) for one in left]
+    figures["told without a number"] = len(unknown)
+    in_memory = sum(len(said.offers) - (said.kept - said.before) for said in lives)
+    disturbed = any(said.disturbed for said in lives)
+    assert disturbed or len(unknown) <= in_memory, f"{unknown} unknown, {in_memory} in memory"
+    for camera, entry in unknown:
+        damaged = disturbed and len(unknown) > in_memory
+        assert _says_more(camera, entry, found, damaged), f"{camera} lacks {entry}: nobody says so"
     known = {one.epoch for one in lives}
     strange = [one for one in found.values() if one.kind != "gap" and one.epoch not in known]
     assert not strange, f"nobody offered {strange[:3]}"
@@ -318,20 +334,10 @@ def judge(cell: Cell, lives: list[Lived], found: dict[str, Arrived]) -> collecti
     return figures
 
 
-def _disturbed(lives: list[Lived], life: int) -> bool:
-    return any(one.disturbed for one in lives[life:])
-
-
-def _judge_life(
-    life: int,
-    said: Lived,
-    found: dict[str, Arrived],
-    figures: collections.Counter[str],
-    *,
-    disturbed: bool,
-) -> None:
-    left: dict[str, list[int]] = {}
-    for camera in {*said.offers}:
+def _missing(camera: str, lives: list[Lived], found: dict[str, Arrived]) -> list[Entry]:
+    """Return the entries of a camera that did not arrive; those that did are what was offered."""
+    missing: list[Entry] = []
+    for life, said in enumerate(lives):
         places = [n for n, name in enumerate(said.offers) if name == camera]
         here = {
             one.number: one
@@ -342,46 +348,37 @@ def _judge_life(
         for number, one in here.items():
             wanted = value_of(life, places[number - 1])
             assert one.value == wanted, f"{camera} {number}: {one.value}, offered {wanted}"
-        missing = [number for number in range(1, len(places) + 1) if number not in here]
-        left[camera] = _uncovered(missing, camera, said.epoch, found)
-        figures["told by a number"] += len(missing) - len(left[camera])
-    unknown = sum(map(len, left.values()))
-    figures["told without a number"] += unknown
-    in_memory = len(said.offers) - (said.kept - said.before)
-    assert disturbed or unknown <= in_memory, f"life {life}: {unknown} unknown of {in_memory}"
-    for camera, numbers in left.items():
-        assert not numbers or _says_more(numbers, camera, said, found, unknown > in_memory), (
-            f"life {life}: {camera} lacks {numbers} of {len(said.offers)}, and nobody says so"
-        )
+        numbers = {*range(1, len(places) + 1)} - here.keys()
+        missing += [(said.epoch, number) for number in sorted(numbers)]
+    return missing
 
 
-def _uncovered(missing: list[int], camera: str, epoch: int, found: dict[str, Arrived]) -> list[int]:
-    """Return the missing numbers that no gap counts."""
+def _uncovered(missing: list[Entry], camera: str, found: dict[str, Arrived]) -> list[Entry]:
+    """Return the missing entries that no gap counts; a gap counts entries up to its own number."""
     gaps = sorted(
-        (one.number, one.lost)
+        ((one.epoch, one.number), one.lost)
         for one in found.values()
-        if (one.camera, one.epoch, one.kind) == (camera, epoch, "gap") and one.lost
+        if (one.camera, one.kind) == (camera, "gap") and one.lost
     )
     left = [*missing]
-    for number, lost in gaps:
-        covered = [one for one in left if one <= number][:lost]
+    for last, lost in gaps:
+        covered = [one for one in left if one <= last][-lost:]
         left = [one for one in left if one not in covered]
     return left
 
 
-def _says_more(
-    left: list[int], camera: str, said: Lived, found: dict[str, Arrived], damaged: bool
-) -> bool:
+def _says_more(camera: str, entry: Entry, found: dict[str, Arrived], damaged: bool) -> bool:
     """Return True if a gap of the camera, or of all, says that more may be missing there."""
     for one in found.values():
         if one.kind != "gap" or not one.at_least:
             continue
         tells_damage = "damaged" in (one.error or "") or "is gone" in (one.error or "")
-        if one.camera == "" and one.epoch == said.epoch:
+        last = one.epoch, one.number
+        if one.camera == "" and (
+            one.epoch == entry[0] or (one.epoch > entry[0] and tells_damage >= damaged)
+        ):
             return True
-        if one.camera == "" and one.epoch > said.epoch and tells_damage >= damaged:
-            return True
-        if one.camera == camera and one.epoch == said.epoch and one.number <= left[0]:
+        if one.camera == camera and (entry < last or (one.epoch == entry[0] and last <= entry)):
             return True
     return False
 
