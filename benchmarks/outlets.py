@@ -50,7 +50,7 @@ class StalledOutlet(Outlet[StalledSettings]):
 
     settings_class = StalledSettings
 
-    async def deliver(self, entries: Sequence[OutletEntry]) -> None:  # noqa: ARG002 - none is taken
+    async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Wait for ever."""
         await asyncio.Event().wait()
 

@@ -1,4 +1,4 @@
-"""What the names of truth values tell: which value is good."""
+"""Tell from the name of a truth value which value is good."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class FleetOutlets(Server):
         await self.outlets.stop()
 
     async def stored(self, asked: StoredRequest) -> dict[str, dict[str, Any]]:
-        """Return what the stores say, by the outlet's name.
+        """Return the answers of the stores, by the outlet's name.
 
         Raises:
             ConfigurationError: one cannot be read now.

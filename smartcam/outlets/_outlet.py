@@ -85,7 +85,7 @@ class Outlet(ABC, Generic[SettingsT]):
         """Hear of a camera's state: ``connected``, ``application``, ``reason``; return at once."""
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
-        """Return what the far end keeps; None where it cannot be asked. Called in a thread."""
+        """Return the results at the far end; None where it cannot be asked. In a thread."""
         return None
 
     async def watch(self) -> None:

@@ -131,7 +131,7 @@ class Outlets(Server):
         }
 
     def stored(self, question: StoreQuestion) -> dict[str, StoredResults]:
-        """Return what far ends keep, by the outlet's name; of those that can be asked. Blocks.
+        """Return the results at far ends that can be asked, by the outlet's name; blocks.
 
         Raises:
             ConfigurationError: one cannot be read now.

@@ -102,7 +102,7 @@ class ResultStore(Outlet[StoreSettings]):
         await self._run(lambda: self._write(entries))
 
     def stored(self, question: StoreQuestion) -> StoredResults | None:
-        """Return what is in the file.
+        """Return the results in the file.
 
         Raises:
             ConfigurationError: it cannot be read.

@@ -76,7 +76,7 @@ class StoredResults(NamedTuple):
 
 
 def read_store(path: Path, question: StoreQuestion) -> StoredResults:
-    """Return what is in a store, which an outlet may be writing; blocks.
+    """Return the results in a store, which an outlet may be writing; blocks.
 
     Raises:
         ConfigurationError: there is no such file, it is no store, or it does not answer in time.

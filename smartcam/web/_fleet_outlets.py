@@ -1,4 +1,4 @@
-"""What a fleet's page shows of outlets: asked once for all who look."""
+"""Outlets on a fleet's page: agents are asked once for all who look."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class OutletsView:
             return self._accounts
 
     async def stored(self, wanted: StoredRows) -> list[ToldStore]:
-        """Return what the stores say.
+        """Return the answers of the stores.
 
         Raises:
             RefusedError: 422, the pattern cannot be one; 503, the fleet is closed.

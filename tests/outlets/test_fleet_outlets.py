@@ -169,7 +169,7 @@ async def test_results_of_one_camera_go_to_a_store_and_the_commands_show_them(
     code, out, err = await command("results", str(tmp_path / "results.sqlite"), "--json")
     assert code == 0, err
     told = json.loads(out.splitlines()[-1])
-    assert account["delivered"] <= told["rows"] <= account["results"]
+    assert account["delivered"] <= told["total"] <= account["results"]
 
 
 async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
@@ -212,9 +212,16 @@ async def test_results_that_did_not_pass_are_found_with_errors_and_gaps(tmp_path
     assert code == 0, err
     *shown, total = map(json.loads, out.splitlines())
     assert sorted(one["id"] for one in shown) == ["a/1/2", "a/1/3", "a/1/4/gap"]
-    assert total == {"rows": 4, "failed": 3, "errors": 1, "lost": 5}
+    assert total == {
+        "total": 4,
+        "failed": 3,
+        "errors": 1,
+        "gaps": 1,
+        "lost": 5,
+        "at_least": False,
+    }
     code, out, err = await command("results", path, "--since", "8h", "--json")
-    assert json.loads(out.splitlines()[-1])["rows"] == 0
+    assert json.loads(out.splitlines()[-1])["total"] == 0
     code, _, err = await command("results", str(tmp_path / "none"))
     assert code == 2
     assert "there is no such file" in err

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import importlib
 import json
 import os
 import random
@@ -27,12 +28,13 @@ import smartcam.outlets
 from smartcam.backoff import Backoff
 from smartcam.exceptions import OutletError
 from smartcam.outlets import Outlet, OutletEntry, Outlets, OutletSettings
-from smartcam.outlets import _pump as pumps
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import result
 
 LIFE_SECONDS = 240.0
 """Seconds within which a life ends or has delivered everything, also on a busy machine."""
+
+pumps: Any = importlib.import_module("smartcam.outlets._pump")
 
 PACKAGE = str(Path(smartcam.outlets.__file__).parent)
 
@@ -158,7 +160,7 @@ def live(number: int, life: Life, section: dict[str, Any], folder: Path, say: in
     pumps.GATHER_SECONDS = life.gather
     pumps.MAX_WAITING = life.waiting
     pumps.LINGER = 0.05
-    pumps.Backoff = lambda: Backoff(initial=0.002, maximum=0.02)  # type: ignore[misc,assignment]
+    pumps.Backoff = lambda: Backoff(initial=0.002, maximum=0.02)
     OUTLETS.register("journal", JournalOutlet)
     if life.line:
         _die_at_line(life)

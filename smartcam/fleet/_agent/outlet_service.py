@@ -211,7 +211,7 @@ async def ask_outlets(bus: Bus, keys: Keys, timeout: float) -> list[ToldOutlet]:
 async def ask_stores(
     bus: Bus, keys: Keys, request: StoredRequest, timeout: float
 ) -> list[ToldStore]:
-    """Return what all agents' stores said within ``timeout`` seconds."""
+    """Return the answers of all agents' stores that came within ``timeout`` seconds."""
     payload = request.model_dump_json().encode()
     return await _ask(bus, keys.outlets("*", "results"), payload, timeout, _stores)
 

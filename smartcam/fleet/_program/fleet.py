@@ -519,7 +519,7 @@ class Fleet:
         most: int = 100,
         timeout: float = STORE_TIMEOUT,
     ) -> list[ToldStore]:
-        """Return what agents' stores of results have, by agent and outlet.
+        """Return the answers of agents' stores of results, by agent and outlet.
 
         Args:
             pattern: pattern of the cameras' names.
