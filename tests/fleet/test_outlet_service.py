@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import sqlite3
 from collections.abc import AsyncIterator
@@ -14,10 +15,11 @@ import pytest
 
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import Fleet, FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
 from smartcam.fleet._inside import FleetOutlets, Keys
 
 pytestmark = pytest.mark.real_time
+
+MemoryBus: Any = importlib.import_module("smartcam.fleet._bus.bus").MemoryBus
 
 FLEET = """
 agent: a1
