@@ -206,7 +206,6 @@ class Spool:
             database.executescript(_SCHEMA)
             with _transaction(database):
                 self._write(database, saved)
-                database.execute("DELETE FROM cameras")
                 lost = _settle(database, counts)
                 epoch = max([counts.get("epoch", 0), *(entry.epoch for entry in saved)])
                 epoch = 1 + max(epoch, self._last_epoch(), time.time_ns() // 1000)
@@ -251,15 +250,18 @@ class Spool:
         with _transaction(database):
             for last, count, why in lost:
                 _add_gap(database, last, count, why, self._in_flight)
-                _remember(database, [last])
                 new["results"] = new.get("results", 0) + count
                 new["dropped.memory"] = new.get("dropped.memory", 0) + count
             came = sum(entry.kind != "gap" for entry in entries)
             new["results"] = new.get("results", 0) + came
-            kept = list(entries)
-            if self._policy == "drop_newest":
-                kept = self._refuse(database, kept, new)
+            taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
+            kept, refused = entries[:taken], [one for one in entries[taken:] if one.kind != "gap"]
             size = self._write(database, kept)
+            for last, count in _by_camera(refused):
+                _add_gap(database, last, count, "the spool was full", self._in_flight)
+            if refused:
+                new["dropped.full"] = new.get("dropped.full", 0) + len(refused)
+            _remember(database, [*(last for last, _, _ in lost), *entries])
             gone, freed = self._make_room(database, self._bytes + size, new)
             _set(database, new)
         self._counts = new
@@ -269,25 +271,16 @@ class Spool:
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
         rows = [_row(entry) for entry in entries]
         database.executemany(_INSERT, rows)
-        _remember(database, entries)
         return sum(row[-2] for row in rows)
 
-    def _refuse(
-        self, database: sqlite3.Connection, entries: list[OutletEntry], counts: dict[str, int]
-    ) -> list[OutletEntry]:
-        """Return the entries that there is room for; those behind become gaps."""
-        room, taken = self._max_bytes - self._bytes, 0
-        for entry in entries:
+    def _room_for(self, entries: Sequence[OutletEntry]) -> int:
+        """Return the number of entries that there is room for."""
+        room = self._max_bytes - self._bytes
+        for taken, entry in enumerate(entries):
             room -= len(entry.body) + ROW_BYTES
             if room < 0:
-                break
-            taken += 1
-        refused = [one for one in entries[taken:] if one.kind != "gap"]
-        counts["dropped.full"] = counts.get("dropped.full", 0) + len(refused)
-        for last, count in _by_camera(refused):
-            _add_gap(database, last, count, "the spool was full", self._in_flight)
-        _remember(database, refused)
-        return entries[:taken]
+                return taken
+        return len(entries)
 
     def _make_room(
         self, database: sqlite3.Connection, size: int, counts: dict[str, int]
