@@ -190,6 +190,26 @@ async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
     }
 
 
+async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path) -> None:
+    pytest.importorskip("zenoh")
+    path = fleet(tmp_path, f"listen: tcp/127.0.0.1:0\n{FLEET}")
+    server = FleetServer(path)
+    async with FleetOutlets(server) as outlets, server:
+        await server.wait_tried()
+        await server.hosts["line1/cam1"].camera.trigger(timeout=20)
+        await until(lambda: outlets.outlets.states["store"].account.delivered == 1)
+        url = f"fleet://127.0.0.1:{server.address.port}"
+        code, out, err = await command("fleet", "outlets", url, "--json", "--timeout", "30")
+        assert code == 0, err
+        (told,) = map(json.loads, out.splitlines())
+        assert (told["outlet"], told["trouble"], told["account"]["delivered"]) == ("store", "", 1)
+        code, out, err = await command("results", url, "--since", "8h", "--json", "--timeout", "30")
+        assert code == 0, err
+        row, total = map(json.loads, out.splitlines())
+        assert row["camera"] == "line1/cam1"
+        assert (total["outlet"], total["total"], total["failed"]) == ("store", 1, 0)
+
+
 async def test_results_that_did_not_pass_are_found_with_errors_and_gaps(tmp_path: Path) -> None:
     from smartcam.outlets import OutletDesk, OutletEntry
 
