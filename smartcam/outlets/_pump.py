@@ -7,6 +7,7 @@ import collections
 import contextlib
 import logging
 import sqlite3
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -216,11 +217,12 @@ class Pump:
         epoch = self.spool.epoch
 
         def work() -> OutletAccount:
-            entries = [
-                OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
-                for one in batch
-                for kind, application, body in [one.make()]
-            ]
+            entries = list[OutletEntry]()
+            for one in batch:
+                kind, application, body = one.make()
+                entry = OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
+                entries.append(entry)
+                time.sleep(0)  # the event loop's thread has its turn between two entries
             gaps = [
                 (
                     OutletEntry(one.camera, epoch, one.number, "gap", None, one.at, ""),
