@@ -102,6 +102,7 @@ class Pump:
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
         self._open = False
+        self._gathering: asyncio.TimerHandle | None = None  # until what came is written
 
     async def start(self) -> None:
         """Open the spool, and begin.
@@ -126,6 +127,9 @@ class Pump:
 
         Cancellation: the spool's thread goes on to the end of what it does.
         """
+        if self._gathering is not None:
+            self._gathering.cancel()
+            self._gathering = None
         try:
             await self._end(self._tasks[:1])
             if self._open:
@@ -176,6 +180,12 @@ class Pump:
         else:
             self._waiting.append(came)
             self._waiting_bytes += size
+        if self._gathering is None:
+            loop = asyncio.get_running_loop()
+            self._gathering = loop.call_later(GATHER_SECONDS, self._gathered)
+
+    def _gathered(self) -> None:
+        self._gathering = None
         self._came.set()
 
     @property
@@ -195,7 +205,6 @@ class Pump:
     async def _write(self) -> None:
         while True:
             await self._came.wait()
-            await asyncio.sleep(GATHER_SECONDS)
             self._came.clear()
             while self._waiting or self._lost:
                 try:
