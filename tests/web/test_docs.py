@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
 
+from smartcam._meanings import FAIL_WORDS, NOT_WORDS, PASS_WORDS
 from smartcam.calibration._files.directory import MAX_NAME
 from smartcam.calibration._files.store import BACKUPS
 from smartcam.calibration._printing.page_layout import RULER
@@ -34,7 +35,6 @@ from smartcam.web._live import CALLS as LIVE_CALLS
 from smartcam.web._live import MAX_NEWS
 from smartcam.web._live_view import MAX_RESULTS
 from smartcam.web._pictures import MAX_VIEWERS
-from smartcam.web._verdicts import FAIL_WORDS, NOT_WORDS, PASS_WORDS
 from smartcam.web._wizard import CALLS as WIZARD_CALLS
 from tests import ROOT
 from tests.web.sitekit import TOKEN
