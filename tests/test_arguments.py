@@ -310,7 +310,7 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "Fleet.outlets": (fleet.outlets, {}),
             "Fleet.stored_results": (fleet.stored_results, {}),
             "Outlets.__init__": (Outlets, {"section": {}, "folder": "."}),
-            "Outlets.stored": (Outlets({}, "").stored, {}),
+            "Outlets.stored": (Outlets({}, ".").stored, {}),
             "Fleet.trigger": (fleet.trigger, {}),
             "Fleet.url_of": (fleet.url_of, {"name": "x"}),
             "fleet.open": (smartcam.fleet.open, {"place": "fleet://127.0.0.1"}),

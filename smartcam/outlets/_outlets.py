@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
+import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._arguments import check_callable, check_kind, check_path
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
     from smartcam.outlets._entry import OutletAccount
     from smartcam.outlets._settings import OutletSettings, Section
     from smartcam.outlets._stored import StoredResults
+
+MAX_TURN_SECONDS = 0.0005
+"""Seconds for which a thread of Python may keep another one waiting while outlets run. Usually it
+is 5 ms, and a trigger would wait so long where its result comes while a spool is written."""
 
 RESULT_BYTES = 600
 """Bytes that a result keeps in memory beside its container, about."""
@@ -103,6 +108,7 @@ class Outlets(Server):
         """
         if self._started:
             return
+        _turns.shorten(self)
         try:
             for pump in self._pumps.values():
                 try:
@@ -121,6 +127,7 @@ class Outlets(Server):
         while self._started:
             await self._started[-1].stop()
             self._started.pop()
+        _turns.leave(self)
 
     @property
     def states(self) -> dict[str, OutletState]:
@@ -183,6 +190,31 @@ class Outlets(Server):
             found = [one for one in pumps if one.outlet.settings.chooses(camera)]
             self._chosen[camera] = found
         return found
+
+
+class _ShortTurns:
+    """Shortens the turns of Python's threads as long as anybody wants that."""
+
+    def __init__(self) -> None:
+        self._wanted: set[int] = set()
+        self._before = 0.0
+
+    def shorten(self, who: Outlets) -> None:
+        """Have short turns from now on."""
+        if not self._wanted:
+            self._before = sys.getswitchinterval()
+            sys.setswitchinterval(min(self._before, MAX_TURN_SECONDS))
+        self._wanted.add(id(who))
+
+    def leave(self, who: Outlets) -> None:
+        """Have turns as before, unless others want short ones. Harmless when done twice."""
+        if id(who) in self._wanted:
+            self._wanted.discard(id(who))
+            if not self._wanted:
+                sys.setswitchinterval(self._before)
+
+
+_turns = _ShortTurns()
 
 
 def _result(

@@ -7,7 +7,6 @@ import collections
 import contextlib
 import logging
 import sqlite3
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -36,7 +35,7 @@ MAX_WAITING_BYTES = 1 << 26
 MAX_WRITTEN_TOGETHER = 500
 """Entries of one write to the spool."""
 
-GATHER_SECONDS = 0.01
+GATHER_SECONDS = 0.002
 """Seconds in which entries gather in memory before they are written together: a write is out of the
 way of the trigger whose result it has, and many results cost one write."""
 
@@ -231,7 +230,6 @@ class Pump:
                 kind, application, body = one.make()
                 entry = OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
                 entries.append(entry)
-                time.sleep(0)  # the event loop's thread has its turn between two entries
             gaps = [
                 (
                     OutletEntry(one.camera, epoch, one.number, "gap", None, one.at, ""),

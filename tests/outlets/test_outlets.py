@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -258,6 +259,18 @@ async def test_stopping_again_and_starting_again_is_harmless(far: FarEnd, tmp_pa
     await outlets.start()
     await outlets.stop()
     await outlets.stop()
+
+
+async def test_threads_have_short_turns_as_long_as_outlets_run(far: FarEnd, tmp_path: Path) -> None:
+    before = sys.getswitchinterval()
+    one, other = Outlets({"list": {}}, tmp_path / "1"), Outlets({"list": {}}, tmp_path / "2")
+    await one.start()
+    await other.start()
+    await one.stop()
+    assert sys.getswitchinterval() == pytest.approx(0.0005)
+    await other.stop()
+    await other.stop()
+    assert sys.getswitchinterval() == pytest.approx(before)
 
 
 def test_an_id_says_camera_epoch_and_number() -> None:
