@@ -235,9 +235,9 @@ async def _ask_outlets(url: str, options: Options) -> None:
         found = await opened.outlets(timeout=options.step(5.0))
     if options.as_json:
         for one in found:
-            fields = one._asdict()
-            head = {key: fields.pop(key) for key in ("agent", "outlet", "trouble")}
-            options.show({**head, "account": fields}, "")
+            account = one._asdict()
+            said = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**said, "account": account}, "")
         return
     rows = [
         (one.agent, one.outlet, *_account_row(one._asdict()), one.trouble or "well")

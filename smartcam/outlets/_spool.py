@@ -450,8 +450,8 @@ def _account(counts: Mapping[str, int], spooled: int) -> OutletAccount:
 def _settle(database: sqlite3.Connection, counts: dict[str, int]) -> int:
     """Have counts balance with the entries that are there; return how many are lost."""
     spooled, _ = database.execute(_TOTALS).fetchone()
-    account = _account(counts, spooled)
-    known = account.delivered + spooled + sum(account.dropped.values())
+    account = _account(counts, int(spooled))
+    known = account.delivered + account.spooled + sum(account.dropped.values())
     lost = max(0, account.results - known)  # the counts may be of an older page than the entries
     counts["results"] = max(account.results, known)
     counts["dropped.damaged"] = counts.get("dropped.damaged", 0) + lost

@@ -111,14 +111,14 @@ def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResult
         "ORDER BY at DESC, rowid DESC LIMIT ?) ORDER BY at, rowid",
         (*values, question.most),
     ).fetchall()
-    counts = database.execute(
+    total, failed, errors, gaps, lost, at_least = database.execute(
         f"SELECT COUNT(*), COUNT(*) FILTER (WHERE {bad}), "  # noqa: S608
         "COUNT(*) FILTER (WHERE kind = 'error'), COUNT(*) FILTER (WHERE kind = 'gap'), "
         f"COALESCE(SUM(lost), 0), COALESCE(MAX(at_least), 0) FROM results WHERE {of}",
         values,
     ).fetchone()
     found = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
-    return StoredResults(found, *counts[:-1], bool(counts[-1]))
+    return StoredResults(found, total, failed, errors, gaps, lost, bool(at_least))
 
 
 def _failure_condition(database: sqlite3.Connection) -> str:

@@ -160,7 +160,12 @@ class FarEnd:
                 return
             self.deaths += 1
         seed, listener, path = self._cell.dice.randrange(1 << 30), self._listener, self._path
-        self._process = forked(lambda: keep_journal(listener, path, seed, faults) or 0)
+
+        def keep() -> int:
+            keep_journal(listener, path, seed, faults)
+            return 0
+
+        self._process = forked(keep)
 
     def stop(self) -> None:
         """End it."""
@@ -259,7 +264,7 @@ class Arrived(NamedTuple):
     kind: str
     value: Any
     lost: int
-    at_least: bool
+    at_least: bool | int | None
     error: str | None
 
 
@@ -272,8 +277,13 @@ def journal_of(folder: Path) -> dict[str, Arrived]:
         assert texts.setdefault(name, body) == body, f"{name} came with two contents"
         said = json.loads(body)
         arrived = Arrived(
-            *(camera, epoch, number, kind),
-            *(said.get("value"), said.get("lost", 0), said.get("at_least", False)),
+            camera,
+            epoch,
+            number,
+            kind,
+            said.get("value"),
+            said.get("lost", 0),
+            said.get("at_least", False),
             said.get("error"),
         )
         found.setdefault(name, arrived)
@@ -292,8 +302,10 @@ def store_of(folder: Path) -> dict[str, Arrived]:
             records = database.execute("SELECT COUNT(*) FROM app_1").fetchone()[0]
             assert records == results, "records without results"
     return {
-        name: Arrived(*key, json.loads(value or "null"), lost or 0, bool(at_least), error)
-        for name, *key, value, lost, at_least, error in rows
+        row[0]: Arrived(
+            row[1], row[2], row[3], row[4], json.loads(row[5] or "null"), row[6] or 0, *row[7:]
+        )
+        for row in rows
     }
 
 

@@ -234,7 +234,9 @@ def _accounts(answer: bytes) -> list[ToldOutlet]:
         ToldOutlet(
             str(said["agent"]),
             str(name),
-            *(int(one[key]) for key in ("results", "delivered", "spooled")),
+            int(one["results"]),
+            int(one["delivered"]),
+            int(one["spooled"]),
             {str(why): int(count) for why, count in one["dropped"].items()},
             str(one["trouble"]),
         )
@@ -252,8 +254,12 @@ def _stores(answer: bytes) -> list[ToldStore]:
             agent,
             str(name),
             [dict(row) for row in one["rows"]],
-            *(int(one[key]) for key in ("total", "failed", "errors", "gaps", "lost")),
-            bool(one["at_least"]),
+            total=int(one["total"]),
+            failed=int(one["failed"]),
+            errors=int(one["errors"]),
+            gaps=int(one["gaps"]),
+            lost=int(one["lost"]),
+            at_least=bool(one["at_least"]),
         )
         for name, one in said["stores"].items()
     ]
