@@ -28,6 +28,7 @@ BENCHMARKS = {
     "large": "containers of 1 kB to 1 MB",
     "fleet": "10, 100 and 1,000 cameras in one process",
     "bus": "triggers and results through a fleet's agent, above a camera at the wire",
+    "outlets": "triggers beside an outlet whose far end is stalled, above those without",
     "plant": "5,000 cameras of four agents: a newcomer, a question to all, results, memory",
     "flood": "trigger latency of 99 cameras beside one that sends as fast as the link takes it",
     "emulator": "triggers that emulated cameras answer, one and 1,000 of them",

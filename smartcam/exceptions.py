@@ -24,6 +24,8 @@
     │   ├── FrameFormatError                   pixels that it has not, or that are not valid
     │   └── FrameTimeoutError (TimeoutError)   no picture in time
     ├── InspectionError                        a tool failed: the picture has no verdict
+    ├── OutletError                            the far end of an outlet is away; it is tried again
+    │   └── EntryRefusedError                  it will never take one of the entries
     ├── RecordingError (OSError)               a recording that could not be written, or read
     ├── RosError                               what another ROS node, or we to one, said
     │   ├── RosMessageError                    bytes or fields that are no message of their type
@@ -61,6 +63,7 @@ __all__ = [
     "ConnectionClosedError",
     "ConnectionLostError",
     "ConnectionTakenError",
+    "EntryRefusedError",
     "FrameError",
     "FrameFeatureError",
     "FrameFormatError",
@@ -77,6 +80,7 @@ __all__ = [
     "MissingExtraError",
     "NotAllowedError",
     "NotRunningError",
+    "OutletError",
     "OvertriggeredError",
     "PluginError",
     "ProtocolError",
@@ -338,6 +342,22 @@ class InspectionError(SmartCamError):
         super().__init__(message)
         self.application = application
         self.tool = tool
+
+
+class OutletError(SmartCamError):
+    """The far end of an outlet did not take entries; they are tried again."""
+
+
+class EntryRefusedError(OutletError):
+    """The far end of an outlet will never take one of the entries.
+
+    Attributes:
+        place: place of the entry in what was delivered; the entries before it were taken.
+    """
+
+    def __init__(self, message: str = "", *, place: int = 0) -> None:
+        super().__init__(message)
+        self.place = place
 
 
 class RecordingError(SmartCamError, OSError):

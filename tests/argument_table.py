@@ -23,6 +23,7 @@ MODULES = (
     "smartcam.testing",
     "smartcam.doctor",
     "smartcam.recording",
+    "smartcam.outlets",
 )
 
 
@@ -279,7 +280,23 @@ TABLE: dict[str, dict[str, str]] = {
         **_QUEUE,
     },
     "Fleet.status": {"pattern": "pattern", **_TIMEOUT},
+    "Fleet.outlets": _TIMEOUT,
+    "Fleet.stored_results": {
+        "pattern": "pattern",
+        "since": "function or None",  # of the odd values only None is one
+        "failed": "flag",
+        "most": "integer",
+        **_TIMEOUT,
+    },
     "Fleet.trigger": {"pattern": "url", **_TIMEOUT},
+    "Outlets.__init__": {
+        "section": "mapping",
+        "folder": "text",
+        "columns": "function",
+        "command": "function or None",
+        "tell": "function",
+    },
+    "Outlets.stored": {"question": "object"},
     "Fleet.url_of": {"name": "text"},
     "fleet.open": {"place": "url", "connect_timeout": "seconds"},
     "FrameSource.__init__": {
@@ -571,6 +588,8 @@ NOT_HERE: dict[str, tuple[str, ...]] = {
         *("FrameSource.frame", "FrameSource.lost", "FrameSource.skipped", "RateControl.sent"),
         *("DeviceFeatures", "FrameSource.trigger_failed", "FrameSource.watch_events"),
         "FrameSource.wait_until_streaming",
+        *("Outlet", "OutletDesk", "Outlets.offer_result", "Outlets.offer_error"),
+        "Outlets.state_changed",
         *("Device.handle", "Device.watch", "LineClient", "LineCamera", "TicketedClient"),
         "TicketedCamera",
         *("CommandClient.arguments", "CommandClient.perform", "FunctionClient.perform"),

@@ -36,6 +36,7 @@ from smartcam.emulator import (
 )
 from smartcam.fleet._inside import RecordSection
 from smartcam.frames import Codecs, FrameGroup, FrameSource, RateControl, RtpSender, RtspServer
+from smartcam.outlets import Outlets
 from smartcam.recording import (
     FleetRecorder,
     FleetReplay,
@@ -306,6 +307,10 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "Fleet.reload": (fleet.reload, {}),
             "Fleet.results": (fleet.results, {}),
             "Fleet.status": (fleet.status, {}),
+            "Fleet.outlets": (fleet.outlets, {}),
+            "Fleet.stored_results": (fleet.stored_results, {}),
+            "Outlets.__init__": (Outlets, {"section": {}, "folder": "."}),
+            "Outlets.stored": (Outlets({}, ".").stored, {}),
             "Fleet.trigger": (fleet.trigger, {}),
             "Fleet.url_of": (fleet.url_of, {"name": "x"}),
             "fleet.open": (smartcam.fleet.open, {"place": "fleet://127.0.0.1"}),

@@ -24,12 +24,13 @@ PUBLIC = [
     "Capabilities", "CommandRejectedError", "ConfigurationError", "ConnectFailedError",
     "Connected",
     "ConnectionClosedError", "ConnectionLostError", "ConnectionTakenError", "Disconnected",
-    "FrameError", "FrameFeatureError", "FrameFormatError", "FrameLostError",
+    "EntryRefusedError", "FrameError", "FrameFeatureError", "FrameFormatError", "FrameLostError",
     "FrameSourceError", "FrameTimeoutError",
     "Header", "Histogram", "InputContainerError", "InspectionError", "InterpretationError",
     "Layout",
     "LayoutError", "LinkError", "LocalProtocolError", "Localization", "MessageError",
     "MissingExtraError", "NotAllowedError", "NotRunningError", "NoticeReceived", "Observer",
+    "OutletError",
     "OvertriggeredError",
     "PluginError",
     "Pose", "Position", "ProtocolError", "Quaternion", "Reconnected", "RecordingError",
@@ -115,7 +116,7 @@ MAX_PUBLIC = 562
 """Names in all, a name that stands in two places counted once. A third of them are words: messages,
 faults of a camera, rules of a link, errors."""
 
-MAX_AT_THE_TOP = 74
+MAX_AT_THE_TOP = 76
 
 
 def test_top_level_exports_are_pinned() -> None:

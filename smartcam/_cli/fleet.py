@@ -194,12 +194,16 @@ async def reload(url: str, agent: str | None, options: Options) -> None:
 
 
 @fleet.command(
-    help="Show the accounts of the outlets in a fleet file, from their spools, whether an agent "
-    "runs or not: results = delivered + spooled + dropped."
+    help="Show the accounts of outlets: results = delivered + spooled + dropped. PLACE is a "
+    "fleet's URL, whose agents are asked, or a fleet file: then its spools are read, whether an "
+    "agent runs or not."
 )
-@click.argument("file", metavar="FLEET.yaml")
-@runs(*OUTPUT)
-async def outlets(file: str, options: Options) -> None:
+@click.argument("place", metavar="URL|FLEET.yaml")
+@runs("--timeout", *OUTPUT)
+async def outlets(place: str, options: Options) -> None:
+    if "://" in place:
+        await _ask_outlets(place, options)
+        return
     from pathlib import Path
 
     from smartcam.fleet import load_fleet
@@ -207,19 +211,40 @@ async def outlets(file: str, options: Options) -> None:
     with from_part("mqtt", '"fleet outlets" needs'):
         from smartcam.outlets._inside import stored_accounts
 
-    section = load_fleet(file).outlets or {}
+    section = load_fleet(place).outlets or {}
     rows: list[tuple[str, ...]] = []
-    for name, account in stored_accounts(section, Path(file).parent).items():
+    for name, account in stored_accounts(section, Path(place).parent).items():
         fields = {} if account is None else account.fields()
         if options.as_json:
             options.show({"outlet": name, "account": fields or None}, "")
-            continue
-        dropped = ", ".join(f"{count} {why}" for why, count in fields.get("dropped", {}).items())
-        numbers = [str(fields.get(key, "")) for key in ("results", "delivered", "spooled")]
-        rows.append((name, *numbers, dropped or "0" if fields else "no spool yet"))
+        rows.append((name, *_account_row(fields)))
     if not options.as_json:
         head = ("outlet", "results", "delivered", "spooled", "dropped")
         click.echo(table_text(head, rows) if rows else "the file has no outlets")
+
+
+def _account_row(fields: dict[str, Any]) -> tuple[str, ...]:
+    dropped = ", ".join(f"{count} {why}" for why, count in fields.get("dropped", {}).items())
+    numbers = [str(fields.get(key, "")) for key in ("results", "delivered", "spooled")]
+    return (*numbers, dropped or "0" if fields else "no spool yet")
+
+
+async def _ask_outlets(url: str, options: Options) -> None:
+    """Show the accounts that a fleet's agents tell."""
+    async with _opened(url, options) as opened:
+        found = await opened.outlets(timeout=options.step(5.0))
+    if options.as_json:
+        for one in found:
+            account = one._asdict()
+            said = {key: account.pop(key) for key in ("agent", "outlet", "trouble")}
+            options.show({**said, "account": account}, "")
+        return
+    rows = [
+        (one.agent, one.outlet, *_account_row(one._asdict()), one.trouble or "well")
+        for one in found
+    ]
+    head = ("agent", "outlet", "results", "delivered", "spooled", "dropped", "state")
+    click.echo(table_text(head, rows) if rows else "no agent has outlets")
 
 
 # ---------------------------------------------------------------------- take-back

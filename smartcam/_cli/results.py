@@ -1,10 +1,8 @@
-"""``smartcam results``: what is in a store of results."""
+"""``smartcam results``: what is in a store of results, here or beside a fleet's agents."""
 
 from __future__ import annotations
 
-import contextlib
 import re
-import sqlite3
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -12,15 +10,14 @@ from typing import Any
 import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
-from smartcam.exceptions import ConfigurationError
+from smartcam._extras import from_part
+from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 
 _UNITS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days"}
 _AGE = re.compile(r"(\d{1,6}(?:\.\d{1,3})?) ?(s|min|h|d)", re.ASCII)
 
 DEFAULT_COUNT = 1000
 """Results that are shown where ``--count`` says nothing."""
-
-_COLUMNS = "id, camera, kind, at, application, sequence, latency, error, lost, value, picture"
 
 
 def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
@@ -38,98 +35,72 @@ def _since(_context: Any, _parameter: Any, text: str | None) -> datetime | None:
 
 
 @click.command(
-    help="Show the results in a store: those of a shift, those that failed. FILE is what an "
-    "outlet of the kind sqlite writes; the oldest result comes first. With --failed those that did "
-    "not pass, by the names of their truth values, with errors and gaps. The last line counts all "
-    "of the time."
+    help="Show the results in a store: those of a shift, those that failed. PLACE is the file that "
+    "an outlet of the kind sqlite writes, or a fleet's URL: then the fleet's agents are asked what "
+    "their stores have. The oldest result comes first. With --failed those that did not pass, by "
+    "the names of their truth values, with errors and gaps. The last line of a store counts all of "
+    "the time."
 )
-@click.argument("file")
+@click.argument("place", metavar="FILE|URL")
 @click.option("--since", metavar="AGE|TIME", callback=_since, help="8h, 30min, 2d, or a time.")
 @click.option("--failed", is_flag=True, help="Errors, gaps, and results that did not pass.")
-@click.option("--camera", metavar="PATTERN", help="Of these cameras: line1/cam1, line1/*.")
-@runs("--count", *OUTPUT)
+@click.option("--camera", metavar="PATTERN", help="Of these cameras: line1/cam1, line1/**.")
+@runs("--count", "--timeout", *OUTPUT)
 async def results(
-    file: str, since: datetime | None, failed: bool, camera: str | None, options: Options
+    place: str, since: datetime | None, failed: bool, camera: str | None, options: Options
 ) -> None:
     """Show results."""
-    _read(file, since, failed, camera, options)
+    most = DEFAULT_COUNT if options.count is None else options.count
+    if "://" in place:
+        await _ask(place, since, failed, camera or "**", most, options)
+        return
+    from smartcam.outlets import StoreQuestion
+    from smartcam.outlets._inside import read_store
+
+    found = read_store(Path(place), StoreQuestion(since, failed, camera or "**", most))
+    _show(found.rows, found.summary, "", options)
 
 
-def _read(
-    file: str, since: datetime | None, failed: bool, camera: str | None, options: Options
+async def _ask(
+    url: str, since: datetime | None, failed: bool, camera: str, most: int, options: Options
 ) -> None:
-    path = Path(file)
-    if not path.is_file():
-        raise ConfigurationError(f"results {file}: there is no such file")
-    place = f"{path.absolute().as_uri()}?mode=ro"
-    try:
-        with contextlib.closing(sqlite3.connect(place, uri=True, timeout=5.0)) as database:
-            _show(database, since, failed, camera, options)
-    except sqlite3.Error as exc:
-        raise ConfigurationError(f"results {file}: expected a store of results: {exc}") from exc
-
-
-def _show(
-    database: sqlite3.Connection,
-    since: datetime | None,
-    failed: bool,
-    camera: str | None,
-    options: Options,
-) -> None:
-    bad = _bad(database)
-    which, values = ["1"], list[Any]()
-    if since is not None:
-        which.append("at >= ?")
-        values.append(since.isoformat(timespec="microseconds"))
-    if camera is not None:
-        which.append("camera GLOB ?")
-        values.append(camera)
-    of = " AND ".join(which)
-    shown = f"{of} AND {bad}" if failed else of
-    count = DEFAULT_COUNT if options.count is None else options.count
-    rows = database.execute(
-        f"SELECT * FROM (SELECT {_COLUMNS} FROM results WHERE {shown} "  # noqa: S608
-        "ORDER BY at DESC LIMIT ?) ORDER BY at",
-        (*values, count),
-    )
-    names = _COLUMNS.split(", ")
-    for row in rows:
-        fields: dict[str, Any] = dict(zip(names, row, strict=True))
-        options.show(fields, _text(fields))
-    total, errors, gaps, not_good = database.execute(
-        "SELECT COUNT(*), COUNT(*) FILTER (WHERE kind = 'error'), "  # noqa: S608
-        f"COALESCE(SUM(lost), 0), COUNT(*) FILTER (WHERE {bad}) FROM results WHERE {of}",
-        values,
-    ).fetchone()
-    said = {"rows": total, "failed": not_good, "errors": errors, "lost": gaps}
-    text = f"{total} rows: {not_good} failed, {errors} of them errors; {gaps} lost in gaps"
-    options.show(said, text)
-
-
-def _bad(database: sqlite3.Connection) -> str:
-    """Return the condition of a result that did not pass."""
-    from smartcam.web._inside import meaning
-
-    found = ["kind != 'result'"]
-    conditions: dict[int, list[str]] = {}
-    for application, name, column in database.execute(
-        "SELECT application, name, column_name FROM fields WHERE type = 'bool'"
-    ):
-        good = meaning(name)
-        if good is not None:
-            quoted = column.replace('"', '""')
-            conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good)}')
-    for application, each in conditions.items():
-        found.append(
-            f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(each)})"  # noqa: S608
+    """Show what the stores of a fleet's agents have."""
+    with from_part("fleet", "the results of a fleet need"):
+        import smartcam.fleet
+    async with smartcam.fleet.open(url, connect_timeout=options.step(10.0)) as fleet:
+        stores = await fleet.stored_results(
+            camera, since=since, failed=failed, most=min(most, 1000), timeout=options.step(30.0)
         )
-    return f"({' OR '.join(found)})"
+    if not stores:
+        raise ResponseTimeoutError(f"results {url}: no agent has a store, or none answered in time")
+    for store in stores:
+        name = f"{store.agent} {store.outlet}".rstrip()
+        if store.error:
+            raise ConfigurationError(f"results of the agent {name}: {store.error}")
+        summary = {key: value for key, value in store._asdict().items() if key not in _NO_COUNTS}
+        _show(store.rows, summary, name, options)
 
 
-def _text(fields: dict[str, Any]) -> str:
-    at = datetime.fromisoformat(fields["at"]).astimezone()
-    said = fields["error"] or fields["value"] or ""
-    lost = f" ({fields['lost']} lost)" if fields["lost"] else ""
-    application = "" if fields["application"] is None else f" application {fields['application']}"
-    picture = f"  {fields['picture']}" if fields["picture"] else ""
-    return f"{at:%Y-%m-%d %H:%M:%S} {fields['camera']}{application}: {said}{lost}{picture}"
+_NO_COUNTS = ("rows", "error")
+
+
+def _show(rows: list[dict[str, Any]], summary: dict[str, Any], name: str, options: Options) -> None:
+    for row in rows:
+        options.show(row, _text(row))
+    least = "at least " if summary["at_least"] else ""
+    text = (
+        f"{f'{name}: ' if name else ''}{summary['total']} rows: {summary['failed']} failed, "
+        f"{summary['errors']} of them errors; {least}{summary['lost']} lost in "
+        f"{summary['gaps']} gaps"
+    )
+    options.show(summary, text)
+
+
+def _text(row: dict[str, Any]) -> str:
+    at = datetime.fromisoformat(row["at"]).astimezone()
+    said = row["error"] or row["value"] or ""
+    lost = f" ({row['lost']} lost)" if row["lost"] else ""
+    application = "" if row["application"] is None else f" application {row['application']}"
+    picture = f"  {row['picture']}" if row["picture"] else ""
+    camera = row["camera"] or "all cameras"
+    return f"{at:%Y-%m-%d %H:%M:%S} {camera}{application}: {said}{lost}{picture}"

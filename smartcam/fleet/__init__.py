@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
+    from smartcam.fleet._agent.outlet_service import ToldOutlet, ToldStore
     from smartcam.fleet._agent.reload import FleetChanges
     from smartcam.fleet._agent.server import FleetServer
     from smartcam.fleet._agent.summary import CameraSummary
@@ -48,6 +49,8 @@ __all__ = [
     "FleetResults",
     "FleetServer",
     "ReservationLost",
+    "ToldOutlet",
+    "ToldStore",
     "fleet_schema",
     "load_fleet",
     "open",
@@ -58,6 +61,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_agent.outlet_service": "ToldOutlet ToldStore",
             "_agent.reload": "FleetChanges",
             "_agent.server": "FleetServer",
             "_agent.summary": "CameraSummary",

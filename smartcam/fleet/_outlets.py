@@ -20,6 +20,7 @@ from smartcam.protocols.messages import ResultContainer
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from smartcam.fleet._agent.outlet_service import StoredRequest
     from smartcam.fleet._agent.server import FleetServer
     from smartcam.fleet._file.fleet_file import CameraEntry
     from smartcam.fleet._program.camera import FleetCamera
@@ -51,11 +52,12 @@ class FleetOutlets(Server):
         self, server: FleetServer, tell: Callable[[str, str], None] = lambda _name, _why: None
     ) -> None:
         with from_part("mqtt", '"outlets:" in a fleet file needs'):
-            from smartcam.outlets import Outlets
+            from smartcam.outlets import Outlets, StoreQuestion
             from smartcam.outlets._inside import columns_of, do_command
         if server.file.outlets is None:
             raise ConfigurationError(f"fleet {server.file.fleet}: outlets: is not in its file")
         self._server, self._do, self._columns_of = server, do_command, columns_of
+        self._question = StoreQuestion
         self.outlets: Outlets = Outlets(
             server.file.outlets,
             server.folder,
@@ -82,6 +84,7 @@ class FleetOutlets(Server):
         if self._observer not in self._server.observers:
             self._server.observers.append(self._observer)
         self._server.outlet_states = lambda: self.outlets.states
+        self._server.stored_results = self.stored
 
     async def stop(self) -> None:
         """End; what is not delivered stays in the spools."""
@@ -91,6 +94,19 @@ class FleetOutlets(Server):
         for program in programs:
             await program.close()
         await self.outlets.stop()
+
+    async def stored(self, asked: StoredRequest) -> dict[str, dict[str, Any]]:
+        """Return the answers of the stores, by the outlet's name.
+
+        Raises:
+            ConfigurationError: one cannot be read now.
+
+        Cancellation: its thread goes on to the end of what it does.
+        """
+        since = None if asked.since is None else datetime.fromisoformat(asked.since)
+        question = self._question(since, asked.failed, asked.camera, asked.most)
+        found = await asyncio.to_thread(self.outlets.stored, question)
+        return {name: {"rows": one.rows, **one.summary} for name, one in found.items()}
 
     def reading(self, camera: str) -> Interpretation | None:
         """Return the interpretation of a camera's results; None for a camera that is not known."""

@@ -13,33 +13,35 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
-    from smartcam.outlets._entry import EntryRefusedError, OutletAccount, OutletEntry, OutletError
+    from smartcam.outlets._entry import OutletAccount, OutletEntry
     from smartcam.outlets._outlet import Column, Outlet, OutletDesk
     from smartcam.outlets._outlets import Outlets, OutletState
     from smartcam.outlets._settings import OutletSettings, OutletsFile, Secret
+    from smartcam.outlets._stored import StoredResults, StoreQuestion
 
 __all__ = [
     "Column",
-    "EntryRefusedError",
     "Outlet",
     "OutletAccount",
     "OutletDesk",
     "OutletEntry",
-    "OutletError",
     "OutletSettings",
     "OutletState",
     "Outlets",
     "OutletsFile",
     "Secret",
+    "StoreQuestion",
+    "StoredResults",
 ]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "_entry": "OutletEntry EntryRefusedError OutletAccount OutletError",
+            "_entry": "OutletAccount OutletEntry",
             "_outlet": "Column OutletDesk Outlet",
             "_outlets": "OutletState Outlets",
             "_settings": "OutletSettings OutletsFile Secret",
+            "_stored": "StoredResults StoreQuestion",
         },
     )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from smartcam.exceptions import SmartCamError
-
 Kind: TypeAlias = Literal["result", "error", "gap"]
 
 
@@ -37,22 +35,6 @@ class OutletEntry(NamedTuple):
         """Id of the entry, by which the far end knows a repetition: ``CAMERA/EPOCH/NUMBER``."""
         gap = "/gap" if self.kind == "gap" else ""
         return f"{self.camera}/{self.epoch}/{self.number}{gap}"
-
-
-class OutletError(SmartCamError):
-    """The far end did not take entries; they are tried again."""
-
-
-class EntryRefusedError(OutletError):
-    """The far end will never take one of the entries.
-
-    Attributes:
-        place: place of the entry in what was delivered; the entries before it were taken.
-    """
-
-    def __init__(self, text: str = "", *, place: int = 0) -> None:
-        super().__init__(text)
-        self.place: int = place
 
 
 class OutletAccount(NamedTuple):

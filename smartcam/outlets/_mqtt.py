@@ -13,8 +13,12 @@ from pydantic import AfterValidator, Field
 
 from smartcam._extras import load
 from smartcam._json import object_text
-from smartcam.exceptions import ConfigurationError, SmartCamError
-from smartcam.outlets._entry import EntryRefusedError, OutletError
+from smartcam.exceptions import (
+    ConfigurationError,
+    EntryRefusedError,
+    OutletError,
+    SmartCamError,
+)
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._settings import OutletSettings, Secret
 
@@ -87,6 +91,18 @@ class MqttSettings(OutletSettings):
     )
 
 
+class _ShakenSocket(ssl.SSLSocket):
+    """A socket that is closed where its handshake fails; paho leaves it open."""
+
+    def do_handshake(self, block: bool = False) -> None:
+        """Do the handshake."""
+        try:
+            super().do_handshake(block)
+        except BaseException:
+            self.close()
+            raise
+
+
 class MqttOutlet(Outlet[MqttSettings]):
     """Publishes entries with QoS 1, states retained, and does commands."""
 
@@ -147,9 +163,11 @@ class MqttOutlet(Outlet[MqttSettings]):
     def _tls(self) -> ssl.SSLContext:
         ca = self.settings.ca
         try:
-            return ssl.create_default_context(cafile=None if ca is None else self.folder / ca)
+            made = ssl.create_default_context(cafile=None if ca is None else self.folder / ca)
         except OSError as exc:
             raise ConfigurationError(f"outlet {self.name}: ca: {ca}: {exc}") from exc
+        made.sslsocket_class = _ShakenSocket
+        return made
 
     def _watch_refusals(self, client: Any) -> None:
         """Learn which messages the broker acknowledges with a failure: aiomqtt does not tell."""

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._settings import OutletSettings
+    from smartcam.outlets._stored import StoredResults, StoreQuestion
 
 SettingsT = TypeVar("SettingsT", bound="OutletSettings")
 
@@ -82,6 +83,10 @@ class Outlet(ABC, Generic[SettingsT]):
 
     def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
         """Hear of a camera's state: ``connected``, ``application``, ``reason``; return at once."""
+
+    def stored(self, question: StoreQuestion) -> StoredResults | None:
+        """Return the results at the far end; None where it cannot be asked. In a thread."""
+        return None
 
     async def watch(self) -> None:
         """Wait while nothing is to be delivered; raise when the far end is gone."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
+import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from smartcam._arguments import check_callable, check_kind, check_path
 from smartcam._json import object_text
 from smartcam._server import Server
 from smartcam._user_code import ENDS_PROGRAM, text_of
@@ -15,6 +17,7 @@ from smartcam.outlets._outlet import Column, OutletDesk
 from smartcam.outlets._pump import Pump
 from smartcam.outlets._settings import mistakes_of, outlet_class
 from smartcam.outlets._spool import Spool, read_account
+from smartcam.outlets._stored import StoreQuestion
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -25,6 +28,11 @@ if TYPE_CHECKING:
     from smartcam.models import Result
     from smartcam.outlets._entry import OutletAccount
     from smartcam.outlets._settings import OutletSettings, Section
+    from smartcam.outlets._stored import StoredResults
+
+MAX_TURN_SECONDS = 0.0005
+"""Seconds for which a thread of Python may keep another one waiting while outlets run. Usually it
+is 5 ms, and a trigger would wait so long where its result comes while a spool is written."""
 
 RESULT_BYTES = 600
 """Bytes that a result keeps in memory beside its container, about."""
@@ -59,12 +67,20 @@ class Outlets(Server):
     def __init__(
         self,
         section: Section,
-        folder: Path,
+        folder: str | Path,
         *,
         columns: Callable[[str, int], Sequence[Column]] = lambda _camera, _application: (),
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         tell: Callable[[str, str], None] = lambda _name, _why: None,
     ) -> None:
+        check_kind(
+            section, dict, "section", "a mapping of settings by the outlet's name", "Outlets"
+        )
+        folder = check_path(folder, "folder", "Outlets")
+        check_callable(columns, "columns", "Outlets")
+        check_callable(tell, "tell", "Outlets")
+        if command is not None:
+            check_callable(command, "command", "Outlets")
         for place, text in mistakes_of(section):
             raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
         desk = OutletDesk(columns, command)
@@ -92,6 +108,7 @@ class Outlets(Server):
         """
         if self._started:
             return
+        _turns.shorten(self)
         try:
             for pump in self._pumps.values():
                 try:
@@ -110,6 +127,7 @@ class Outlets(Server):
         while self._started:
             await self._started[-1].stop()
             self._started.pop()
+        _turns.leave(self)
 
     @property
     def states(self) -> dict[str, OutletState]:
@@ -118,6 +136,16 @@ class Outlets(Server):
             name: OutletState(pump.account, pump.disk_trouble or pump.trouble)
             for name, pump in self._pumps.items()
         }
+
+    def stored(self, question: StoreQuestion) -> dict[str, StoredResults]:
+        """Return the results at far ends that can be asked, by the outlet's name; blocks.
+
+        Raises:
+            ConfigurationError: one cannot be read now.
+        """
+        check_kind(question, StoreQuestion, "question", "a StoreQuestion", "stored")
+        answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}
+        return {name: found for name, found in answers.items() if found is not None}
 
     # ------------------------------------------------------------------ what cameras bring
 
@@ -162,6 +190,31 @@ class Outlets(Server):
             found = [one for one in pumps if one.outlet.settings.chooses(camera)]
             self._chosen[camera] = found
         return found
+
+
+class _ShortTurns:
+    """Shortens the turns of Python's threads as long as anybody wants that."""
+
+    def __init__(self) -> None:
+        self._wanted: set[int] = set()
+        self._before = 0.0
+
+    def shorten(self, who: Outlets) -> None:
+        """Have short turns from now on."""
+        if not self._wanted:
+            self._before = sys.getswitchinterval()
+            sys.setswitchinterval(min(self._before, MAX_TURN_SECONDS))
+        self._wanted.add(id(who))
+
+    def leave(self, who: Outlets) -> None:
+        """Have turns as before, unless others want short ones. Harmless when done twice."""
+        if id(who) in self._wanted:
+            self._wanted.discard(id(who))
+            if not self._wanted:
+                sys.setswitchinterval(self._before)
+
+
+_turns = _ShortTurns()
 
 
 def _result(

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.backoff import Backoff
-from smartcam.outlets._entry import EntryRefusedError, OutletAccount, OutletEntry
+from smartcam.exceptions import EntryRefusedError
+from smartcam.outlets._entry import OutletAccount, OutletEntry
+from smartcam.outlets._spool import is_damage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,6 +34,10 @@ MAX_WAITING_BYTES = 1 << 26
 
 MAX_WRITTEN_TOGETHER = 500
 """Entries of one write to the spool."""
+
+GATHER_SECONDS = 0.002
+"""Seconds in which entries gather in memory before they are written together: a write is out of the
+way of the trigger whose result it has, and many results cost one write."""
 
 DISK_RETRY_SECONDS = 1.0
 """Seconds until a disk that was full or away is tried again."""
@@ -95,6 +101,7 @@ class Pump:
         self._tasks: list[asyncio.Task[None]] = []
         self._thread = ThreadPoolExecutor(1, f"smartcam.outlets.{outlet.name}")
         self._open = False
+        self._gathering: asyncio.TimerHandle | None = None  # until what came is written
 
     async def start(self) -> None:
         """Open the spool, and begin.
@@ -104,7 +111,7 @@ class Pump:
             sqlite3.Error: its file cannot be made.
         """
         try:
-            await self._run(self.spool.open)
+            await self._run(lambda: None)  # which opens it
         except BaseException:
             await self._end_thread()
             raise
@@ -119,10 +126,13 @@ class Pump:
 
         Cancellation: the spool's thread goes on to the end of what it does.
         """
+        if self._gathering is not None:
+            self._gathering.cancel()
+            self._gathering = None
         try:
             await self._end(self._tasks[:1])
             if self._open:
-                with contextlib.suppress(TimeoutError, sqlite3.Error):
+                with contextlib.suppress(Exception):  # what stays is told by the next start
                     async with asyncio.timeout(STOP_TIMEOUT):
                         while self._waiting or self._lost:
                             await self._keep_some()
@@ -145,9 +155,13 @@ class Pump:
             await asyncio.wait(tasks)
 
     async def _end_thread(self) -> None:
+        ended = not (self._waiting or self._lost)
         with contextlib.suppress(RuntimeError, TimeoutError):
+            closing = asyncio.wrap_future(
+                self._thread.submit(lambda: self.spool.close(ended=ended))
+            )
             async with asyncio.timeout(STOP_TIMEOUT):
-                await self._run(self.spool.close)
+                await asyncio.shield(closing)
         self._thread.shutdown(wait=False)
 
     def offer(
@@ -165,6 +179,12 @@ class Pump:
         else:
             self._waiting.append(came)
             self._waiting_bytes += size
+        if self._gathering is None:
+            loop = asyncio.get_running_loop()
+            self._gathering = loop.call_later(GATHER_SECONDS, self._gathered)
+
+    def _gathered(self) -> None:
+        self._gathering = None
         self._came.set()
 
     @property
@@ -188,11 +208,8 @@ class Pump:
             while self._waiting or self._lost:
                 try:
                     await self._keep_some()
-                except sqlite3.OperationalError as exc:
-                    self._say_disk(f"the spool {self.spool.path}: {exc}")
-                    await asyncio.sleep(DISK_RETRY_SECONDS)
-                except sqlite3.Error as exc:
-                    self._say_disk(f"the spool {self.spool.path} was damaged: {exc}")
+                except Exception as exc:  # noqa: BLE001 - whatever it is, what waits is kept
+                    self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                     self._account = self.spool.account
                     await asyncio.sleep(DISK_RETRY_SECONDS)
                 else:
@@ -208,11 +225,11 @@ class Pump:
         epoch = self.spool.epoch
 
         def work() -> OutletAccount:
-            entries = [
-                OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
-                for one in batch
-                for kind, application, body in [one.make()]
-            ]
+            entries = list[OutletEntry]()
+            for one in batch:
+                kind, application, body = one.make()
+                entry = OutletEntry(one.camera, epoch, one.number, kind, application, one.at, body)
+                entries.append(entry)
             gaps = [
                 (
                     OutletEntry(one.camera, epoch, one.number, "gap", None, one.at, ""),
@@ -243,12 +260,13 @@ class Pump:
         """Have work done in the spool's thread, and what follows, also for a cancelled caller."""
 
         def guarded() -> T:
+            if self.spool.closed:
+                self.spool.open()
             try:
                 return work()
-            except sqlite3.OperationalError:
-                raise  # the disk is full or away
-            except sqlite3.DatabaseError:
-                self.spool.reopen()
+            except sqlite3.Error as exc:
+                if is_damage(exc):
+                    self.spool.renew(text_of(exc))
                 raise
 
         running = asyncio.wrap_future(self._thread.submit(guarded))
@@ -340,8 +358,8 @@ class Pump:
         while True:
             try:
                 await self._run(work, self._set_account)
-            except sqlite3.OperationalError as exc:
-                self._say_disk(f"the spool {self.spool.path}: {exc}")
+            except sqlite3.Error as exc:
+                self._say_disk(f"the spool {self.spool.path}: {text_of(exc)}")
                 await asyncio.sleep(DISK_RETRY_SECONDS)
             else:
                 return

@@ -7,14 +7,15 @@ import json
 import os
 import sqlite3
 import time
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+import zlib
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from smartcam._locks import try_lock
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._entry import OutletAccount, OutletEntry
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
 Policy: TypeAlias = Literal["drop_oldest", "drop_newest"]
@@ -25,6 +26,9 @@ ROW_BYTES = 200
 MAX_PLACE = (1 << 63) - 1
 """The last place that an entry may have."""
 
+MAX_REASON_CHARACTERS = 500
+"""Characters of the reasons of a gap, which may be several gaps in one."""
+
 MAX_DAMAGED_FILES = 3
 """Damaged spools that are kept beside the new one."""
 
@@ -32,21 +36,41 @@ _SCHEMA = """
 CREATE TABLE IF NOT EXISTS entries(
     place INTEGER PRIMARY KEY AUTOINCREMENT, camera TEXT NOT NULL, epoch INTEGER NOT NULL,
     number INTEGER NOT NULL, kind TEXT NOT NULL, application INTEGER, at REAL NOT NULL,
-    body TEXT NOT NULL, bytes INTEGER NOT NULL, count INTEGER NOT NULL);
+    body TEXT NOT NULL, bytes INTEGER NOT NULL, checksum INTEGER NOT NULL);
 CREATE INDEX IF NOT EXISTS of_camera ON entries(camera, place);
 CREATE TABLE IF NOT EXISTS counts(name TEXT PRIMARY KEY, value INTEGER NOT NULL);
 CREATE TABLE IF NOT EXISTS cameras(camera TEXT PRIMARY KEY, epoch INTEGER, number INTEGER);
 """
-_COUNT = "SELECT COUNT(*) FROM entries WHERE kind != 'gap'"
+_TOTALS = "SELECT COUNT(*) FILTER (WHERE kind != 'gap'), COALESCE(SUM(bytes), 0) FROM entries"
 _FIELDS = "camera, epoch, number, kind, application, at, body"
-_INSERT = f"INSERT INTO entries({_FIELDS}, bytes, count) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"  # noqa: S608
+_INSERT = (
+    f"INSERT INTO entries(place, {_FIELDS}, bytes, checksum) "  # noqa: S608
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+)
+
+_DISK_CODES = frozenset(
+    {
+        *(sqlite3.SQLITE_BUSY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR),
+        *(sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_PERM),
+        *(sqlite3.SQLITE_PROTOCOL, sqlite3.SQLITE_READONLY),
+    }
+)
+
+
+def is_damage(error: sqlite3.Error) -> bool:
+    """Return True if an error tells that the file is damaged, not that its disk is full or away."""
+    code = getattr(error, "sqlite_errorcode", None)
+    if code is None:
+        return not isinstance(error, sqlite3.OperationalError)
+    return code & 0xFF not in _DISK_CODES
 
 
 class SpoolHead(NamedTuple):
-    """Entries at the head of the spool, and their places."""
+    """Entries at the head of the spool, their places, and the epoch in which they are there."""
 
     places: list[int]
     entries: list[OutletEntry]
+    epoch: int
 
 
 class Spool:
@@ -82,7 +106,7 @@ class Spool:
         self._lock: int | None = None
 
     def open(self) -> None:
-        """Open the file."""
+        """Open the file, also again after an error."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self._lock is None:
             self._lock = os.open(self.path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o600)
@@ -92,22 +116,26 @@ class Spool:
                 raise ConfigurationError(f"outlet's spool {self.path}: another process has it")
         try:
             self._connect()
-        except sqlite3.OperationalError:
-            raise  # the disk is full or away
-        except sqlite3.DatabaseError as exc:
+        except sqlite3.Error as exc:
+            if not is_damage(exc):
+                raise
             self._start_anew(str(exc))
+        self._keep_epoch(self.epoch)
 
-    def reopen(self) -> None:
-        """Open the file again where it turned out to be damaged."""
+    def renew(self, why: str) -> None:
+        """Put the file aside, which turned out to be damaged, and go on with what can be read."""
         database, self._database = self._database, None
         if database is not None:
             database.close()
-        self.open()
+        self._start_anew(why)
+
+    @property
+    def closed(self) -> bool:
+        """True where the file is not open, also after an error of :meth:`renew`."""
+        return self._database is None
 
     def _connect(self) -> None:
-        database = sqlite3.connect(
-            self.path, timeout=0.5, isolation_level=None, check_same_thread=False
-        )
+        database = _connected(self.path)
         try:
             database.execute("PRAGMA journal_mode = WAL")
             database.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'NORMAL'}")
@@ -124,28 +152,44 @@ class Spool:
         self._database = database
 
     def _load(self, database: sqlite3.Connection) -> None:
-        self._counts = dict(database.execute("SELECT name, value FROM counts"))
-        spooled, size = database.execute(
-            "SELECT COUNT(*) FILTER (WHERE kind != 'gap'), COALESCE(SUM(bytes), 0) FROM entries"
-        ).fetchone()
-        self._spooled, self._bytes = spooled, size
-        known = self._counts.get("epoch", 0)
-        self.epoch = max(known + 1, time.time_ns() // 1000)
+        counts = _counts_of(database)
+        self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
+        if not _account(counts, self._spooled).balanced:
+            raise sqlite3.DatabaseError("its account does not balance")
+        before, last = counts.get("epoch", 0), self._last_epoch()
+        self.epoch = max(before + 1, last + 1, time.time_ns() // 1000)
         with _transaction(database):
-            if self._counts.get("running"):  # nobody ended it: what waited in memory is gone
-                for camera, epoch, number in database.execute(
-                    "SELECT camera, epoch, number FROM cameras"
-                ).fetchall():
-                    _add_gap(
-                        database,
-                        OutletEntry(camera, epoch, number, "gap", None, time.time(), ""),
-                        0,
-                        "the process ended at once; what came behind the last entry may be missing",
-                        0,
-                    )
+            if counts.get("running"):  # nobody ended it: what waited in memory is gone
+                why = "the process ended at once; what came behind the last entry may be missing"
+                for camera, epoch, number in _last_numbers(database):
+                    _add_gap(database, _gap(camera, epoch, number + 1), 0, why, 0)
             database.execute("DELETE FROM cameras")
+            database.execute("INSERT INTO cameras VALUES ('', ?, 0)", (self.epoch,))
+            if last > before:
+                why = "the spool is gone, or older than its last start; what it had is missing"
+                self._tell_all(database, 0, why)
             _set(database, {"epoch": self.epoch, "running": 1})
-        self._counts |= {"epoch": self.epoch, "running": 1}
+        self._counts = {**counts, "epoch": self.epoch, "running": 1}
+
+    def _last_epoch(self) -> int:
+        """Return the epoch that the lock's file remembers, whatever became of the spool."""
+        if self._lock is None:
+            return 0
+        os.lseek(self._lock, 0, os.SEEK_SET)
+        said = os.read(self._lock, 20).strip()
+        return int(said) if said.isdigit() else 0
+
+    def _keep_epoch(self, epoch: int) -> None:
+        if self._lock is not None:
+            os.lseek(self._lock, 0, os.SEEK_SET)
+            os.write(self._lock, b"%20d" % epoch)
+
+    def _tell_all(self, database: sqlite3.Connection, lost: int, why: str) -> None:
+        """Tell a gap of all cameras."""
+        ((_, epoch, number),) = _last_numbers(database, "WHERE camera = ''")
+        gap = _gap("", epoch, number + 1)
+        _add_gap(database, gap, lost, why, self._in_flight, unknown=True)
+        database.execute("UPDATE cameras SET number = number + 1 WHERE camera = ''")
 
     def _start_anew(self, why: str) -> None:
         """Put a damaged file aside, and keep what can be read of it."""
@@ -156,33 +200,21 @@ class Spool:
             if part.exists():
                 part.replace(self.path.with_name(f"{self.path.name}.damaged-{stamp}{suffix}"))
         self._forget_damaged()
-        lost = 0
-        if counts:
-            counts["running"] = 1
-            waited = counts.get("results", 0) - counts.get("delivered", 0)
-            waited -= sum(value for name, value in counts.items() if name.startswith("dropped."))
-            kept = sum(entry.kind != "gap" for entry in saved)
-            lost = max(0, waited - kept)
-            # the counts may be of an older page than the entries
-            counts["results"] = counts.get("results", 0) + max(0, kept - waited)
-            counts["dropped.damaged"] = counts.get("dropped.damaged", 0) + lost
-        else:
-            counts = {"results": sum(entry.kind != "gap" for entry in saved)}
+        database = _connected(self.path)
+        with contextlib.closing(database):
+            database.execute("PRAGMA journal_mode = WAL")
+            database.executescript(_SCHEMA)
+            with _transaction(database):
+                self._write(database, saved)
+                lost = _settle(database, counts)
+                epoch = max([counts.get("epoch", 0), *(entry.epoch for entry in saved)])
+                epoch = 1 + max(epoch, self._last_epoch(), time.time_ns() // 1000)
+                _set(database, {**counts, "epoch": epoch, "running": 0})
+                text = f"the spool was damaged ({why}); the file is kept beside it"
+                _add_gap(database, _gap("", epoch, 0), lost, text, 0, unknown=True)
+        self._keep_epoch(epoch)
+        self._in_flight = 0
         self._connect()
-        before = max([counts.get("epoch", 0), *(entry.epoch for entry in saved)])
-        counts["epoch"] = self.epoch = max(self.epoch, before + 1)
-        database = self._there
-        with _transaction(database):
-            _set(database, counts)
-            _add_gap(
-                database,
-                OutletEntry("", self.epoch, 0, "gap", None, time.time(), ""),
-                lost,
-                f"the spool was damaged ({why}); the file is kept beside it",
-                0,
-            )
-        self._counts |= counts
-        self._insert(saved)
 
     def _forget_damaged(self) -> None:
         pattern = f"{self.path.name}.damaged-*"
@@ -222,45 +254,33 @@ class Spool:
                 new["dropped.memory"] = new.get("dropped.memory", 0) + count
             came = sum(entry.kind != "gap" for entry in entries)
             new["results"] = new.get("results", 0) + came
-            kept = list(entries)
-            if self._policy == "drop_newest":
-                kept = self._refuse(database, kept, new)
+            taken = self._room_for(entries) if self._policy == "drop_newest" else len(entries)
+            kept, refused = entries[:taken], [one for one in entries[taken:] if one.kind != "gap"]
             size = self._write(database, kept)
+            for last, count in _by_camera(refused):
+                _add_gap(database, last, count, "the spool was full", self._in_flight)
+            if refused:
+                new["dropped.full"] = new.get("dropped.full", 0) + len(refused)
+            _remember(database, [*(last for last, _, _ in lost), *entries])
             gone, freed = self._make_room(database, self._bytes + size, new)
             _set(database, new)
         self._counts = new
         self._bytes += size - freed
         self._spooled += sum(entry.kind != "gap" for entry in kept) - gone
 
-    def _insert(self, entries: Sequence[OutletEntry]) -> None:
-        database = self._there
-        with _transaction(database):
-            self._bytes += self._write(database, entries)
-        self._spooled += sum(entry.kind != "gap" for entry in entries)
-
     def _write(self, database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> int:
-        sizes = [len(entry.body) + ROW_BYTES for entry in entries]
-        rows = [(*entry, size, 1) for entry, size in zip(entries, sizes, strict=True)]
+        rows = [_row(entry) for entry in entries]
         database.executemany(_INSERT, rows)
-        last = {entry.camera: (entry.camera, entry.epoch, entry.number) for entry in entries}
-        database.executemany("INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)", last.values())
-        return sum(sizes)
+        return sum(row[-2] for row in rows)
 
-    def _refuse(
-        self, database: sqlite3.Connection, entries: list[OutletEntry], counts: dict[str, int]
-    ) -> list[OutletEntry]:
-        """Return the entries that there is room for; those behind become gaps."""
-        room, taken = self._max_bytes - self._bytes, 0
-        for entry in entries:
+    def _room_for(self, entries: Sequence[OutletEntry]) -> int:
+        """Return the number of entries that there is room for."""
+        room = self._max_bytes - self._bytes
+        for taken, entry in enumerate(entries):
             room -= len(entry.body) + ROW_BYTES
             if room < 0:
-                break
-            taken += 1
-        refused = [one for one in entries[taken:] if one.kind != "gap"]
-        counts["dropped.full"] = counts.get("dropped.full", 0) + len(refused)
-        for last, count in _by_camera(refused):
-            _add_gap(database, last, count, "the spool was full", self._in_flight)
-        return entries[:taken]
+                return taken
+        return len(entries)
 
     def _make_room(
         self, database: sqlite3.Connection, size: int, counts: dict[str, int]
@@ -291,15 +311,33 @@ class Spool:
 
     def head(self, most: int) -> SpoolHead:
         """Return the oldest entries, ``most`` at most; they stay, and are in flight until told."""
-        places, entries = list[int](), list[OutletEntry]()
-        for place, *fields in self._there.execute(
-            f"SELECT place, {_FIELDS} FROM entries ORDER BY place LIMIT ?",  # noqa: S608
-            (most,),
-        ):
-            places.append(place)
-            entries.append(OutletEntry(*fields))
-        self._in_flight = places[-1] if places else 0
-        return SpoolHead(places, entries)
+        while True:
+            places, entries, bad = list[int](), list[OutletEntry](), list[int]()
+            for place, checksum, *fields in self._there.execute(
+                f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY place LIMIT ?",  # noqa: S608
+                (most,),
+            ):
+                entry = OutletEntry(*fields)
+                if _checksum(entry) != checksum:
+                    bad.append(place)
+                else:
+                    places.append(place)
+                    entries.append(entry)
+            if not bad:
+                self._in_flight = places[-1] if places else 0
+                return SpoolHead(places, entries, self.epoch)
+            self._discard(bad)
+
+    def _discard(self, places: Sequence[int]) -> None:
+        """Drop entries that are not what was written, and tell of them."""
+        database, counts = self._there, dict(self._counts)
+        with _transaction(database):
+            database.executemany("DELETE FROM entries WHERE place = ?", [(one,) for one in places])
+            lost = _settle(database, counts)
+            self._tell_all(database, lost, "entries of the spool were damaged")
+            _set(database, counts)
+        self._counts = counts
+        self._spooled, self._bytes = database.execute(_TOTALS).fetchone()
 
     def done(self, waiting: SpoolHead, count: int | None = None, refused: str = "") -> None:
         """Forget the first ``count`` entries, which the far end took; None: all.
@@ -310,6 +348,8 @@ class Spool:
             refused: why the far end never takes the next one; "" where none was refused.
         """
         database = self._there
+        if waiting.epoch != self.epoch:
+            return  # the spool was begun anew meanwhile: they come again, with the same ids
         taken = len(waiting.places) if count is None else count
         places, entries = waiting.places[:taken], waiting.entries[:taken]
         delivered = sum(entry.kind != "gap" for entry in entries)
@@ -342,12 +382,18 @@ class Spool:
         """The bytes of entries that wait."""
         return self._bytes
 
-    def close(self) -> None:
-        """Close the file, and mark it as ended well."""
+    def close(self, *, ended: bool = True) -> None:
+        """Close the file.
+
+        Args:
+            ended: whether nothing was lost that waited for the spool; else the next start tells of
+                a gap.
+        """
         database, self._database = self._database, None
         if database is not None:
-            with contextlib.suppress(sqlite3.Error), _transaction(database):
-                _set(database, {"running": 0})
+            if ended:
+                with contextlib.suppress(sqlite3.Error), _transaction(database):
+                    _set(database, {"running": 0})
             database.close()
         lock, self._lock = self._lock, None
         if lock is not None:
@@ -365,18 +411,51 @@ def read_account(path: Path) -> OutletAccount | None:
     place = f"{path.absolute().as_uri()}?mode=ro"
     with contextlib.closing(sqlite3.connect(place, uri=True, timeout=1.0)) as database:
         database.execute("BEGIN")
-        counts = dict(database.execute("SELECT name, value FROM counts"))
-        (spooled,) = database.execute(_COUNT).fetchone()
+        counts = _counts_of(database)
+        spooled, _ = database.execute(_TOTALS).fetchone()
     return _account(counts, spooled)
 
 
-def _account(counts: dict[str, int], spooled: int) -> OutletAccount:
+def _connected(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(path, timeout=0.5, isolation_level=None, check_same_thread=False)
+    database.text_factory = _text  # a damaged text is found by its checksum
+    return database
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="replace")
+
+
+def _counts_of(database: sqlite3.Connection) -> dict[str, int]:
+    """Return the counts.
+
+    Raises:
+        sqlite3.DatabaseError: they are damaged.
+    """
+    counts = dict(database.execute("SELECT name, value FROM counts"))
+    if not all(isinstance(one, int) and one >= 0 for one in counts.values()):
+        raise sqlite3.DatabaseError("a count is none")
+    return counts
+
+
+def _account(counts: Mapping[str, int], spooled: int) -> OutletAccount:
     dropped = {
         name.removeprefix("dropped."): value
         for name, value in counts.items()
         if name.startswith("dropped.") and value
     }
     return OutletAccount(counts.get("results", 0), counts.get("delivered", 0), spooled, dropped)
+
+
+def _settle(database: sqlite3.Connection, counts: dict[str, int]) -> int:
+    """Have counts balance with the entries that are there; return how many are lost."""
+    spooled, _ = database.execute(_TOTALS).fetchone()
+    account = _account(counts, int(spooled))
+    known = account.delivered + account.spooled + sum(account.dropped.values())
+    lost = max(0, account.results - known)  # the counts may be of an older page than the entries
+    counts["results"] = max(account.results, known)
+    counts["dropped.damaged"] = counts.get("dropped.damaged", 0) + lost
+    return lost
 
 
 @contextlib.contextmanager
@@ -391,8 +470,33 @@ def _transaction(database: sqlite3.Connection) -> Iterator[None]:
         raise
 
 
-def _set(database: sqlite3.Connection, new: dict[str, int]) -> None:
+def _set(database: sqlite3.Connection, new: Mapping[str, int]) -> None:
     database.executemany("INSERT OR REPLACE INTO counts VALUES (?, ?)", new.items())
+
+
+def _remember(database: sqlite3.Connection, entries: Sequence[OutletEntry]) -> None:
+    """Remember the last number of each camera, behind which a gap stands after a crash."""
+    last = {entry.camera: (entry.camera, entry.epoch, entry.number) for entry in entries}
+    database.executemany("INSERT OR REPLACE INTO cameras VALUES (?, ?, ?)", last.values())
+
+
+def _last_numbers(database: sqlite3.Connection, which: str = "") -> list[tuple[str, int, int]]:
+    return database.execute(f"SELECT camera, epoch, number FROM cameras {which}").fetchall()  # noqa: S608
+
+
+def _checksum(entry: OutletEntry) -> int:
+    return zlib.crc32(repr((*entry,)).encode(errors="backslashreplace"))
+
+
+def _row(entry: OutletEntry, place: int | None = None) -> tuple[Any, ...]:
+    """Return a row of the table; None: behind all others."""
+    entry = entry._replace(at=float(entry.at))
+    size = 0 if entry.kind == "gap" else len(entry.body) + ROW_BYTES
+    return place, *entry, size, _checksum(entry)
+
+
+def _gap(camera: str, epoch: int, number: int) -> OutletEntry:
+    return OutletEntry(camera, epoch, number, "gap", None, time.time(), "")
 
 
 def _by_camera(entries: Iterable[OutletEntry]) -> list[tuple[OutletEntry, int]]:
@@ -410,6 +514,8 @@ def _add_gap(
     why: str,
     in_flight: int,
     place: int | None = None,
+    *,
+    unknown: bool = False,
 ) -> None:
     """Tell a gap, at a place that is free, or at the end; gaps that follow each other are one.
 
@@ -420,37 +526,44 @@ def _add_gap(
         why: reason.
         in_flight: place up to which entries are being delivered, and stay as they are.
         place: place of the gap; None: the end.
+        unknown: whether more may be missing than the count tells.
     """
-    unknown, gone = count == 0, list[tuple[int]]()
-    for there, kind, body in database.execute(
-        "SELECT place, kind, body FROM entries WHERE camera = ? AND place > ? AND place <= ? "
-        "ORDER BY place DESC",
+    unknown, gone, reasons = unknown or count == 0, list[tuple[int]](), [why]
+    for there, checksum, *fields in database.execute(
+        f"SELECT place, checksum, {_FIELDS} FROM entries "  # noqa: S608
+        "WHERE camera = ? AND place > ? AND place <= ? ORDER BY place DESC",
         (last.camera, in_flight, MAX_PLACE if place is None else place),
     ):
-        if kind != "gap":
+        entry = OutletEntry(*fields)
+        if entry.kind != "gap" or _checksum(entry) != checksum:
             break
-        said = json.loads(body)
+        said = json.loads(entry.body)
         count += said["lost"]
         unknown = unknown or said["at_least"]
+        reasons.append(said["error"])
         gone.append((there,))
     database.executemany("DELETE FROM entries WHERE place = ?", gone)
-    body = json.dumps({"error": why, "kind": "Gap", "lost": count, "at_least": unknown})
-    database.execute(
-        f"INSERT INTO entries(place, {_FIELDS}, bytes, count) "  # noqa: S608
-        "VALUES (?, ?, ?, ?, 'gap', NULL, ?, ?, 0, ?)",
-        (place, last.camera, last.epoch, last.number, last.at, body, count),
-    )
+    each = dict.fromkeys(one for text in reversed(reasons) for one in text.split("; "))
+    error = "; ".join(each)[:MAX_REASON_CHARACTERS]
+    body = json.dumps({"error": error, "kind": "Gap", "lost": count, "at_least": unknown})
+    gap = OutletEntry(last.camera, last.epoch, last.number, "gap", None, last.at, body)
+    database.execute(_INSERT, _row(gap, place))
 
 
 def _salvaged(path: Path) -> tuple[list[OutletEntry], dict[str, int]]:
     """Return the entries and the counts that can be read of a damaged file."""
-    entries, counts = list[OutletEntry](), dict[str, int]()
-    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(path)) as database:
+    entries, counts = dict[int, OutletEntry](), dict[str, int]()
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(_connected(path)) as database:
         with contextlib.suppress(sqlite3.Error):
-            counts = dict(database.execute("SELECT name, value FROM counts"))
-        with contextlib.suppress(sqlite3.Error, TypeError):
-            for row in database.execute(f"SELECT {_FIELDS} FROM entries ORDER BY place"):  # noqa: S608
-                entry = OutletEntry(*row)
-                if isinstance(entry.body, str) and isinstance(entry.camera, str):
-                    entries.append(entry)
-    return entries, counts
+            counts = _counts_of(database)
+        for order in ("place", "place DESC"):  # around a page that cannot be read
+            with contextlib.suppress(sqlite3.Error):
+                for place, checksum, *fields in database.execute(
+                    f"SELECT place, checksum, {_FIELDS} FROM entries ORDER BY {order}"  # noqa: S608
+                ):
+                    if place in entries:
+                        break
+                    entry = OutletEntry(*fields)
+                    if _checksum(entry) == checksum:
+                        entries[place] = entry
+    return [entries[place] for place in sorted(entries)], counts

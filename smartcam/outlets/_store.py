@@ -17,6 +17,7 @@ from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._settings import OutletSettings
+from smartcam.outlets._stored import read_store
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 
     from smartcam.outlets._entry import OutletEntry
     from smartcam.outlets._outlet import Column, OutletDesk
+    from smartcam.outlets._stored import StoredResults, StoreQuestion
 
-VERSION = 1
+VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
 
 MAX_COLUMNS = 500
@@ -41,7 +43,7 @@ CREATE TABLE IF NOT EXISTS results(
     id TEXT PRIMARY KEY, camera TEXT NOT NULL, epoch INTEGER NOT NULL, number INTEGER NOT NULL,
     kind TEXT NOT NULL, at TEXT NOT NULL, application INTEGER, sequence INTEGER,
     triggered_at TEXT, latency REAL, error TEXT, error_kind TEXT, lost INTEGER, value TEXT,
-    records INTEGER, picture TEXT);
+    records INTEGER, picture TEXT, at_least INTEGER);
 CREATE INDEX IF NOT EXISTS results_at ON results(at);
 CREATE TABLE IF NOT EXISTS fields(
     application INTEGER NOT NULL, name TEXT NOT NULL, column_name TEXT NOT NULL,
@@ -99,6 +101,14 @@ class ResultStore(Outlet[StoreSettings]):
         """Write entries, all or none."""
         await self._run(lambda: self._write(entries))
 
+    def stored(self, question: StoreQuestion) -> StoredResults | None:
+        """Return the results in the file.
+
+        Raises:
+            ConfigurationError: it cannot be read.
+        """
+        return read_store(self.path, question)
+
     async def close(self) -> None:
         """Close the file."""
         thread, self._thread = self._thread, None
@@ -132,6 +142,8 @@ class ResultStore(Outlet[StoreSettings]):
         with _transaction(database):
             for statement in filter(str.strip, _TABLES.split(";")):
                 database.execute(statement)
+            if version == 1:
+                database.execute("ALTER TABLE results ADD COLUMN at_least INTEGER")
             database.execute(f"PRAGMA user_version = {VERSION}")
         self._expired = 0.0
 
@@ -170,6 +182,7 @@ class ResultStore(Outlet[StoreSettings]):
             None if value is None else json.dumps(value, separators=(",", ":")),
             None if records is None else len(records),
             self._picture(entry, said),
+            said.get("at_least"),
         )
         marks = ", ".join("?" * len(row))
         written = database.execute(f"INSERT OR IGNORE INTO results VALUES ({marks})", row).rowcount  # noqa: S608

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from smartcam.exceptions import ConfigurationError
 from smartcam.web._errors import RefusedError
 from smartcam.web._failure_pictures import FailurePictures
+from smartcam.web._fleet_outlets import OutletsView, StoredRows
 from smartcam.web._fleet_socket import PROTOCOL, FleetSocket, RowsInSight
 from smartcam.web._fleet_view import FleetView
 from smartcam.web._live import CALLS as LIVE_CALLS
@@ -62,6 +63,7 @@ class FleetSite(Site):
         view: view of the fleet that the table shows.
         control: control that was given.
         viewers: sockets of the pages that show the table.
+        outlets: what the agents tell of their outlets.
 
     Raises:
         ConfigurationError: the token cannot be used, or a unit is unknown.
@@ -83,7 +85,14 @@ class FleetSite(Site):
             host=host,
             port=port,
             token=token,
-            files=(*FILES, "fleet_chart.js", "fleet_row.js", "live.css", "live.js"),
+            files=(
+                *FILES,
+                "fleet_chart.js",
+                "fleet_outlets.js",
+                "fleet_row.js",
+                "live.css",
+                "live.js",
+            ),
             pages={"/camera/{name:.+}": "live"},
         )
         self.fleet: Fleet = fleet
@@ -91,6 +100,7 @@ class FleetSite(Site):
         self.units: PageUnits = PageUnits(units)
         self.view: FleetView = FleetView(fleet, self.units.shown)
         self.viewers: set[FleetSocket] = set()
+        self.outlets: OutletsView = OutletsView(fleet)
         self._live: dict[str, WatchedCamera] = {}
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -233,6 +243,23 @@ async def _table(site: FleetSite, call: CallRequest) -> web.StreamResponse:
         return await viewer.serve()
     finally:
         site.viewers.discard(viewer)
+
+
+@CALLS.add("GET", f"{API}/outlets")
+async def _outlets(site: FleetSite, _call: CallRequest) -> object:
+    """The accounts of all agents' outlets: results = delivered + spooled + dropped."""
+    return {"outlets": [one._asdict() for one in await site.outlets.accounts()]}
+
+
+@CALLS.add(
+    "GET",
+    f"{API}/stored",
+    query=StoredRows,
+    about="What agents' stores of results have: the query may have `hours`, `failed` (errors, "
+    "gaps, what did not pass), `camera` (a pattern), `most`.",
+)
+async def _stored(site: FleetSite, call: CallRequest) -> object:
+    return {"stores": [one._asdict() for one in await site.outlets.stored(call.query)]}
 
 
 def _of_camera(handler: Action[ShowsCamera]) -> Action[FleetSite]:

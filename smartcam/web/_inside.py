@@ -10,13 +10,11 @@ if TYPE_CHECKING:
     from smartcam.web._clouds import Up
     from smartcam.web._guard import new_token
     from smartcam.web._jpeg import encoded, is_whole_jpeg, picture
-    from smartcam.web._verdicts import meaning
 
 __all__ = [
     "Up",
     "encoded",
     "is_whole_jpeg",
-    "meaning",
     "new_token",
     "picture",
 ]
@@ -28,6 +26,5 @@ if not TYPE_CHECKING:
             "_clouds": "Up",
             "_guard": "new_token",
             "_jpeg": "encoded is_whole_jpeg picture",
-            "_verdicts": "meaning",
         },
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-import re
 from typing import Any, Final, Literal, TypeAlias
 
+from smartcam._meanings import meaning
 from smartcam.models import Localization, jsonable
 
 MAX_JUDGED: Final = 200
@@ -31,23 +31,6 @@ def _verdict(name: str, values: list[bool]) -> dict[str, Any]:
     good = meaning(name)
     verdict = None if good is None else "pass" if all(one is good for one in values) else "fail"
     return {"name": name, "true": sum(values), "of": len(values), "verdict": verdict}
-
-
-PASS_WORDS = frozenset({"ok", "pass", "passed", "good", "valid", "accept", "accepted", "io"})
-FAIL_WORDS = frozenset(
-    {"nok", "fail", "failed", "bad", "defect", "reject", "rejected", "error", "nio"}
-)
-NOT_WORDS = frozenset({"not", "no"})
-
-
-def meaning(name: str) -> bool | None:
-    """Return the good value of a truth field, judged by its name; None where that does not tell.
-
-    ``ok`` is good when true, ``defect`` and ``not_ok`` when false. ``present`` may be either.
-    """
-    words = set(re.findall(r"[a-z]+", name.lower()))
-    known = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
-    return None if known != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)
 
 
 _meaning = functools.lru_cache(maxsize=4096)(meaning)

@@ -21,9 +21,10 @@ from smartcam.fleet._bus import wire as _wire
 from smartcam.fleet._bus.address import CERTIFICATE_FILES
 from smartcam.fleet._frames.wire import decode_part
 from smartcam.fleet._inside import meets, read_identity
-from smartcam.fleet._json.plain import MAX_REQUEST_BYTES, _fields
+from smartcam.fleet._json.plain import MAX_REQUEST_BYTES, request_fields
 from smartcam.fleet._security.certificates import MAX_BYTES
 from smartcam.frames import Frame, Moment, find_format
+from smartcam.outlets._mqtt import MAX_COMMAND_BYTES, _command_fields
 from smartcam.recording import load_recording
 from smartcam.recording._mcap import form as _form
 from smartcam.recording._mcap import records as _records
@@ -399,10 +400,17 @@ BUS: tuple[Parser, ...] = (
     ),
     Parser(
         "fleet: requests in JSON",
-        lambda text: _fields(text.encode()),
+        lambda text: request_fields(text.encode()),
         _JSON,
         MAX_REQUEST_BYTES,
         "fleet._json.plain.MAX_REQUEST_BYTES",
+    ),
+    Parser(
+        "MQTT: commands",
+        lambda text: _command_fields(text.encode()),
+        _JSON,
+        MAX_COMMAND_BYTES,
+        "outlets._mqtt.MAX_COMMAND_BYTES",
     ),
     Parser(
         "certificates",

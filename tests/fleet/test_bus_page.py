@@ -182,6 +182,7 @@ async def everything(bus: MemoryBus, monkeypatch: pytest.MonkeyPatch) -> AsyncIt
         await anext(own)
         await fleet.status()
         await fleet.reload()
+        await fleet.outlets()
         await camera.frame_after(0.0, encoding="jpeg", timeout=PATIENCE)
         monkeypatch.setattr(_fleet, "MAX_CAMERAS_SUBSCRIBED", 0)  # as if there were many cameras
         bundled = fleet.results()

@@ -88,6 +88,14 @@ async def test_operator_commands_and_viewer_looks(server: FleetServer, folder: P
         assert (await robot.trigger()).number == result.number + 1  # the robot's alone were done
 
 
+async def test_viewer_reads_what_outlets_did(server: FleetServer, folder: Path) -> None:
+    async with program(url(server, folder / "dashboard")) as dashboard:
+        found = dashboard._program
+        for name in ("accounts", "results"):
+            (answer,) = await found.bus.ask(found.keys.outlets("*", name), b"", PATIENCE)
+            assert b'"error":""' in answer[1]
+
+
 async def test_who_commands_all_the_same_is_not_heard(server: FleetServer, folder: Path) -> None:
     """One that does not look at its own certificate: the router drops it, and the call ends."""
     async with program(url(server, folder / "dashboard")) as dashboard:

@@ -50,6 +50,7 @@ VIEWER_DOES: dict[str, set[str]] = {
     "results": {"hear"},
     "bundle": {"hear"},
     "summary": {"ask"},
+    "outlets": {"ask"},
     "listing": {"ask"},
     "topic": {"hear"},
     "service": set(),
@@ -116,8 +117,8 @@ def test_viewer_asks_agents_only_what_changes_nothing() -> None:
         if right.does == "ask" and "viewer" in right.roles
         for one in right.keys
     ]
-    asked = {ANY.summary("*"), ANY.listing("**"), *(ANY.service("**", name) for name in LOOKING)}
-    assert {*may} == asked
+    asked = {ANY.summary("*"), ANY.listing("**"), ANY.outlets("*", "*")}
+    assert {*may} == asked | {ANY.service("**", name) for name in LOOKING}
 
 
 def test_name_is_that_of_who_knows_its_secret() -> None:

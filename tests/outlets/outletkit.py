@@ -9,8 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from smartcam.exceptions import OutletError
 from smartcam.models import Result
-from smartcam.outlets import Outlet, OutletDesk, OutletEntry, OutletError, OutletSettings
+from smartcam.outlets import Outlet, OutletDesk, OutletEntry, OutletSettings
 
 
 def result(

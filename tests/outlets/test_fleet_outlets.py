@@ -169,7 +169,7 @@ async def test_results_of_one_camera_go_to_a_store_and_the_commands_show_them(
     code, out, err = await command("results", str(tmp_path / "results.sqlite"), "--json")
     assert code == 0, err
     told = json.loads(out.splitlines()[-1])
-    assert account["delivered"] <= told["rows"] <= account["results"]
+    assert account["delivered"] <= told["total"] <= account["results"]
 
 
 async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
@@ -188,6 +188,26 @@ async def test_fleet_outlets_shows_the_accounts(tmp_path: Path) -> None:
         "spooled": 0,
         "dropped": {},
     }
+
+
+async def test_a_fleets_url_is_asked_for_accounts_and_for_results(tmp_path: Path) -> None:
+    pytest.importorskip("zenoh")
+    path = fleet(tmp_path, f"listen: tcp/127.0.0.1:0\n{FLEET}")
+    server = FleetServer(path)
+    async with FleetOutlets(server) as outlets, server:
+        await server.wait_tried()
+        await server.hosts["line1/cam1"].camera.trigger(timeout=20)
+        await until(lambda: outlets.outlets.states["store"].account.delivered == 1)
+        url = f"fleet://127.0.0.1:{server.address.port}"
+        code, out, err = await command("fleet", "outlets", url, "--json", "--timeout", "30")
+        assert code == 0, err
+        (told,) = map(json.loads, out.splitlines())
+        assert (told["outlet"], told["trouble"], told["account"]["delivered"]) == ("store", "", 1)
+        code, out, err = await command("results", url, "--since", "8h", "--json", "--timeout", "30")
+        assert code == 0, err
+        row, total = map(json.loads, out.splitlines())
+        assert row["camera"] == "line1/cam1"
+        assert (total["outlet"], total["total"], total["failed"]) == ("store", 1, 0)
 
 
 async def test_results_that_did_not_pass_are_found_with_errors_and_gaps(tmp_path: Path) -> None:
@@ -212,9 +232,16 @@ async def test_results_that_did_not_pass_are_found_with_errors_and_gaps(tmp_path
     assert code == 0, err
     *shown, total = map(json.loads, out.splitlines())
     assert sorted(one["id"] for one in shown) == ["a/1/2", "a/1/3", "a/1/4/gap"]
-    assert total == {"rows": 4, "failed": 3, "errors": 1, "lost": 5}
+    assert total == {
+        "total": 4,
+        "failed": 3,
+        "errors": 1,
+        "gaps": 1,
+        "lost": 5,
+        "at_least": False,
+    }
     code, out, err = await command("results", path, "--since", "8h", "--json")
-    assert json.loads(out.splitlines()[-1])["rows"] == 0
+    assert json.loads(out.splitlines()[-1])["total"] == 0
     code, _, err = await command("results", str(tmp_path / "none"))
     assert code == 2
     assert "there is no such file" in err

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from smartcam.exceptions import ConfigurationError
-from smartcam.outlets import EntryRefusedError, OutletEntry, Outlets, OutletsFile
+from smartcam.exceptions import ConfigurationError, EntryRefusedError
+from smartcam.outlets import OutletEntry, Outlets, OutletsFile
 from smartcam.registry import OUTLETS
 from tests.outlets.outletkit import FarEnd, ListOutlet, numbers, result, until
 
@@ -136,6 +137,44 @@ async def test_a_disk_that_is_full_for_a_while_loses_nothing_that_memory_holds(
     assert numbers(far.taken) == [*range(300)]
 
 
+async def test_whatever_a_spool_raises_is_told_and_tried_again(
+    far: FarEnd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("smartcam.outlets._pump.DISK_RETRY_SECONDS", 0.01)
+    async with Outlets({"list": {}}, tmp_path) as outlets:
+        spool, left = outlets._pumps["list"].spool, [OSError("gone"), RuntimeError("odd")]
+        add = spool.add
+
+        def failing(*given: Any) -> None:
+            if left:
+                raise left.pop()
+            add(*given)
+
+        monkeypatch.setattr(spool, "add", failing)
+        outlets.offer_result(result(1))
+        await until(lambda: "odd" in outlets.states["list"].trouble or not left)
+        await until(lambda: account(outlets).delivered == 1)
+        assert not outlets.states["list"].trouble
+
+
+async def test_what_a_full_disk_keeps_out_until_the_end_is_told_by_the_next_start(
+    far: FarEnd, tmp_path: Path
+) -> None:
+    far.there = False
+    async with Outlets({"list": {}}, tmp_path) as outlets:
+        spool = outlets._pumps["list"].spool
+        pages = spool._there.execute("PRAGMA page_count").fetchone()[0]
+        spool._there.execute(f"PRAGMA max_page_count = {pages}")
+        outlets.offer_result(result(1, value={"n": 1, "text": "x" * 100_000}))
+        await until(lambda: "full" in outlets.states["list"].trouble)
+        epoch = spool.epoch
+    far.there = True
+    async with Outlets({"list": {}}, tmp_path) as outlets:
+        await until(lambda: bool(far.taken))
+    assert [(one.kind, one.epoch) for one in far.taken] == [("gap", epoch)]
+    assert '"at_least": true' in far.taken[0].body
+
+
 async def test_a_spool_that_is_damaged_while_it_is_used_is_begun_anew(
     far: FarEnd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -220,6 +259,18 @@ async def test_stopping_again_and_starting_again_is_harmless(far: FarEnd, tmp_pa
     await outlets.start()
     await outlets.stop()
     await outlets.stop()
+
+
+async def test_threads_have_short_turns_as_long_as_outlets_run(far: FarEnd, tmp_path: Path) -> None:
+    before = sys.getswitchinterval()
+    one, other = Outlets({"list": {}}, tmp_path / "1"), Outlets({"list": {}}, tmp_path / "2")
+    await one.start()
+    await other.start()
+    await one.stop()
+    assert sys.getswitchinterval() == pytest.approx(0.0005)
+    await other.stop()
+    await other.stop()
+    assert sys.getswitchinterval() == pytest.approx(before)
 
 
 def test_an_id_says_camera_epoch_and_number() -> None:

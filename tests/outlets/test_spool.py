@@ -79,6 +79,75 @@ def test_beyond_the_bound_the_newest_are_refused_where_the_policy_says_so(tmp_pa
     spool.close()
 
 
+def test_the_gap_of_a_crash_has_another_id_than_that_of_a_refused_entry(tmp_path: Path) -> None:
+    spool = opened(tmp_path, 2 * (ROW_BYTES + 2), "drop_newest")
+    spool.add([entry(n, spool) for n in range(1, 4)])
+    first = spool.head(10).entries
+    spool.done(spool.head(10))
+    spool.close(ended=False)  # as if it was killed
+    again = opened(tmp_path, 2 * (ROW_BYTES + 2), "drop_newest")
+    second = [one for one in again.head(10).entries if one.camera]
+    assert [one.number for one in first + second] == [1, 2, 3, 4]
+    assert len({one.id for one in first + second}) == 4
+    again.close()
+
+
+def test_an_entry_that_is_not_what_was_written_is_dropped_and_told(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool, body=f'{{"n": {n}}}') for n in range(1, 6)])
+    spool._there.execute("UPDATE entries SET body = '{\"n\": 7}' WHERE number = 3")
+    head = spool.head(10).entries
+    assert [one.number for one in head if one.kind == "result"] == [1, 2, 4, 5]
+    (gap,) = [one for one in head if one.kind == "gap"]
+    assert (gap.camera, json.loads(gap.body)["lost"]) == ("", 1)
+    assert spool.account == OutletAccount(5, 0, 4, {"damaged": 1})
+    spool.close()
+
+
+@pytest.mark.parametrize("gone", ["all of it", "what was written since the last start"])
+def test_a_spool_that_is_deleted_or_older_than_its_last_start_is_told(
+    tmp_path: Path, gone: str
+) -> None:
+    spool, path = opened(tmp_path), tmp_path / "a.spool"
+    spool.close()
+    older, first = path.read_bytes(), spool.epoch
+    spool = opened(tmp_path)
+    spool.add([entry(1, spool)])
+    spool.close()
+    if gone == "all of it":
+        path.unlink()
+    else:
+        path.write_bytes(older)
+    again = opened(tmp_path)
+    (gap,) = again.head(10).entries
+    assert (gap.camera, gap.kind, json.loads(gap.body)["at_least"]) == ("", "gap", True)
+    assert again.epoch > spool.epoch > first
+    again.close()
+
+
+def test_counts_that_do_not_balance_are_damage(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool) for n in range(1, 6)])
+    spool._there.execute("UPDATE counts SET value = 3 WHERE name = 'results'")
+    spool.close()
+    again = opened(tmp_path)
+    assert again.account == OutletAccount(5, 0, 5, {})
+    assert any("does not balance" in one.body for one in again.head(10).entries)
+    again.close()
+
+
+def test_what_was_in_flight_when_a_spool_began_anew_comes_again(tmp_path: Path) -> None:
+    spool = opened(tmp_path)
+    spool.add([entry(n, spool) for n in range(1, 6)])
+    waiting = spool.head(2)
+    spool.renew("as a test says")
+    spool.done(waiting)
+    head = [one.number for one in spool.head(10).entries if one.kind == "result"]
+    assert head == [1, 2, 3, 4, 5]
+    assert spool.account == OutletAccount(5, 0, 5, {})
+    spool.close()
+
+
 def test_what_is_being_delivered_is_not_dropped(tmp_path: Path) -> None:
     spool = opened(tmp_path, 10 * (ROW_BYTES + 2))
     spool.add([entry(n, spool) for n in range(1, 11)])

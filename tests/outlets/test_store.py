@@ -144,6 +144,17 @@ async def test_a_store_of_a_newer_version_is_refused(tmp_path: Path) -> None:
     await made.close()
 
 
+async def test_a_store_of_version_1_gets_the_column_that_it_lacks(tmp_path: Path) -> None:
+    await written(store(tmp_path), entry(1, {"n": 1}))
+    with contextlib.closing(sqlite3.connect(tmp_path / "results.sqlite")) as database:
+        database.execute("ALTER TABLE results DROP COLUMN at_least")
+        database.execute("PRAGMA user_version = 1")
+    gap = '{"error":"full","kind":"Gap","lost":4,"at_least":true}'
+    await written(store(tmp_path), OutletEntry("line1/cam1", 1, 9, "gap", None, 1e9, gap))
+    found = rows(tmp_path, "SELECT kind, lost, at_least FROM results ORDER BY number")
+    assert found == [("result", None, None), ("gap", 4, 1)]
+
+
 async def test_a_localization_is_a_row_with_its_pose(tmp_path: Path) -> None:
     pose = {
         "header": {"seq": 1, "stamp": None, "frame_id": "c"},

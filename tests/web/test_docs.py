@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, get_args
 
 import pytest
 
+from smartcam._meanings import FAIL_WORDS, NOT_WORDS, PASS_WORDS
 from smartcam.calibration._files.directory import MAX_NAME
 from smartcam.calibration._files.store import BACKUPS
 from smartcam.calibration._printing.page_layout import RULER
@@ -32,7 +33,6 @@ from smartcam.web._history import BAR_SECONDS, MAX_BARS, MAX_PICTURES
 from smartcam.web._live import MAX_NEWS
 from smartcam.web._live_view import MAX_RESULTS
 from smartcam.web._pictures import MAX_VIEWERS
-from smartcam.web._verdicts import FAIL_WORDS, NOT_WORDS, PASS_WORDS
 from tests import ROOT
 from tests.web.sitekit import TOKEN
 

@@ -12,6 +12,7 @@ import aiohttp
 import pytest
 
 import smartcam
+from smartcam._meanings import meaning
 from smartcam.emulator import Application, EmulatedCamera, EmulatedInSight
 from smartcam.fleet import FleetFile
 from smartcam.layout import Layout
@@ -35,7 +36,7 @@ from smartcam.web._live_view import (
     ShownResult,
     shown_value,
 )
-from smartcam.web._verdicts import meaning, verdicts
+from smartcam.web._verdicts import verdicts
 from tests.handmade import until
 from tests.web.sitekit import TOKEN, Caller, Listener, Raw
 

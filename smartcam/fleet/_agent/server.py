@@ -17,6 +17,7 @@ from smartcam._zenoh import BusLink, with_ports
 from smartcam.camera import DEFAULT_MAX_QUEUE
 from smartcam.exceptions import ConfigurationError, ConnectionClosedError, SmartCamError
 from smartcam.fleet._agent.agent import Agent
+from smartcam.fleet._agent.outlet_service import OutletService
 from smartcam.fleet._agent.reload import CameraSource, FleetChanges, Reloader, loaded
 from smartcam.fleet._agent.reload_service import ReloadService
 from smartcam.fleet._bus.address import DEFAULT_PORT, FleetAddress
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._inside import CalibrationDesks
     from smartcam.emulator import WireCamera
     from smartcam.fleet._agent.host import Host
+    from smartcam.fleet._agent.outlet_service import StoredRequest
     from smartcam.fleet._bus.bus import Bus
     from smartcam.fleet._file.access import Access
     from smartcam.fleet._file.fleet_file import FramesEntry, Planned
@@ -74,6 +76,7 @@ class FleetServer(Server):
         folder: folder of the file's relative paths.
         observers: observers of all sessions; add them before the server is started.
         outlet_states: function that returns the states of the outlets, by name.
+        stored_results: function that returns what the stores of results say, by outlet.
         calibrations: calibrations of the cameras; None where there is no folder for them.
 
     Raises:
@@ -94,6 +97,7 @@ class FleetServer(Server):
         self._given = file
         self.observers: list[Observer] = []
         self.outlet_states: Callable[[], Mapping[str, OutletState]] = dict
+        self.stored_results: Callable[[StoredRequest], Awaitable[dict[str, Any]]] = _nothing
         found = file if isinstance(file, FleetFile) else load_fleet(file)
         self.folder: Path = folder or (Path() if isinstance(file, FleetFile) else Path(file).parent)
         try:
@@ -164,6 +168,14 @@ class FleetServer(Server):
             service = ReloadService(agent, self._bus, Keys(file.fleet), self.reload)
             stack.push_async_callback(self.reloads.close)
             stack.callback(service.close)
+            outlets = OutletService(
+                agent,
+                self._bus,
+                Keys(file.fleet),
+                lambda: self.outlet_states(),
+                lambda asked: self.stored_results(asked),
+            )
+            stack.callback(outlets.close)
             stack.push_async_callback(self._leave_ros)
             await self._enter_ros()
             if isinstance(self._bus, ZenohEnd):
@@ -498,6 +510,10 @@ def _ros_frames(entry: FramesEntry | None, folder: Path) -> dict[str, Any]:
     if url := entry.camera_info_url(folder):
         found["camera_info_url"] = url
     return found
+
+
+async def _nothing(_asked: StoredRequest) -> dict[str, Any]:
+    return {}
 
 
 async def _end_emulators(sources: dict[str, CameraSource]) -> None:

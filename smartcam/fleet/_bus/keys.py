@@ -149,6 +149,10 @@ class Keys:
         """Return the key at which an agent answers for all its cameras; in JSON."""
         return f"{self.root}/summary/{agent}"
 
+    def outlets(self, agent: str, name: str) -> str:
+        """Return the key at which an agent tells of its outlets: accounts, results; in JSON."""
+        return f"{self.root}/outlets/{agent}/{name}"
+
     def listing(self, camera: str) -> str:
         """Return the key at which a camera's description is asked for; in JSON."""
         return f"{self.root}/cameras/{camera}"

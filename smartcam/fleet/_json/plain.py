@@ -233,7 +233,7 @@ class Plain:
             return
         *chunks, name = self._keys.tail(question.key, "service")
         camera = "/".join(chunks)
-        fields, error = _fields(question.payload)
+        fields, error = request_fields(question.payload)
         service = SERVICES.get(name, UNKNOWN)
         if service is UNKNOWN:
             error = ConfigurationError(
@@ -248,7 +248,7 @@ class Plain:
             self._refuse_pattern(question)
             return
         (name,) = self._keys.tail(question.key, "thesis")
-        fields, error = _fields(question.payload)
+        fields, error = request_fields(question.payload)
         service = THESIS.get(name, UNKNOWN)
         if service is UNKNOWN:
             error = ConfigurationError(
@@ -512,7 +512,7 @@ class Plain:
                 await self._agent.unshare(camera, "its Setup has failed")
 
 
-def _fields(payload: bytes) -> tuple[dict[str, Any] | None, SmartCamError | None]:
+def request_fields(payload: bytes) -> tuple[dict[str, Any] | None, SmartCamError | None]:
     """Return a request's fields, or what is wrong with it. Nothing is an empty request."""
     if len(payload) > MAX_REQUEST_BYTES:
         text = f"a request of {len(payload)} bytes; {MAX_REQUEST_BYTES} are taken"

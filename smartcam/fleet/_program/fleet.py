@@ -13,7 +13,13 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Generic
 
-from smartcam._arguments import check_seconds, check_text
+from smartcam._arguments import (
+    check_flag,
+    check_instant,
+    check_integer,
+    check_seconds,
+    check_text,
+)
 from smartcam._finishing import close_all
 from smartcam._suggestions import did_you_mean
 from smartcam.camera import DEFAULT_MAX_QUEUE, DEFAULT_MAX_QUEUE_BYTES, DEFAULT_TRIGGER_TIMEOUT
@@ -22,6 +28,12 @@ from smartcam.exceptions import (
     ConnectionClosedError,
     LocalProtocolError,
     SmartCamError,
+)
+from smartcam.fleet._agent.outlet_service import (
+    MAX_STORED_ROWS,
+    StoredRequest,
+    ask_outlets,
+    ask_stores,
 )
 from smartcam.fleet._agent.reload_service import reload_agents
 from smartcam.fleet._agent.summary import ask_cameras, by_name
@@ -39,6 +51,7 @@ if TYPE_CHECKING:
     from types import TracebackType
     from typing import Literal, Self
 
+    from smartcam.fleet._agent.outlet_service import ToldOutlet, ToldStore
     from smartcam.fleet._agent.reload import FleetChanges
     from smartcam.fleet._agent.summary import CameraSummary
     from smartcam.fleet._bus.bus import Bus, Handle
@@ -55,6 +68,9 @@ MAX_CAMERAS_SUBSCRIBED = 64
 
 STATUS_TIMEOUT = 5.0
 """Seconds for the answers of all agents."""
+
+STORE_TIMEOUT = 30.0
+"""Seconds for the answers of all stores of results, which read a file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -477,6 +493,58 @@ class Fleet:
         told = await ask_cameras(program.bus, program.keys, "*", pattern, timeout)
         best = by_name(told, lambda one: (one.summary.connected, one.summary.agent))
         return {name: best[name].summary for name in sorted(best)}
+
+    async def outlets(self, *, timeout: float = STATUS_TIMEOUT) -> list[ToldOutlet]:
+        """Return the accounts of all agents' outlets, by agent and name.
+
+        Args:
+            timeout: seconds for the answers of all agents; those that do not answer are left out.
+
+        Raises:
+            ConfigurationError: the timeout cannot work.
+            ConnectionClosedError: the fleet is not open.
+
+        Cancellation: safe.
+        """
+        timeout = check_seconds(timeout, "timeout", "outlets")
+        self._require_open()
+        return await ask_outlets(self._program.bus, self._program.keys, timeout)
+
+    async def stored_results(
+        self,
+        pattern: str = "**",
+        *,
+        since: datetime | None = None,
+        failed: bool = False,
+        most: int = 100,
+        timeout: float = STORE_TIMEOUT,
+    ) -> list[ToldStore]:
+        """Return the answers of agents' stores of results, by agent and outlet.
+
+        Args:
+            pattern: pattern of the cameras' names.
+            since: time with its zone from which on; None: all that is there.
+            failed: whether rows are only errors, gaps, and results that did not pass.
+            most: rows of each store at most, the newest of all.
+            timeout: seconds for the answers of all agents; those that do not answer are left out.
+
+        Raises:
+            ConfigurationError: an argument cannot work.
+            ConnectionClosedError: the fleet is not open.
+
+        Cancellation: safe.
+        """
+        who = "stored_results"
+        at = check_instant(since, "since", who)
+        request = StoredRequest(
+            since=None if at is None else at.astimezone(UTC).isoformat(),
+            failed=check_flag(failed, "failed", who),
+            camera=check_pattern(pattern),
+            most=check_integer(most, "most", 0, MAX_STORED_ROWS, who),
+        )
+        timeout = check_seconds(timeout, "timeout", who)
+        self._require_open()
+        return await ask_stores(self._program.bus, self._program.keys, request, timeout)
 
     def _require_open(self) -> None:
         if self._state != "open":

@@ -77,6 +77,7 @@ RIGHTS: tuple[Right, ...] = (
     Right("hear results in bundles", "hear", (_ANY.bundle("*"),), _LOOKS),
     Right("ask what agents know of all cameras", "ask", (_ANY.summary("*"),), _LOOKS),
     Right("JSON: list the cameras", "ask", (_ANY.listing("**"),), _LOOKS),
+    Right("JSON: ask what outlets did", "ask", (_ANY.outlets("*", "*"),), _LOOKS),
     Right("JSON: hear topics", "hear", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _LOOKS),
     Right(
         "JSON: services that change nothing",
@@ -102,6 +103,7 @@ RIGHTS: tuple[Right, ...] = (
     Right("tell results and states", "say", (_ANY.results("**"), _ANY.states("**")), _SHARES),
     Right("tell results in bundles", "say", (_ANY.bundle("*"),), _SHARES),
     Right("say what it knows of all cameras", "answer", (_ANY.summary("*"),), _SHARES),
+    Right("JSON: tell what its outlets did", "answer", (_ANY.outlets("*", "*"),), _SHARES),
     Right("JSON: tell topics", "say", (_ANY.topic("*", "**"), _ANY.thesis_topic("**")), _SHARES),
     Right(
         "JSON: list, serve",

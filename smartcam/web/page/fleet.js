@@ -2,6 +2,7 @@
 
 import { $, askToken, atGate, headers, live, make, setText, takeUnits, token } from "./base.js";
 import { drawChart, drawLegend } from "./fleet_chart.js";
+import { followOutlets } from "./fleet_outlets.js";
 import { Row } from "./fleet_row.js";
 
 const PROTOCOL = "smartcam.fleet";
@@ -284,4 +285,5 @@ setInterval(() => {
   for (const row of shown.values()) row.age(now());
   if (bars.length && Math.floor(now()) % 5 === 0) drawChart($("chart"), bars, now());
 }, 1000);
+followOutlets();
 listen();

@@ -1,0 +1,126 @@
+"""Outlets: triggers of an agent's camera beside an outlet whose far end is stalled.
+
+Two agents in this process have a session each with the same canned camera, which is a process of
+its own. One has an outlet that takes nothing for ever, so that each result goes to its spool; the
+other one has none. Triggers come as those of fast machines do, 100 a second at random intervals, in
+rounds by turns at both agents; each is measured on the wall clock from the call of ``trigger()`` to
+its result. Of a round counts the 99th percentile of each side.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib.util
+import random
+import sys
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.measure import Comparison, Cost, Goal, Plan, take_turns_awaiting
+from benchmarks.peers import peer
+from smartcam.fleet import FleetServer
+from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._inside import FleetOutlets
+from smartcam.outlets import Outlet, OutletEntry, OutletSettings
+from smartcam.registry import OUTLETS
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterable, Sequence
+
+__all__ = ["run"]
+
+TRIGGERS = 400
+"""In a round of each side: the fourth slowest is the 99th percentile."""
+
+PERIOD = 0.01
+"""Seconds from a trigger to the next, in the mean; from half of it to one and a half."""
+
+STALLED, WITHOUT = "beside a stalled outlet", "without an outlet"
+
+
+class StalledSettings(OutletSettings):
+    """No settings of its own."""
+
+
+class StalledOutlet(Outlet[StalledSettings]):
+    """Takes nothing, and never says so."""
+
+    settings_class = StalledSettings
+
+    async def deliver(self, entries: Sequence[OutletEntry]) -> None:
+        """Wait for ever."""
+        await asyncio.Event().wait()
+
+
+def run(plan: Plan) -> Iterable[Comparison]:
+    """Measure the 99th percentile and the median of triggers on both sides."""
+    if importlib.util.find_spec("yaml") is None:
+        print("outlets: left out: PyYAML is not installed (smartcam[yaml])", file=sys.stderr)
+        return
+    OUTLETS.register("stalled", StalledOutlet)
+    with peer("trigger", "together") as port, tempfile.TemporaryDirectory() as folder:
+        yield from asyncio.run(_triggers(plan, port, Path(folder)))
+
+
+async def _triggers(plan: Plan, port: int, folder: Path) -> list[Comparison]:
+    count = plan.operations(TRIGGERS, least=100)
+    middles: dict[str, list[Cost]] = {STALLED: [], WITHOUT: []}
+    async with (
+        _agent(port, folder, {"stalled": {"timeout": 3600}}) as stalled,
+        _agent(port, folder, None) as without,
+    ):
+        sides = {
+            name: partial(_slowest, server, count, middles[name])
+            for name, server in ((STALLED, stalled), (WITHOUT, without))
+        }
+        series = await take_turns_awaiting(plan, sides)
+        account = stalled.outlet_states()["stalled"].account
+        assert account.spooled == account.results == count * (plan.rounds + 1), account
+    goal = Goal("at most", 1.1)
+    case = "await trigger(), 100 a second"
+    note = "wall clock; every result is written to the spool, and none is taken"
+    mid = {name: type(series[name])(name, "us", values[1:]) for name, values in middles.items()}
+    return [
+        Comparison(
+            "outlets", f"{case}, p99", series[STALLED], series[WITHOUT], "ratio", goal, note
+        ),
+        Comparison("outlets", f"{case}, p50", mid[STALLED], mid[WITHOUT]),
+    ]
+
+
+@contextlib.asynccontextmanager
+async def _agent(
+    port: int, folder: Path, outlets: dict[str, Any] | None
+) -> AsyncIterator[FleetServer]:
+    from smartcam.fleet import FleetFile
+
+    url = f"bvs://127.0.0.1:{port}?dialect=handbook"
+    fields: dict[str, Any] = {"cameras": {"cam": {"url": url, "interpret_as": "localizations"}}}
+    if outlets is not None:
+        fields["outlets"] = outlets
+    server = FleetServer(FleetFile.model_validate(fields), bus=MemoryBus().end(), folder=folder)
+    async with contextlib.AsyncExitStack() as stack:
+        if outlets is not None:
+            await stack.enter_async_context(FleetOutlets(server))
+        await stack.enter_async_context(server)
+        await server.wait_tried()
+        yield server
+
+
+async def _slowest(server: FleetServer, count: int, middles: list[Cost]) -> Cost:
+    """Return the 99th percentile of triggers, in microseconds; keep the one in the middle."""
+    camera, took = server.hosts["cam"].camera, list[float]()
+    dice, due = random.Random(count), time.perf_counter()  # noqa: S311
+    for _ in range(count):
+        due += dice.uniform(0.5, 1.5) * PERIOD
+        await asyncio.sleep(max(0.0, due - time.perf_counter()))
+        begin = time.perf_counter()
+        await camera.trigger(timeout=30.0)
+        took.append(time.perf_counter() - begin)
+    took.sort()
+    middles.append(took[count // 2] * 1e6)
+    return took[count - max(1, count // 100)] * 1e6

@@ -1,0 +1,21 @@
+"""Tell from the name of a truth value which value is good."""
+
+from __future__ import annotations
+
+import re
+
+PASS_WORDS = frozenset({"ok", "pass", "passed", "good", "valid", "accept", "accepted", "io"})
+FAIL_WORDS = frozenset(
+    {"nok", "fail", "failed", "bad", "defect", "reject", "rejected", "error", "nio"}
+)
+NOT_WORDS = frozenset({"not", "no"})
+
+
+def meaning(name: str) -> bool | None:
+    """Return the good value of a truth field, judged by its name; None where that does not tell.
+
+    ``ok`` is good when true, ``defect`` and ``not_ok`` when false. ``present`` may be either.
+    """
+    words = set(re.findall(r"[a-z]+", name.lower()))
+    known = bool(words & PASS_WORDS) + bool(words & FAIL_WORDS)
+    return None if known != 1 else bool(words & PASS_WORDS) is not bool(words & NOT_WORDS)

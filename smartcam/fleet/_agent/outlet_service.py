@@ -1,0 +1,265 @@
+"""Outlets over the bus: agents tell the accounts of theirs, and what their stores say."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from smartcam.exceptions import ConfigurationError, LocalProtocolError, SmartCamError
+from smartcam.fleet._bus.address import check_pattern
+from smartcam.fleet._bus.bus import always
+from smartcam.fleet._json.plain import request_fields
+from smartcam.fleet._json.topics import as_json
+from smartcam.fleet._program.reading import failure
+from smartcam.settings import validated
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping
+
+    from smartcam.fleet._agent.agent import Agent
+    from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle
+    from smartcam.fleet._bus.keys import Keys
+    from smartcam.outlets import OutletState
+
+logger: logging.Logger = logging.getLogger("smartcam.fleet")
+
+MAX_STORE_QUESTIONS = 4
+"""Questions to stores of one agent that are under way at most; each has a thread."""
+
+MAX_STORED_ROWS = 1000
+"""Rows of a store in one answer."""
+
+MAX_ROWS_BYTES = 1 << 23
+"""Bytes of rows in one answer; beyond, the oldest are left out."""
+
+ROW_BYTES = 300
+"""Bytes of a row beside its value and its error, about."""
+
+
+class ToldOutlet(NamedTuple):
+    """An outlet's account, as its agent told it: ``results == delivered + spooled + dropped``.
+
+    Attributes:
+        agent: name of the agent.
+        outlet: name of the outlet.
+        results: results and errors that came.
+        delivered: results and errors that the far end took.
+        spooled: results and errors that wait.
+        dropped: results and errors that were given up, by the reason.
+        trouble: why nothing is delivered, or spooled, at the time; "" where all is well.
+    """
+
+    agent: str
+    outlet: str
+    results: int
+    delivered: int
+    spooled: int
+    dropped: dict[str, int]
+    trouble: str
+
+
+class ToldStore(NamedTuple):
+    """The answer of a store of results, as its agent told it.
+
+    Attributes:
+        agent: name of the agent.
+        outlet: name of the outlet that writes the store; "" where the agent could not answer.
+        rows: rows that were asked for, the oldest first, with the columns of the store's table
+            ``results`` by their names.
+        total: results, errors and gaps of the time and the cameras, shown or not.
+        failed: number of them that are errors, gaps, or did not pass.
+        errors: number of errors.
+        gaps: number of gaps.
+        lost: results that the gaps tell of.
+        at_least: whether more may be lost than the gaps count.
+        error: why the store could not be asked; "" where it was.
+    """
+
+    agent: str
+    outlet: str
+    rows: list[dict[str, Any]]
+    total: int = 0
+    failed: int = 0
+    errors: int = 0
+    gaps: int = 0
+    lost: int = 0
+    at_least: bool = False
+    error: str = ""
+
+
+def _moment(text: str) -> str:
+    try:
+        aware = datetime.fromisoformat(text).tzinfo is not None
+    except ValueError:
+        aware = False
+    if not aware:
+        raise ValueError("expected a time with its zone, such as 2030-01-31T06:00:00+00:00")
+    return text
+
+
+def _pattern(text: str) -> str:
+    try:
+        return check_pattern(text)
+    except ConfigurationError as exc:
+        raise ValueError(str(exc)) from exc
+
+
+class StoredRequest(BaseModel):
+    """The fields of a question to stores."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    since: Annotated[str, Field(max_length=100), AfterValidator(_moment)] | None = None
+    failed: bool = False
+    camera: Annotated[str, Field(max_length=200), AfterValidator(_pattern)] = "**"
+    most: Annotated[int, Field(ge=0, le=MAX_STORED_ROWS)] = 100
+
+
+class OutletService:
+    """Answers programs that want to know what an agent's outlets did.
+
+    Args:
+        agent: the agent, which does the work in tasks of its own.
+        bus: the agent's end of the bus.
+        keys: keys of the fleet.
+        states: returns the states of the outlets, by name.
+        stored: returns what the stores say, by the outlet's name.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        bus: Bus,
+        keys: Keys,
+        states: Callable[[], Mapping[str, OutletState]],
+        stored: Callable[[StoredRequest], Awaitable[dict[str, dict[str, Any]]]],
+    ) -> None:
+        self._agent, self._keys = agent, keys
+        self._states, self._stored = states, stored
+        self._under_way = 0
+        pattern = keys.outlets(agent.name, "*")
+        self._declared: Handle = bus.answer(pattern, self._on_question, patient=always)
+
+    def close(self) -> None:
+        """Answer no more."""
+        self._declared.close()
+
+    def _on_question(self, question: BusQuestion) -> None:
+        name = question.key.rpartition("/")[2]
+        if name == "accounts":
+            accounts = {
+                name: {**state.account.fields(), "trouble": state.trouble}
+                for name, state in self._states().items()
+            }
+            self._say(question, name, {"error": "", "outlets": accounts})
+        elif name != "results":
+            error = ConfigurationError(f"outlets: expected accounts or results, got {name!r:.80}")
+            self._say(question, name, failure(error))
+        elif self._under_way >= MAX_STORE_QUESTIONS:
+            text = f"{self._under_way} questions to the stores are under way"
+            self._say(question, name, failure(LocalProtocolError(text)))
+        else:
+            self._under_way += 1
+            self._agent.begin(self._answer(question), "smartcam.fleet.outlets")
+
+    async def _answer(self, question: BusQuestion) -> None:
+        said = failure(SmartCamError("the agent ends"))
+        try:
+            given, error = request_fields(question.payload)
+            if error is not None:
+                raise error
+            request = validated(StoredRequest, given or {}, "outlets: results")
+            found = await self._stored(request)
+            said = {"error": "", "stores": {name: _bounded(one) for name, one in found.items()}}
+        except SmartCamError as exc:
+            said = failure(exc)
+        finally:
+            self._under_way -= 1
+            self._say(question, "results", said)
+
+    def _say(self, question: BusQuestion, name: str, fields: dict[str, Any]) -> None:
+        agent = self._agent.name
+        key = question.key if "*" not in question.key else self._keys.outlets(agent, name)
+        question.reply(key, as_json({"agent": agent, **fields}))
+        question.close()
+
+
+def _bounded(store: dict[str, Any]) -> dict[str, Any]:
+    """Return a store's answer without the oldest rows that there is no room for."""
+    rows, size = list[dict[str, Any]](), 0
+    for row in reversed(store["rows"]):
+        size += ROW_BYTES + len(row["value"] or "") + len(row["error"] or "")
+        if size > MAX_ROWS_BYTES:
+            break
+        rows.append(row)
+    return {**store, "rows": rows[::-1]}
+
+
+T = TypeVar("T", ToldOutlet, ToldStore)
+
+
+async def ask_outlets(bus: Bus, keys: Keys, timeout: float) -> list[ToldOutlet]:
+    """Return the accounts of all agents' outlets that came within ``timeout`` seconds."""
+    return await _ask(bus, keys.outlets("*", "accounts"), b"", timeout, _accounts)
+
+
+async def ask_stores(
+    bus: Bus, keys: Keys, request: StoredRequest, timeout: float
+) -> list[ToldStore]:
+    """Return the answers of all agents' stores that came within ``timeout`` seconds."""
+    payload = request.model_dump_json().encode()
+    return await _ask(bus, keys.outlets("*", "results"), payload, timeout, _stores)
+
+
+async def _ask(
+    bus: Bus, key: str, payload: bytes, timeout: float, read: Callable[[bytes], list[T]]
+) -> list[T]:
+    found: list[T] = []
+    for _, answer in await bus.ask(key, payload, timeout):
+        try:
+            found += await asyncio.to_thread(read, answer)
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as exc:
+            logger.warning("%s ! an agent's answer cannot be read: %r", key, exc)
+    return sorted(found, key=lambda one: one[:2])
+
+
+def _accounts(answer: bytes) -> list[ToldOutlet]:
+    said: Any = json.loads(answer)
+    return [
+        ToldOutlet(
+            str(said["agent"]),
+            str(name),
+            int(one["results"]),
+            int(one["delivered"]),
+            int(one["spooled"]),
+            {str(why): int(count) for why, count in one["dropped"].items()},
+            str(one["trouble"]),
+        )
+        for name, one in said["outlets"].items()
+    ]
+
+
+def _stores(answer: bytes) -> list[ToldStore]:
+    said: Any = json.loads(answer)
+    agent = str(said["agent"])
+    if said["error"]:
+        return [ToldStore(agent, "", [], error=str(said["error"]))]
+    return [
+        ToldStore(
+            agent,
+            str(name),
+            [dict(row) for row in one["rows"]],
+            total=int(one["total"]),
+            failed=int(one["failed"]),
+            errors=int(one["errors"]),
+            gaps=int(one["gaps"]),
+            lost=int(one["lost"]),
+            at_least=bool(one["at_least"]),
+        )
+        for name, one in said["stores"].items()
+    ]

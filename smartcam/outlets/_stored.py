@@ -1,0 +1,139 @@
+"""Answer what a shift asks of a store of results: what failed, and what is missing."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from smartcam._file_values import chosen
+from smartcam._meanings import meaning
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+READ_TIMEOUT = 20.0
+"""Seconds within which a store answers."""
+
+STEPS_BETWEEN_LOOKS = 10_000
+"""Steps of SQLite's machine between two looks at the time."""
+
+COLUMNS = (
+    *("id", "camera", "kind", "at", "application", "sequence", "latency"),
+    *("error", "lost", "at_least", "value", "picture"),
+)
+"""Columns of a row that is shown."""
+
+
+class StoreQuestion(NamedTuple):
+    """A question to a store of results.
+
+    Attributes:
+        since: time from which on; None for all that is there.
+        failed: whether only errors, gaps and results that did not pass are shown.
+        camera: name or pattern of the cameras; ``**`` for all.
+        most: rows that are shown at most, the newest of all.
+    """
+
+    since: datetime | None = None
+    failed: bool = False
+    camera: str = "**"
+    most: int = 1000
+
+
+class StoredResults(NamedTuple):
+    """The answer of a store of results.
+
+    Attributes:
+        rows: rows that were asked for, the oldest first: ``id``, ``camera``, ``kind``, ``at``,
+            ``application``, ``sequence``, ``latency``, ``error``, ``lost``, ``at_least``,
+            ``value``, ``picture``.
+        total: results, errors and gaps of the time and the cameras, shown or not.
+        failed: number of them that are errors, gaps, or did not pass.
+        errors: number of errors.
+        gaps: number of gaps.
+        lost: results that the gaps tell of.
+        at_least: whether more may be lost than the gaps count.
+    """
+
+    rows: list[dict[str, Any]]
+    total: int
+    failed: int
+    errors: int
+    gaps: int
+    lost: int
+    at_least: bool
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Everything but the rows."""
+        fields = self._asdict()
+        del fields["rows"]
+        return fields
+
+
+def read_store(path: Path, question: StoreQuestion) -> StoredResults:
+    """Return the results in a store, which an outlet may be writing; blocks.
+
+    Raises:
+        ConfigurationError: there is no such file, it is no store, or it does not answer in time.
+    """
+    if not path.is_file():
+        raise ConfigurationError(f"results {path}: there is no such file")
+    place, end = f"{path.absolute().as_uri()}?mode=ro", time.monotonic() + READ_TIMEOUT
+    try:
+        with contextlib.closing(sqlite3.connect(place, uri=True, timeout=5.0)) as database:
+            database.set_progress_handler(lambda: time.monotonic() > end, STEPS_BETWEEN_LOOKS)
+            return _read(database, question)
+    except sqlite3.Error as exc:
+        raise ConfigurationError(f"results {path}: expected a store of results: {exc}") from exc
+
+
+def _read(database: sqlite3.Connection, question: StoreQuestion) -> StoredResults:
+    database.create_function(
+        "chosen", 1, lambda name: name == "" or chosen((question.camera,), name)
+    )
+    bad = _failure_condition(database)
+    which, values = ["1"], list[Any]()
+    if question.since is not None:
+        which.append("at >= ?")
+        values.append(question.since.astimezone(UTC).isoformat(timespec="microseconds"))
+    if question.camera != "**":
+        which.append("chosen(camera)")  # a gap of all cameras is of each one
+    of = " AND ".join(which)
+    shown = f"{of} AND {bad}" if question.failed else of
+    columns = ", ".join(COLUMNS)
+    rows = database.execute(
+        f"SELECT * FROM (SELECT rowid, {columns} FROM results WHERE {shown} "  # noqa: S608
+        "ORDER BY at DESC, rowid DESC LIMIT ?) ORDER BY at, rowid",
+        (*values, question.most),
+    ).fetchall()
+    total, failed, errors, gaps, lost, at_least = database.execute(
+        f"SELECT COUNT(*), COUNT(*) FILTER (WHERE {bad}), "  # noqa: S608
+        "COUNT(*) FILTER (WHERE kind = 'error'), COUNT(*) FILTER (WHERE kind = 'gap'), "
+        f"COALESCE(SUM(lost), 0), COALESCE(MAX(at_least), 0) FROM results WHERE {of}",
+        values,
+    ).fetchone()
+    found = [dict(zip(COLUMNS, row[1:], strict=True)) for row in rows]
+    return StoredResults(found, total, failed, errors, gaps, lost, bool(at_least))
+
+
+def _failure_condition(database: sqlite3.Connection) -> str:
+    """Return the condition of rows that are errors, gaps, or results that did not pass."""
+    conditions: dict[int, list[str]] = {}
+    for application, name, column in database.execute(
+        "SELECT application, name, column_name FROM fields WHERE type = 'bool'"
+    ):
+        good = meaning(name)
+        if good is not None:
+            quoted = column.replace('"', '""')
+            conditions.setdefault(application, []).append(f'"{quoted}" = {int(not good)}')
+    found = [
+        f"id IN (SELECT id FROM app_{int(application)} WHERE {' OR '.join(each)})"  # noqa: S608
+        for application, each in conditions.items()
+    ]
+    either = " OR ".join(["kind != 'result'", *found])
+    return f"({either})"

@@ -1,0 +1,80 @@
+"""Outlets on a fleet's page: agents are asked once for all who look."""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from smartcam.exceptions import ConfigurationError, ConnectionClosedError
+from smartcam.web._errors import RefusedError
+
+if TYPE_CHECKING:
+    from smartcam.fleet import Fleet, ToldOutlet, ToldStore
+
+KEPT: Final = 2.0
+"""Seconds for which the answer for one page does for the others, too."""
+
+MAX_STORE_QUESTIONS: Final = 4
+"""Questions to the stores that pages may have under way at a time."""
+
+
+class StoredRows(BaseModel):
+    """The results in stores that a page wants."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+
+    hours: float = Field(default=8.0, gt=0, le=24 * 3660)
+    failed: bool = False
+    camera: str = Field(default="**", max_length=200)
+    most: int = Field(default=200, ge=0, le=1000)
+
+
+class OutletsView:
+    """Asks agents of their outlets.
+
+    Args:
+        fleet: an open fleet, which the caller closes.
+    """
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._accounts: list[ToldOutlet] = []
+        self._at = -KEPT
+        self._turn = asyncio.Lock()
+        self._stores = asyncio.Semaphore(MAX_STORE_QUESTIONS)
+
+    async def accounts(self) -> list[ToldOutlet]:
+        """Return the accounts of all outlets, of :data:`KEPT` seconds before at most.
+
+        Raises:
+            RefusedError: 503, the fleet is closed.
+        """
+        loop = asyncio.get_running_loop()
+        async with self._turn:
+            if loop.time() - self._at >= KEPT:
+                try:
+                    self._accounts = await self._fleet.outlets()
+                except ConnectionClosedError as exc:
+                    raise RefusedError(503, str(exc)[:300], "an open fleet") from exc
+                self._at = loop.time()
+            return self._accounts
+
+    async def stored(self, wanted: StoredRows) -> list[ToldStore]:
+        """Return the answers of the stores.
+
+        Raises:
+            RefusedError: 422, the pattern cannot be one; 503, the fleet is closed.
+        """
+        since = datetime.now(UTC) - timedelta(hours=wanted.hours)
+        async with self._stores:
+            try:
+                return await self._fleet.stored_results(
+                    wanted.camera, since=since, failed=wanted.failed, most=wanted.most
+                )
+            except ConfigurationError as exc:
+                raise RefusedError(422, str(exc)[:300], "a pattern of cameras") from exc
+            except ConnectionClosedError as exc:
+                raise RefusedError(503, str(exc)[:300], "an open fleet") from exc

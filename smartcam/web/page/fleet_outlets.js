@@ -1,0 +1,55 @@
+// Outlets on the fleet's page: their accounts, and what the stores of results say of a shift.
+
+import { $, headers, make, setText } from "./base.js";
+
+const PERIOD_MS = 5000; // between two questions for the accounts
+const NUMBERS = ["results", "delivered", "spooled"];
+
+const ask = async (path) => {
+  const answer = await fetch(path, { headers: headers(), cache: "no-store" }).catch(() => null);
+  return answer?.ok ? answer.json() : null;
+};
+
+// Show the accounts from now on; the panel is there as soon as an agent tells of an outlet.
+export async function followOutlets() {
+  $("failures").addEventListener("toggle", showFailures);
+  $("since").addEventListener("change", showFailures);
+  for (;;) {
+    const said = document.hidden ? null : await ask("/api/outlets");
+    if (said) showAccounts(said.outlets);
+    await new Promise((done) => setTimeout(done, PERIOD_MS));
+  }
+}
+
+function showAccounts(outlets) {
+  $("outlets").hidden = !outlets.length;
+  $("accounts").replaceChildren(...outlets.map(account));
+}
+
+function account(one) {
+  const dropped = Object.entries(one.dropped).map(([why, count]) => `${count} ${why}`);
+  const cells = [one.agent, one.outlet, ...NUMBERS.map((name) => one[name]), dropped.join(", ") || "0", one.trouble || "well"];
+  return make("tr", { "data-well": String(!one.trouble) }, ...cells.map(cell));
+}
+
+async function showFailures() {
+  if (!$("failures").open) return;
+  const said = await ask(`/api/stored?failed=true&hours=${$("since").value}`);
+  const stores = said?.stores ?? [];
+  setText("counted", stores.map(counted).join(" "));
+  const rows = stores.flatMap((store) => store.rows).sort((one, other) => (one.at < other.at ? 1 : -1));
+  $("failed").replaceChildren(...rows.map(failure));
+}
+
+function counted(store) {
+  if (store.error) return `${store.agent}: ${store.error}.`;
+  const least = store.at_least ? "at least " : "";
+  return `${store.agent} ${store.outlet}: ${store.failed} of ${store.total} failed, ${store.errors} errors, ${least}${store.lost} lost in ${store.gaps} gaps.`;
+}
+
+function failure(row) {
+  const cells = [new Date(row.at).toLocaleString(), row.camera || "all cameras", row.application ?? "", row.error || row.value || ""];
+  return make("tr", {}, ...cells.map(cell));
+}
+
+const cell = (text) => make("td", { textContent: String(text) });
