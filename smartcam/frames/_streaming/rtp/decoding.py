@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._codecs.threads import Codecs, StreamRuns
 from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._pixels.formats import find_format
 
@@ -102,6 +102,7 @@ class UnitDecoding:
         self._shown = False
         self._ended = False
         self._codecs = Codecs(threads=1)
+        self._run = StreamRuns(self._codecs)
         self._task: asyncio.Task[None] | None = None
 
     async def begin(self, source: UnitSource) -> None:
@@ -187,10 +188,12 @@ class UnitDecoding:
                 decoder.lost()
             self._skipped, self._anew = 0, False
             await self._give(decoder, unit, device_time)
+            if self._units:
+                await asyncio.sleep(0)  # pictures that came together do not hold up the loop
 
     def _decoder(self) -> H264Decoder:
-        run = self._codecs._run  # noqa: SLF001 - as the decoders that the codecs give out
-        return self._plan.coding.decoder(run, reorders=self._reorders, to=self._plan.to)
+        reorders, to = self._reorders, self._plan.to
+        return self._plan.coding.decoder(self._run, reorders=reorders, to=to)
 
     def _with_sets(self, unit: AccessUnit) -> AccessUnit:
         if not self._plan.sets or self._plan.coding.size_in(unit.data) is not None:

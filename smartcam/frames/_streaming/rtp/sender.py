@@ -18,7 +18,8 @@ from smartcam.exceptions import (
     LocalProtocolError,
     MessageError,
 )
-from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._codecs.h264 import H264Encoder
+from smartcam.frames._codecs.threads import Codecs, StreamRuns
 from smartcam.frames._source import FrameSource
 from smartcam.frames._streaming.rtp import packets as wire
 from smartcam.frames._streaming.rtp.feedback import Audience, PacketHistory
@@ -30,7 +31,6 @@ from smartcam.frames._streaming.rtp.sockets import SocketPair, host_and_port, re
 if TYPE_CHECKING:
     from typing import Self
 
-    from smartcam.frames._codecs.h264 import H264Encoder
     from smartcam.frames._frame import Frame
     from smartcam.frames._streaming.rtp.feedback import RtpReceiver
     from smartcam.frames._streaming.rtp.sockets import Endpoint
@@ -144,7 +144,7 @@ class RtpSender:
         self._entered = False
 
     def _made_encoder(self, fps: float) -> H264Encoder:
-        return self._codecs.h264_encoder(fps=fps, **self._options)  # type: ignore[arg-type]
+        return H264Encoder(StreamRuns(self._codecs), fps=fps, **self._options)  # type: ignore[arg-type]
 
     @property
     def sdp(self) -> str:
