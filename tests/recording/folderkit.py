@@ -22,10 +22,11 @@ NAME = "line1/cam1"
 def section(**fields: Any) -> RecordSection:
     """Return what a file says, with sizes as small as a test wants."""
     said = {"folder": "rec", "size": 1e8, "age": 3600.0, "keep": 1e10, "cameras": ("**",)}
-    return RecordSection.model_construct(**{**said, "frames": True, **fields})
+    usual = {"frames": True, "pictures": "none"}
+    return RecordSection.model_construct(**{**said, **usual, **fields})
 
 
-def server(folder: Path, *urls: str) -> FleetServer:
+def server(folder: Path, *urls: str, frames: str | None = None) -> FleetServer:
     """Return the agent of cameras ``line1/cam1``, ... at these addresses."""
     entries = {
         f"line1/cam{place}": {
@@ -33,6 +34,7 @@ def server(folder: Path, *urls: str) -> FleetServer:
             "application": 1,
             "interpret_as": LAYOUT,
             "reconnect": {"initial": 0.01, "maximum": 0.05},
+            **({} if frames is None else {"frames": frames}),
         }
         for place, url in enumerate(urls, 1)
     }
@@ -42,10 +44,14 @@ def server(folder: Path, *urls: str) -> FleetServer:
 
 @contextlib.asynccontextmanager
 async def recording(
-    place: Path, *urls: str, clock: Callable[[], float] = time.monotonic, **fields: Any
+    place: Path,
+    *urls: str,
+    clock: Callable[[], float] = time.monotonic,
+    frames: str | None = None,
+    **fields: Any,
 ) -> AsyncIterator[tuple[FleetRecorder, FleetServer]]:
     """Record cameras into ``place/rec``."""
-    agent = server(place, *urls)
+    agent = server(place, *urls, frames=frames)
     recorder = FleetRecorder(agent, section(**fields), _clock=clock)
     async with recorder, agent:
         await agent.wait_tried()
