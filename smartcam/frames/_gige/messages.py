@@ -13,12 +13,14 @@ import struct
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from smartcam.exceptions import MessageError
+from smartcam.frames._gige.block import picture_bytes
 from smartcam.frames._gige.features import GenicamFeatures
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping
 
     from smartcam.frames._features import FeatureValue
+    from smartcam.frames._gige.block import WholePicture
     from smartcam.frames._gige.description import Element
     from smartcam.frames._gige.features import DeviceMemory
 
@@ -61,6 +63,27 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
         found[number] = payload[begin : end - _ENDING.size]
         end = begin
     return found
+
+
+def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
+    """Return why a picture whose leader has no size may be of another one; "" where it is not.
+
+    Args:
+        picture: picture of the size that the camera's features say.
+        chunks: values that came with it.
+    """
+    leader = picture.leader
+    need, size = picture_bytes(leader, picture.rows), f"{leader.width}x{leader.height}"
+    try:
+        *_, first = cut_chunks(picture.payload or memoryview(b"")).values()
+    except (MessageError, ValueError) as exc:
+        return f"a picture of {size} in chunk data that cannot be read: {exc}"
+    if len(first) != need:
+        return f"a picture of {size} has {need} bytes, the chunk that came has {len(first)}"
+    for name, said in (("ChunkWidth", leader.width), ("ChunkHeight", leader.height)):
+        if chunks.get(name, said) != said:
+            return f"its picture is {size} by its features, {name} is {chunks[name]}"
+    return ""
 
 
 class MessageFeatures(GenicamFeatures):
