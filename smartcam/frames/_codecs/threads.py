@@ -15,7 +15,7 @@ from smartcam.frames._codecs.h264 import H264Decoder, H264Encoder
 from smartcam.frames._frame import Frame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Coroutine
     from typing import Literal, Self
 
 
@@ -241,11 +241,16 @@ class StreamRuns:
         self._codecs = codecs
         self._longest: float | None = None  # seconds of CPU time, the last pictures counting most
 
+    @property
+    def short(self) -> bool:
+        """True if what is run next is run at once, in the event loop."""
+        return self._longest is not None and self._longest <= MAX_LOOP_TIME
+
     async def __call__(self, work: Callable[[], T]) -> T:
         """Run the work, and return its result."""
-        self._codecs._open_pool()  # noqa: SLF001 - what is closed runs nothing
-        if self._longest is None or self._longest > MAX_LOOP_TIME:
+        if not self.short:
             return await self._codecs._run(partial(self._timed, work))  # noqa: SLF001
+        self._codecs._open_pool()  # noqa: SLF001 - what is closed runs nothing
         return self._timed(work)
 
     def _timed(self, work: Callable[[], T]) -> T:
@@ -255,3 +260,18 @@ class StreamRuns:
         finally:
             took = time.thread_time() - began
             self._longest = max(took, DECAY * (self._longest or 0.0))
+
+
+def at_once(work: Coroutine[Any, Any, T]) -> T:
+    """Return the result of a coroutine that never waits.
+
+    Raises:
+        RuntimeError: it waits.
+    """
+    try:
+        work.send(None)
+    except StopIteration as done:
+        result: T = done.value
+        return result
+    work.close()
+    raise RuntimeError("it cannot be done without waiting")

@@ -44,6 +44,9 @@ REPORT_INTERVAL: Final = 2.0
 MIN_KEY_FRAME_INTERVAL: Final = 0.2
 """Seconds between two key frames made on request, since key frames are large."""
 
+BEGINS_SPS: Final = b"\0\0\1\x67"
+"""Start code and head of a sequence's parameters, as x264 writes them."""
+
 FULL_SOCKET_TIMEOUT: Final = 1.0
 """Seconds that a full socket is waited for before the next frame is tried all the same."""
 
@@ -285,7 +288,8 @@ class RtpSender:
     def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
         """Send a frame's packets; return whether the socket took them all."""
         data = bytes(encoded.data)
-        self._sets = parameter_sets(data) or self._sets
+        if BEGINS_SPS in data:
+            self._sets = parameter_sets(data) or self._sets
         self._ticks = max(self._ticks + 1, int(encoded.captured * CLOCK_RATE))
         sequence = self._packetizer.sequence
         to = link.to[1:]
