@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import os
 import threading
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+import smartcam
 from smartcam.backoff import Backoff
 from smartcam.exceptions import ConfigurationError, FrameSourceError
 from smartcam.fleet._file.fleet_file import FramesEntry, load_fleet
 from smartcam.frames import FrameSource
-from smartcam.recording import load_recording
+from smartcam.recording import FleetReplay, Recorder, load_recording
 from smartcam.recording._folders import files as folder_files
 from smartcam.recording._folders import pictures as folder_pictures
 from smartcam.recording._folders import writer as folder_writer
 from smartcam.recording._judged import PictureMatcher
 from smartcam.recording._mcap.form import RecordedPicture
 from smartcam.recording._recorder import MAX_WAITING_BYTES
+from smartcam.recording._replays.pictures import ReplayedPictures
+from smartcam.recording._replays.schedule import Take, TakeList
 from tests.fleet.fleetkit import NumberedCamera
 from tests.frames.drivers import ScriptedDriver, frame
 from tests.recording.folderkit import NAME, files, recording, until
@@ -213,3 +218,61 @@ def test_picture_that_may_be_another_one_is_none() -> None:
     assert _matched(*pictures[:2], _picture(12, lost=1), *pictures[4:]) == [None]
     assert _matched(*pictures[:2], _picture(12, left_out=1), *pictures[4:]) == [None]
     assert _matched(*pictures[:3], _picture(13, lost=1)) == [11]
+
+
+async def test_replayed_fleet_shows_the_picture_of_each_result(
+    tmp_path: Path, device: Device
+) -> None:
+    async with NumberedCamera(time=0.02) as box:
+        options: dict[str, Any] = {"frames": "synthetic://", "pictures": "judged"}
+        async with recording(tmp_path, box.url, **options) as (_, agent):
+            await until(lambda: device.given)
+            for _ in range(6):
+                await agent.hosts[NAME].camera.trigger()
+            last = device.given[-1]
+            await until(lambda: device.given[-1].utc > last.utc)
+    found = load_recording(tmp_path / "rec")
+    judged = [*found.judged(NAME)]
+    assert any(one.picture is not None for one in judged)
+    shown = 0
+    async with FleetReplay(found) as played, smartcam.connect(played.server.urls[NAME]) as camera:
+        for made, picture, _ in judged:
+            before = time.monotonic()
+            result = await camera.trigger()
+            assert result.raw == made.raw
+            if picture is not None:
+                shown += 1
+                frame = await camera.newest_frame(max_age=math.inf)
+                assert (frame.sequence, bytes(frame.data)) == (picture.sequence, picture.data)
+                assert before <= frame.began <= frame.captured <= time.monotonic()
+    assert shown == found.counts.pictures
+
+
+def _lists(*takes: tuple[bool, bytes]) -> dict[int, TakeList]:
+    made = TakeList(5)
+    for triggered, data in takes:
+        (made.triggered if triggered else made.unasked).append(Take([data], 0.1))
+    return {5: made}
+
+
+def test_results_that_are_alike_have_pictures_only_in_one_order(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        for number, raw in enumerate((b"a", b"b", b"a", b"c"), 1):
+            made = result(number, number)._replace(raw=raw)
+            recorder.on_result(made)
+            recorder.add_picture(shot(number), result=made)
+    found = load_recording(path)
+
+    def shown(applications: dict[int, TakeList], *given: bytes) -> list[int | None]:
+        pictures = ReplayedPictures(found, "left", applications, 1.0)
+        numbers = []
+        for data in given:
+            pictures.given(5, data)
+            numbers.append(pictures.shown and pictures.shown.sequence)
+        return numbers
+
+    one = [(True, b"a"), (True, b"b"), (True, b"a")]
+    assert shown(_lists(*one), b"a", b"b", b"a", b"a", b"c") == [1, 2, 3, 1, None]
+    assert shown(_lists((True, b"a"), (False, b"a"), (False, b"b")), b"a", b"b") == [None, 2]
+    assert shown(_lists(*one, (True, b"a")), b"a", b"b") == [None, 2]  # one of them has no result
