@@ -80,7 +80,7 @@ class _PlyElement:
         return row
 
     def end(self, data: bytes, start: int, order: str) -> int:
-        """Return where its rows end that begin at a place."""
+        """Return the place at which the rows end that begin at ``start``."""
         if not self.lists:
             return start + (self.count * self.row(order).itemsize if self.count else 0)
         if self.count > MAX_LIST_ROWS:

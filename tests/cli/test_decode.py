@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from smartcam._cli.byte_text import bytes_of_text
 from tests.cli.commandline import (
     ACTIVE_21,
     BUSY,
@@ -229,19 +228,24 @@ DUMPS = {
 
 @pytest.mark.parametrize("name", DUMPS)
 def test_decode_bytes_as_tools_copy_them(tmp_path: Path, name: str) -> None:
-    assert bytes_of_text(DUMPS[name]) == WAITING
     path = tmp_path / "bytes.txt"
     path.write_text(DUMPS[name])
-    if name == "Wireshark":
-        assert run("decode", str(path), "--json").done().lines[0]["message"] == "StatusReport"
+    (line,) = run("decode", str(path), "--json").done().lines
+    assert line["message"] == "StatusReport"
 
 
 def test_decode_dump_with_a_gap_says_which_line(tmp_path: Path) -> None:
     path = tmp_path / "bytes.txt"
     path.write_text(DUMPS["Wireshark"].replace("0010", "0020"))
     run("decode", str(path)).failed(2, "line 2 has offset 0x20: expected 0x10")
-    assert bytes_of_text("31000400  1a000100") == bytes.fromhex("310004001a000100")
-    assert bytes_of_text("0000 0200") == bytes.fromhex("00000200")
-    for wrong in ("0000   zz", "50:5", "0x5", "\\x5", "50 5"):
-        with pytest.raises(ValueError, match=r"fromhex|hexadecimal"):
-            bytes_of_text(wrong)
+
+
+@pytest.mark.parametrize(("data", "value"), [("0000 0200", 0x20000), ("0000   02 00 00 00", 2)])
+def test_decode_four_digits_are_an_offset_where_more_blanks_follow(data: str, value: int) -> None:
+    (line,) = run("decode", data, "--interpret-as", "n: int32", "--json").done().lines
+    assert line["value"] == {"n": value}
+
+
+@pytest.mark.parametrize("data", ["0000   zz", "50:5", "0x5", "\\x5", "50 5"])
+def test_decode_bytes_that_are_not_whole_say_what_is_expected(data: str) -> None:
+    run("decode", data).failed(2, "or a dump with offsets")

@@ -11,10 +11,41 @@ from typing import Any
 
 from smartcam.fleet import FleetFile, FleetServer
 from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._file.fleet_file import FramesEntry
 from smartcam.fleet._inside import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
 from smartcam.recording._folder import FileName, files_of
+from smartcam.recording._folders import files as folder_files
+from smartcam.recording._folders import pictures as folder_pictures
+from smartcam.recording._folders import writer as folder_writer
+from smartcam.recording._judged import PictureMatcher
+from smartcam.recording._mcap.form import RecordedPicture
+from smartcam.recording._recorder import MAX_WAITING_BYTES
+from smartcam.recording._replays.pictures import ReplayedPictures
+from smartcam.recording._replays.schedule import Take, TakeList
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
+
+__all__ = [
+    "MAX_WAITING_BYTES",
+    "NAME",
+    "FramesEntry",
+    "PictureMatcher",
+    "RecordedPicture",
+    "ReplayedPictures",
+    "Take",
+    "TakeList",
+    "all_runs",
+    "files",
+    "folder_files",
+    "folder_pictures",
+    "folder_writer",
+    "name_of",
+    "recording",
+    "runs",
+    "section",
+    "server",
+    "until",
+]
 
 NAME = "line1/cam1"
 
