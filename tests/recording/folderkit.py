@@ -57,7 +57,7 @@ def section(**fields: Any) -> RecordSection:
     return RecordSection.model_construct(**{**said, **usual, **fields})
 
 
-def server(folder: Path, *urls: str, frames: str | None = None) -> FleetServer:
+def server(folder: Path, *urls: str, source: str | None = None) -> FleetServer:
     """Return the agent of cameras ``line1/cam1``, ... at these addresses."""
     entries = {
         f"line1/cam{place}": {
@@ -65,7 +65,7 @@ def server(folder: Path, *urls: str, frames: str | None = None) -> FleetServer:
             "application": 1,
             "interpret_as": LAYOUT,
             "reconnect": {"initial": 0.01, "maximum": 0.05},
-            **({} if frames is None else {"frames": frames}),
+            **({} if source is None else {"frames": source}),
         }
         for place, url in enumerate(urls, 1)
     }
@@ -78,11 +78,11 @@ async def recording(
     place: Path,
     *urls: str,
     clock: Callable[[], float] = time.monotonic,
-    frames: str | None = None,
+    source: str | None = None,
     **fields: Any,
 ) -> AsyncIterator[tuple[FleetRecorder, FleetServer]]:
     """Record cameras into ``place/rec``."""
-    agent = server(place, *urls, frames=frames)
+    agent = server(place, *urls, source=source)
     recorder = FleetRecorder(agent, section(**fields), _clock=clock)
     async with recorder, agent:
         await agent.wait_tried()

@@ -88,7 +88,7 @@ async def test_each_result_has_the_first_picture_of_its_trigger(
     tmp_path: Path, device: Device
 ) -> None:
     async with NumberedCamera(time=0.02) as box:
-        options: dict[str, Any] = {"frames": "synthetic://", "pictures": "judged"}
+        options: dict[str, Any] = {"source": "synthetic://", "pictures": "judged"}
         async with recording(tmp_path, box.url, **options) as (recorder, agent):
             camera = agent.hosts[NAME].camera
             await until(lambda: device.given)
@@ -116,7 +116,7 @@ async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bou
 ) -> None:
     monkeypatch.setattr(folder_files, "STEP", 1)
     async with NumberedCamera() as box:
-        options = {"frames": "synthetic://", "pictures": "all", "size": 20_000.0, "keep": 60_000.0}
+        options = {"source": "synthetic://", "pictures": "all", "size": 20_000.0, "keep": 60_000.0}
         async with recording(tmp_path, box.url, **options) as (recorder, agent):
             await until(lambda: files(tmp_path) and device.given)
             first = files(tmp_path)[0]
@@ -139,7 +139,7 @@ async def test_source_that_is_gone_is_told_once_and_used_again(
 ) -> None:
     device.fails["open"] = FrameSourceError("the cable is out")
     async with NumberedCamera() as box:
-        options: dict[str, Any] = {"frames": "synthetic://", "pictures": "all"}
+        options: dict[str, Any] = {"source": "synthetic://", "pictures": "all"}
         async with recording(tmp_path, box.url, **options) as (recorder, _):
             await until(lambda: device.calls.count("open") >= 3)
             device.fails.clear()
@@ -168,7 +168,7 @@ async def test_pictures_leave_room_for_results(
     size = folder_pictures.MAX_BYTES_WITH_PICTURES - (1 << 20)
     large = {"data": bytes(size), "width": 4096, "height": size // 4096, "stride": 4096}
     async with NumberedCamera() as box:
-        options: dict[str, Any] = {"frames": "synthetic://", "pictures": "all"}
+        options: dict[str, Any] = {"source": "synthetic://", "pictures": "all"}
         async with recording(tmp_path, box.url, **options) as (recorder, agent):
             await until(lambda: device.given)
             device.left = 0
@@ -233,7 +233,7 @@ async def test_replayed_fleet_shows_the_picture_of_each_result(
     tmp_path: Path, device: Device
 ) -> None:
     async with NumberedCamera(time=0.02) as box:
-        options: dict[str, Any] = {"frames": "synthetic://", "pictures": "judged"}
+        options: dict[str, Any] = {"source": "synthetic://", "pictures": "judged"}
         async with recording(tmp_path, box.url, **options) as (_, agent):
             await until(lambda: device.given)
             for _ in range(6):
