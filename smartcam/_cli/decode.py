@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from smartcam._cli.options import DIALECTS, OUTPUT, Options, from_hex, option, runs
+from smartcam._cli.byte_text import bytes_of_text
+from smartcam._cli.options import DIALECTS, OUTPUT, Options, option, runs
 from smartcam._cli.texts import table_text
 from smartcam.exceptions import ConfigurationError, FrameError, hex_excerpt
 
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    help="Decode DATA: hex, the name of a file (binary or hex text), or - for standard input. "
+    help="Decode DATA: hex, the name of a file (binary, hex or a dump of it), or - for standard "
+    "input. "
     "Frames are shown field by field (those without a magic number need --dialect); anything else "
     "is a result container's data and needs --interpret-as."
 )
@@ -73,16 +75,30 @@ def _load(data: str) -> bytes:
         try:
             path = Path(data)
             if not path.is_file():
-                return from_hex(data, "decode: neither a file nor hex")
+                return _from_text(data)
             raw = path.read_bytes()
         except (OSError, ValueError) as exc:
             if isinstance(exc, ConfigurationError):
                 raise
             raise ConfigurationError(f"decode: {data[:64]!r}: {exc}") from exc
     try:
-        return bytes.fromhex(raw.decode("ascii"))
+        return bytes_of_text(raw.decode("ascii"))
+    except ConfigurationError:
+        raise
     except ValueError:
         return raw  # a binary file
+
+
+def _from_text(data: str) -> bytes:
+    try:
+        return bytes_of_text(data)
+    except ConfigurationError:
+        raise
+    except ValueError as exc:
+        raise ConfigurationError(
+            f"decode: {data[:64]!r} is neither a file nor hex: expected two of 0-9 and a-f for "
+            "each byte, such as 50 53, 50:53, 0x50, 0x53 or \\x50\\x53, or a dump with offsets"
+        ) from exc
 
 
 def _dialect_of(payload: bytes) -> FramedDialect | None:

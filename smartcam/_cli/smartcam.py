@@ -136,7 +136,8 @@ TOPICS: Mapping[str, Mapping[str, Listed]] = {
         "interpreters": Listed("listings", "List the interpreters that --interpret-as knows."),
         "decode": Listed(
             "decode",
-            "Decode DATA: hex, the name of a file (binary or hex text), or - for standard input.",
+            "Decode DATA: hex, the name of a file (binary, hex or a dump of it), or - for standard "
+            "input.",
         ),
     },
     "A robot": {

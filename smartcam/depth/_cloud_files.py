@@ -39,6 +39,13 @@ MAX_HEAD: Final = 1 << 12
 UNIT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
 """The comment with which :func:`save_cloud` says the unit."""
 
+COLOURS: Final = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+)
+"""Names of the colours' columns, as programs write them."""
+
 COARSE: Final = 1e-3
 """Metres by which float32 may round a coordinate that was written as a double."""
 
@@ -65,7 +72,9 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
 
     PLY is read as text and as bytes of either order, PCD as text, as bytes and compressed. Points
     with a coordinate that is not finite are no points, as in organised files, and are left out.
-    Colours are ``red``, ``green``, ``blue`` or PCL's ``rgb``; ``sigma`` is in the same unit.
+    Colours are ``red``, ``green``, ``blue``, or ``diffuse_red`` and so on, or ``r``, ``g``, ``b``,
+    or PCL's ``rgb``: bytes, 16 bits, other numbers of 0 to 255, or of 0 to 1. ``sigma`` is in the
+    same unit.
     Properties of other names are skipped, and so is a PCD's viewpoint. It takes its time: beside an
     event loop it belongs into a thread.
 
@@ -171,21 +180,26 @@ def _loses(exact: NDArray[Any], kept: NDArray[Any]) -> bool:
 def _colours(
     columns: Mapping[str, NDArray[Any]], there: NDArray[np.bool_]
 ) -> NDArray[np.uint8] | None:
-    if not all(name in columns for name in ("red", "green", "blue")):
+    names = next((some for some in COLOURS if all(name in columns for name in some)), None)
+    if names is None:
         return None
-    found: NDArray[Any] = np.stack(
-        [columns[name][there] for name in ("red", "green", "blue")], axis=1
-    )
-    if found.dtype.kind == "f":  # 0 to 1
-        if found.size and not (found.min() >= 0 and found.max() <= 1):
-            raise BadTableError(
-                "colours of 0 to 1, or of 8 bits", f"{found.min()} to {found.max()}"
-            )
-        levels: NDArray[np.uint8] = np.rint(found * 255).astype(np.uint8)
-        return levels
-    if found.dtype != np.uint8:
-        raise BadTableError("colours of 0 to 1, or of 8 bits", f"{found.dtype}")
-    return np.asarray(found, np.uint8)
+    found: NDArray[Any] = np.stack([columns[name][there] for name in names], axis=1)
+    if found.dtype == np.uint8 or not found.size:
+        return found.astype(np.uint8)
+    least, most = float(found.min()), float(found.max())
+    if found.dtype == np.uint16:
+        scale = 1 / 257  # 65535 is 255
+    elif found.dtype.kind == "f" and least >= 0 and most <= 1:
+        scale = 255.0
+    elif found.dtype.itemsize > 1 and least >= 0 and most <= 255:
+        scale = 1.0
+    else:
+        raise BadTableError(
+            "colours of 0 to 1, of 0 to 255 or of 16 bits",
+            f"{found.dtype} of {least:g} to {most:g}",
+        )
+    levels: NDArray[np.uint8] = np.rint(found * scale).astype(np.uint8)
+    return levels
 
 
 def _sigma(

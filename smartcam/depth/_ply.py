@@ -48,6 +48,9 @@ TYPES: Final = {
 }
 """The document's names, and those that others write."""
 
+MAX_LIST_ROWS: Final = 1 << 20
+"""Rows of lists before the vertices, such as cameras; faces stand behind."""
+
 ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -58,7 +61,13 @@ class _PlyElement:
     name: str
     count: int
     properties: dict[str, str] = field(default_factory=dict)  # numpy's types by name
-    lists: bool = False  # whether its rows are of any length
+    # numpy's types in the order of a row: of a number, or of a list's size and its numbers
+    parts: list[tuple[str, ...]] = field(default_factory=list)
+
+    @property
+    def lists(self) -> bool:
+        """True if its rows are of any length."""
+        return any(len(part) > 1 for part in self.parts)
 
     def row(self, order: str) -> np.dtype[Any]:
         """Return the rows' type."""
@@ -70,6 +79,26 @@ class _PlyElement:
         check_row(row)
         return row
 
+    def end(self, data: bytes, start: int, order: str) -> int:
+        """Return the place at which the rows end that begin at ``start``."""
+        if not self.lists:
+            return start + (self.count * self.row(order).itemsize if self.count else 0)
+        if self.count > MAX_LIST_ROWS:
+            raise BadTableError(
+                f"up to {MAX_LIST_ROWS} rows of lists before the vertices", f"{self.count}"
+            )
+        kinds = [[np.dtype(order + kind) for kind in part] for part in self.parts]
+        for _ in range(self.count):
+            for size, *items in kinds:
+                end = start + size.itemsize
+                if items:
+                    many = int(np.frombuffer(data[start:end].ljust(8, b"\0"), size, 1)[0])
+                    end += max(0, many) * items[0].itemsize
+                start = end
+            if start > len(data):
+                raise BadTableError(f"{self.count} rows for {self.name}", "fewer")
+        return start
+
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:
     """Return the columns of a file's vertices; else BadTableError."""
@@ -78,7 +107,7 @@ def read(data: bytes) -> dict[str, NDArray[Any]]:
     row = vertex.row(order)
     if order:
         for one in before:
-            start += one.count * one.row(order).itemsize if one.count else 0
+            start = one.end(data, start, order)
         rows = from_bytes(data, start, vertex.count, row)
         return {name: rows[name].astype(kind) for name, kind in vertex.properties.items()}
     types = [np.dtype(kind) for kind in vertex.properties.values()]
@@ -105,7 +134,7 @@ def _header(data: bytes) -> tuple[str, list[_PlyElement], int]:
             case ["element", name, count] if len(elements) < MAX_FIELDS:
                 elements.append(_PlyElement(name, count_of(count, "rows")))
             case ["property", "list", size, kind, _] if elements and {size, kind} <= TYPES.keys():
-                elements[-1].lists = True
+                _add_part(elements[-1], TYPES[size], TYPES[kind])
             case ["property", kind, name] if elements and kind in TYPES:
                 _add(elements[-1], name, TYPES[kind])
             case _:
@@ -119,6 +148,16 @@ def _add(element: _PlyElement, name: str, kind: str) -> None:
     if name in element.properties or len(element.properties) >= MAX_FIELDS:
         raise BadTableError(f"up to {MAX_FIELDS} properties, each once", f"{shown(name)} again")
     element.properties[name] = kind
+    _add_part(element, kind)
+
+
+def _add_part(element: _PlyElement, *part: str) -> None:
+    if len(element.parts) >= MAX_FIELDS or (len(part) > 1 and part[0].startswith("f")):
+        raise BadTableError(
+            f"up to {MAX_FIELDS} properties, lists with a whole number as their size",
+            f"{len(element.parts) + 1}, the last one of {' and '.join(part)}",
+        )
+    element.parts.append(part)
 
 
 def _vertex(elements: list[_PlyElement]) -> tuple[list[_PlyElement], _PlyElement]:

@@ -49,6 +49,9 @@ class DeviceClock:
     Frames that all come late have waited somewhere, however long it is: the offset rises no faster
     than a clock drifts. A clock that was set back by less than the time between two frames looks
     the same; its frames count as older than they are until the offset has followed.
+
+    Attributes:
+        jumps: number of times that the clock was set anew.
     """
 
     def __init__(self) -> None:
@@ -58,13 +61,13 @@ class DeviceClock:
         self._piece_began = 0.0
         self._held: float | None = None  # the offset at the last frame
         self._before_queue: float | None = None  # the offset before frames waited somewhere
-        self._jumps = 0
+        self.jumps = 0
 
     def statistics(self) -> ClockStatistics:
         """Return the drift and the jumps of the device's clock known so far."""
         # device = (arrival - offset) / (1 + slope): a slope above 0 is a clock that is too slow
         drift = None if self._drift is None else -self._drift / (1 + self._drift)
-        return ClockStatistics(drift, self._jumps)
+        return ClockStatistics(drift, self.jumps)
 
     def captured(self, device: float, arrival: float) -> float:
         """Return a device's time on ours; never later than ``arrival``.
@@ -74,7 +77,7 @@ class DeviceClock:
             arrival: when that came, seconds of ``time.monotonic()``.
         """
         if self._jumped(device, arrival):
-            self._jumps += 1
+            self.jumps += 1
             self._lowest.clear()
             self._drift = self._held = self._before_queue = None
         self._remember(device, arrival - device)
@@ -124,7 +127,9 @@ class DeviceClock:
         return slope if abs(slope) <= MAX_DRIFT else None
 
     def _offset(self, device: float) -> float:
-        slope = self._drift or 0.0
+        slope = self._drift
+        if not slope:
+            return min(offset for _, offset in self._lowest)
         return min(offset + slope * (device - at) for at, offset in self._lowest)
 
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from smartcam.frames._codecs.jpeg import jpeg_header
     from smartcam.frames._codecs.pictures import converted, decoded, to_jpeg, with_pixels
     from smartcam.frames._features import FEATURE_TIMEOUT
+    from smartcam.frames._frame import changed
     from smartcam.frames._gige import discovery, places
     from smartcam.frames._gige.assembler import PacketCounts
     from smartcam.frames._gige.control import ControlChannel
@@ -40,6 +41,7 @@ __all__ = [
     "Planes",
     "Register",
     "YuvPairs",
+    "changed",
     "checked_mac",
     "colour_properties",
     "converted",
@@ -67,6 +69,7 @@ if not TYPE_CHECKING:
             "_codecs.jpeg": "jpeg_header",
             "_codecs.pictures": "converted decoded to_jpeg with_pixels",
             "_features": "FEATURE_TIMEOUT",
+            "_frame": "changed",
             "_gige.force_address": "checked_mac force_address",
             "_gige.": "discovery places",
             "_gige.assembler": "PacketCounts",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import dataclasses
 import logging
 import time
 import warnings
@@ -33,6 +32,7 @@ from smartcam.frames._clocks import DeviceClock
 from smartcam.frames._driver import FrameDriver, FrameSink
 from smartcam.frames._events import FrameEvents
 from smartcam.frames._features import FrameFeatures
+from smartcam.frames._frame import changed
 from smartcam.frames._reader import FRAME_TIMEOUT, FrameReader
 from smartcam.frames._trigger import TriggerQueue
 
@@ -390,7 +390,7 @@ class FrameSource(FrameSink):
         """Return a frame with the lens that was given for the source."""
         if self._camera_info is None or frame.camera_info is not None:
             return frame
-        return dataclasses.replace(frame, camera_info=self._camera_info)
+        return changed(frame, camera_info=self._camera_info)
 
     async def wait_until_streaming(self, reader: FrameReader, *, anew: bool) -> None:
         """Wait until the device streams; with ``anew`` the stream begins once more.
@@ -431,9 +431,9 @@ class FrameSource(FrameSink):
         if frame.device_time is not None and not self._driver.times_frames:
             if self._clock is None:
                 self._clock = DeviceClock()
-            jumps = self._clock.statistics().jumps
+            jumps = self._clock.jumps
             captured = self._clock.captured(frame.device_time, captured)
-            if self._clock.statistics().jumps > jumps:
+            if self._clock.jumps > jumps:
                 _log.warning(
                     "%s: the camera's clock was set anew, at frame %d", self.name, frame.sequence
                 )
@@ -443,7 +443,7 @@ class FrameSource(FrameSink):
         if captured == frame.captured:
             return frame
         shift = captured - frame.captured
-        return dataclasses.replace(frame, captured=captured, utc=frame.utc + shift)
+        return changed(frame, captured=captured, utc=frame.utc + shift)
 
     def lost(self, count: int) -> None:
         """Take from the driver that frames were lost."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -42,11 +43,11 @@ class JudgedResult(NamedTuple):
 
 def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
     """Yield each result with its picture, as soon as no later picture can be the result's."""
-    matchers: dict[str, _Matcher] = {}
+    matchers: dict[str, PictureMatcher] = {}
     for item in items:
         if isinstance(item, (RecordedPicture, Result)):
             if item.camera not in matchers:
-                matchers[item.camera] = _Matcher()
+                matchers[item.camera] = PictureMatcher()
             matcher = matchers[item.camera]
             if isinstance(item, RecordedPicture):
                 matcher.add_picture(item)
@@ -57,13 +58,23 @@ def judged(items: Iterable[Item]) -> Iterator[JudgedResult]:
         yield from matcher.settled(over=True)
 
 
-class _Matcher:
-    """Pictures and results of one camera."""
+class PictureMatcher:
+    """Pictures and results of one camera, of which results with their pictures come.
 
-    def __init__(self) -> None:
+    Args:
+        max_bytes: bytes of the pictures that are kept to be found; the last one is kept in any
+            case.
+
+    Attributes:
+        results: results whose picture is not known yet.
+    """
+
+    def __init__(self, max_bytes: int = MAX_PICTURE_BYTES) -> None:
         self.results: deque[Result[Any]] = deque()
+        self._max_bytes = max_bytes
         self._pictures: deque[RecordedPicture] = deque()
         self._bytes = 0
+        self._dropped = -math.inf  # start of the exposure of the last picture not kept any more
         self._latest = 0.0  # capture of the last picture without a result's number, seconds
 
     def add_picture(self, picture: RecordedPicture) -> None:
@@ -72,8 +83,11 @@ class _Matcher:
         if picture.result_number is None:
             self._latest = max(self._latest, picture.frame.utc)
         too_many = len(self._pictures) > MAX_PICTURES
-        while too_many or (self._bytes > MAX_PICTURE_BYTES and len(self._pictures) > 1):
-            self._bytes -= _size(self._pictures.popleft())
+        while too_many or (self._bytes > self._max_bytes and len(self._pictures) > 1):
+            dropped = self._pictures.popleft()
+            self._bytes -= _size(dropped)
+            if dropped.result_number is None:
+                self._dropped = max(self._dropped, dropped.frame.utc - dropped.frame.duration)
             too_many = False
 
     def settled(self, *, over: bool = False) -> Iterator[JudgedResult]:
@@ -82,12 +96,25 @@ class _Matcher:
             result = self.results[0]
             found = self._told(result)
             told = found is not None
-            late = self._latest > result.received_at.timestamp()
-            if not (told or late or over or len(self.results) > MAX_RESULTS):
+            if not (told or over or self._is_late(result)):
                 return
             self.results.popleft()
             picture = self._by_time(result) if found is None else found.frame
             yield JudgedResult(result, picture, told)
+
+    def settled_by_time(self) -> Iterator[JudgedResult]:
+        """Yield the results as soon as the times say their picture, where nobody tells it."""
+        while self.results:
+            result = self.results[0]
+            picture = self._by_time(result)
+            if picture is None and not self._is_late(result):
+                return
+            self.results.popleft()
+            yield JudgedResult(result, picture, False)
+
+    def _is_late(self, result: Result[Any]) -> bool:
+        """Return True if a result waits no longer for a picture."""
+        return self._latest > result.received_at.timestamp() or len(self.results) > MAX_RESULTS
 
     def _told(self, result: Result[Any]) -> RecordedPicture | None:
         key = result.number, result.received_at
@@ -100,9 +127,14 @@ class _Matcher:
         if result.triggered_at is None:  # how long the camera's tools took is not known
             return None
         triggered, came = result.triggered_at.timestamp(), result.received_at.timestamp()
-        untold = (one.frame for one in self._pictures if one.result_number is None)
-        between = (one for one in untold if triggered <= one.utc - one.duration <= one.utc <= came)
-        return next(between, None)
+        if self._dropped >= triggered:
+            return None
+        for one in self._pictures:
+            began = one.frame.utc - one.frame.duration
+            if one.result_number is None and triggered <= began <= one.frame.utc <= came:
+                missing = one.left_out or one.frame.lost  # the picture may be one of these
+                return None if missing else one.frame
+        return None
 
 
 def _size(picture: RecordedPicture) -> int:

@@ -557,6 +557,12 @@ class _Scan:
     def _check_ours(self, schemas: dict[int, str]) -> None:
         if not self.file_facts:
             names = ", ".join(sorted(set(schemas.values()))[:8]) or "nothing"
+            if any(name.startswith("smartcam.") for name in schemas.values()):
+                raise ConfigurationError(
+                    f"recording {self.path}: it holds {names}, but its metadata records are "
+                    "missing, which say whose it is: another program left them out. mcap filter "
+                    "keeps them with --include-metadata; take the file that it was made of"
+                )
             raise ConfigurationError(
                 f"recording {self.path}: this MCAP file is no recording of smartcam; it holds "
                 f"{names}"

@@ -202,3 +202,50 @@ def test_decode_frames_of_a_dialect_with_a_quirk() -> None:
 
 def test_decode_quirks_without_a_dialect_is_wrong_usage() -> None:
     run("decode", "00", "--quirks", "code").failed(2, "name it with --dialect")
+
+
+_FIRST, _SECOND = WAITING[:16], WAITING[16:]
+DUMPS = {
+    "blanks": WAITING.hex(" "),
+    "colons": WAITING.hex(":"),
+    "hyphens": WAITING.hex("-"),
+    "numbers of C": "{" + ", ".join(f"0x{one:02x}" for one in WAITING) + "};",
+    "escapes": '"' + "".join(f"\\x{one:02X}" for one in WAITING) + '"',
+    "Wireshark": f"0000   {_FIRST.hex(' ')}\n0010   {_SECOND.hex(' ')}\n",
+    "Wireshark with text": f"0000   {_FIRST.hex(' ')}   PSVB............\n"
+    f"0010   {_SECOND.hex(' ')}                                       ab cd\n",
+    "text that is not aligned": f"0000   {_FIRST.hex(' ')}   PSVB............\n"
+    f"0010   {_SECOND.hex(' ')}   ....\n",
+    "xxd": f"00000000: {_FIRST.hex(' ', 2)}  PSVB............\n"
+    f"00000010: {_SECOND.hex(' ', 2)}                                ab cd\n",
+    "hexdump -C": f"00000000  {_FIRST[:8].hex(' ')}  {_FIRST[8:].hex(' ')}  |PSVB....|ab|\n"
+    f"00000010  {_SECOND.hex(' ')}                                       |abcd|\n00000014\n",
+    "tcpdump -X": f"\t0x0000:  {_FIRST.hex(' ', 2)}  PSVB............\n"
+    f"\t0x0010:  {_SECOND.hex(' ', 2)}                                ab cd\n",
+    "one line": f"0000   {WAITING.hex(' ')}   PSVB",
+}
+
+
+@pytest.mark.parametrize("name", DUMPS)
+def test_decode_bytes_as_tools_copy_them(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "bytes.txt"
+    path.write_text(DUMPS[name])
+    (line,) = run("decode", str(path), "--json").done().lines
+    assert line["message"] == "StatusReport"
+
+
+def test_decode_dump_with_a_gap_says_which_line(tmp_path: Path) -> None:
+    path = tmp_path / "bytes.txt"
+    path.write_text(DUMPS["Wireshark"].replace("0010", "0020"))
+    run("decode", str(path)).failed(2, "line 2 has offset 0x20: expected 0x10")
+
+
+@pytest.mark.parametrize(("data", "value"), [("0000 0200", 0x20000), ("0000   02 00 00 00", 2)])
+def test_decode_four_digits_are_an_offset_where_more_blanks_follow(data: str, value: int) -> None:
+    (line,) = run("decode", data, "--interpret-as", "n: int32", "--json").done().lines
+    assert line["value"] == {"n": value}
+
+
+@pytest.mark.parametrize("data", ["0000   zz", "50:5", "0x5", "\\x5", "50 5"])
+def test_decode_bytes_that_are_not_whole_say_what_is_expected(data: str) -> None:
+    run("decode", data).failed(2, "or a dump with offsets")

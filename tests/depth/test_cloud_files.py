@@ -142,6 +142,55 @@ def test_ply_as_others_write_it(tmp_path: Path) -> None:
     assert cloud.colours.tolist() == [[0, 128, 255]]
 
 
+@pytest.mark.parametrize(
+    ("kinds", "form", "values"),
+    [
+        ("uchar", "B", (255, 128, 0)),
+        ("ushort", "H", (65535, 32896, 0)),
+        ("float", "f", (255.0, 128.0, 0.0)),
+        ("double", "d", (1.0, 128 / 255, 0.0)),
+        ("int", "i", (255, 128, 0)),
+    ],
+)
+@pytest.mark.parametrize(
+    "names", ["red green blue", "diffuse_red diffuse_green diffuse_blue", "r g b"]
+)
+def test_colours_as_others_name_and_size_them(
+    tmp_path: Path, names: str, kinds: str, form: str, values: tuple[float, ...]
+) -> None:
+    colours = "".join(f"property {kinds} {name}\n" for name in names.split())
+    lists = "element camera 2\nproperty short id\nproperty list ushort int of\n"
+    place = "property float x\nproperty float y\nproperty float z\n"
+    begin = "ply\nformat binary_little_endian 1.0\n"
+    head = f"{begin}{lists}element vertex 1\n{place}{colours}end_header\n"
+    cameras = struct.pack("<hH2ihH", 1, 2, 7, 8, 2, 0)
+    data = head.encode() + cameras + struct.pack(f"<3f3{form}", 1, 2, 3, *values)
+    cloud = loaded(tmp_path, "a.ply", data)
+    assert cloud.points.tolist() == [[1, 2, 3]]
+    assert cloud.colours is not None
+    assert cloud.colours.tolist() == [[255, 128, 0]]
+    for wrong, said in (
+        (
+            data[: len(head) + 2] + b"\xff\xff" + data[len(head) + 4 :],
+            "2 rows for camera, got fewer",
+        ),
+        (data.replace(b"camera 2", b"camera 2000000"), "1048576 rows of lists"),
+        (data.replace(b"list ushort", b"list float"), "a whole number as their size"),
+    ):
+        with pytest.raises(FrameFormatError, match=said):
+            loaded(tmp_path, "a.ply", wrong)
+
+
+def test_colours_of_a_pcd_may_be_fields_of_their_own(tmp_path: Path) -> None:
+    head = (
+        b"VERSION 0.7\nFIELDS x y z r g b\nSIZE 4 4 4 1 1 1\nTYPE F F F U U U\n"
+        b"COUNT 1 1 1 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA binary\n"
+    )
+    cloud = loaded(tmp_path, "a.pcd", head + struct.pack("<3f3B", 1, 2, 3, 255, 128, 0))
+    assert cloud.colours is not None
+    assert cloud.colours.tolist() == [[255, 128, 0]]
+
+
 def test_organised_pcd_with_padding_and_normals(tmp_path: Path) -> None:
     head = (
         b"# .PCD v.7\nVERSION .7\nFIELDS x y z _ normal rgba\nSIZE 8 8 8 1 4 4\nTYPE F F F U F U\n"
@@ -194,7 +243,7 @@ def test_compressed_pcd(tmp_path: Path) -> None:
         ("a.ply", b"float z", b"float x", "each once"),
         ("a.ply", b"float z", b"quad z", "a line of a PLY header, got 'property quad z'"),
         ("a.ply", b"float z", b"list uchar int z", "rows of numbers for vertex"),
-        ("a.ply", b"uchar red", b"char red", "colours of 0 to 1, or of 8 bits"),
+        ("a.ply", b"uchar red", b"char red", "colours of 0 to 1, of 0 to 255 or of 16"),
         ("a.ply", b"little_endian 1.0", b"little_endian 2.0", "PLY header"),
         ("a.ply", b"end_header\n", b"", "PLY header|header"),
         ("a.ply", b"\x6f\x12\x83\x3a", b"\x6f\x12\x83\xba", "a cloud, got sigma"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,7 @@ from smartcam.exceptions import (
 )
 from smartcam.frames import Codecs, find_format
 from smartcam.frames._codecs import pictures
+from smartcam.frames._codecs.threads import MAX_LOOP_TIME, StreamRuns
 from smartcam.frames._inside import read_stamp
 from tests.frames.pictures import HEIGHT, WIDTH, fill, frame_of, known_of, stamped
 
@@ -315,6 +317,31 @@ async def test_codecs_that_are_not_open_say_so() -> None:
     for threads in (0, 65):
         with pytest.raises(ConfigurationError, match=f"threads: .* 1 to 64, got {threads}"):
             Codecs(threads)
+
+
+def _spend(seconds: float) -> threading.Thread:
+    """Take CPU time; return the thread that it was taken in."""
+    end = time.thread_time() + seconds
+    while time.thread_time() < end:
+        pass
+    return threading.current_thread()
+
+
+async def test_pictures_of_a_stream_leave_the_loop_when_they_are_long(codecs: Codecs) -> None:
+    runs, loop = StreamRuns(codecs), threading.current_thread()
+    long = 3 * MAX_LOOP_TIME
+    assert await runs(lambda: _spend(0)) is not loop  # nobody knew how long it would take
+    assert await runs(lambda: _spend(0)) is loop
+    await runs(lambda: _spend(long))
+    short = [await runs(lambda: _spend(0)) for _ in range(40)]
+    back = short.index(loop)
+    assert back >= 1  # behind a long one others may be as long
+    assert set(short[back:]) == {loop}
+    with pytest.raises(ZeroDivisionError):
+        await runs(lambda: 1 / 0)
+    await codecs.close()
+    with pytest.raises(LocalProtocolError, match="they are closed"):
+        await runs(lambda: _spend(0))
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,41 @@ from typing import Any
 
 from smartcam.fleet import FleetFile, FleetServer
 from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet._file.fleet_file import FramesEntry
 from smartcam.fleet._inside import RecordSection
 from smartcam.recording import FleetRecorder, Recording, load_recording
 from smartcam.recording._folder import FileName, files_of
+from smartcam.recording._folders import files as folder_files
+from smartcam.recording._folders import pictures as folder_pictures
+from smartcam.recording._folders import writer as folder_writer
+from smartcam.recording._judged import PictureMatcher
+from smartcam.recording._mcap.form import RecordedPicture
+from smartcam.recording._recorder import MAX_WAITING_BYTES
+from smartcam.recording._replays.pictures import ReplayedPictures
+from smartcam.recording._replays.schedule import Take, TakeList
 from tests.fleet.fleetkit import LAYOUT, PATIENCE
+
+__all__ = [
+    "MAX_WAITING_BYTES",
+    "NAME",
+    "FramesEntry",
+    "PictureMatcher",
+    "RecordedPicture",
+    "ReplayedPictures",
+    "Take",
+    "TakeList",
+    "all_runs",
+    "files",
+    "folder_files",
+    "folder_pictures",
+    "folder_writer",
+    "name_of",
+    "recording",
+    "runs",
+    "section",
+    "server",
+    "until",
+]
 
 NAME = "line1/cam1"
 
@@ -22,10 +53,11 @@ NAME = "line1/cam1"
 def section(**fields: Any) -> RecordSection:
     """Return what a file says, with sizes as small as a test wants."""
     said = {"folder": "rec", "size": 1e8, "age": 3600.0, "keep": 1e10, "cameras": ("**",)}
-    return RecordSection.model_construct(**{**said, "frames": True, **fields})
+    usual = {"frames": True, "pictures": "none"}
+    return RecordSection.model_construct(**{**said, **usual, **fields})
 
 
-def server(folder: Path, *urls: str) -> FleetServer:
+def server(folder: Path, *urls: str, source: str | None = None) -> FleetServer:
     """Return the agent of cameras ``line1/cam1``, ... at these addresses."""
     entries = {
         f"line1/cam{place}": {
@@ -33,6 +65,7 @@ def server(folder: Path, *urls: str) -> FleetServer:
             "application": 1,
             "interpret_as": LAYOUT,
             "reconnect": {"initial": 0.01, "maximum": 0.05},
+            **({} if source is None else {"frames": source}),
         }
         for place, url in enumerate(urls, 1)
     }
@@ -42,10 +75,14 @@ def server(folder: Path, *urls: str) -> FleetServer:
 
 @contextlib.asynccontextmanager
 async def recording(
-    place: Path, *urls: str, clock: Callable[[], float] = time.monotonic, **fields: Any
+    place: Path,
+    *urls: str,
+    clock: Callable[[], float] = time.monotonic,
+    source: str | None = None,
+    **fields: Any,
 ) -> AsyncIterator[tuple[FleetRecorder, FleetServer]]:
     """Record cameras into ``place/rec``."""
-    agent = server(place, *urls)
+    agent = server(place, *urls, source=source)
     recorder = FleetRecorder(agent, section(**fields), _clock=clock)
     async with recorder, agent:
         await agent.wait_tried()

@@ -10,6 +10,7 @@ import numpy as np
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, Moment, find_format
+from smartcam.models import Result
 from tests.recording.recordingkit import at
 
 FIELDS = [field.name for field in dataclasses.fields(Frame) if field.name != "data"]
@@ -61,3 +62,9 @@ def all_formats() -> list[str]:
     except FrameFormatError as error:
         return list(error.available)
     raise AssertionError("there is a format of that name")
+
+
+def result(number: int, seconds: float, triggered: float | None = None) -> Result[Any]:
+    """Return a result that came at a moment, and was triggered at one or by nobody."""
+    when = None if triggered is None else at(triggered)
+    return Result("left", 5, None, number, when, at(seconds), None, b"\0", b"\0")

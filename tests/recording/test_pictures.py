@@ -45,7 +45,7 @@ from smartcam.recording import (
     replay,
 )
 from tests.frames.drivers import ShowingDriver
-from tests.recording.picturekit import BEGIN, VARIED, same, shot
+from tests.recording.picturekit import BEGIN, VARIED, result, same, shot
 from tests.recording.recordingkit import at, session, write
 
 has_full_disk = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
@@ -436,11 +436,6 @@ async def test_size_that_changes_is_played_as_it_changes(tmp_path: Path) -> None
 
 
 # ---------------------------------------------------------------------- beside results
-
-
-def result(number: int, seconds: float, triggered: float | None = None) -> Result[Any]:
-    when = None if triggered is None else at(triggered)
-    return Result("left", 5, None, number, when, at(seconds), None, b"\0", b"\0")
 
 
 def test_result_has_the_picture_that_the_recorder_was_told(tmp_path: Path) -> None:

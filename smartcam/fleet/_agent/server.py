@@ -91,7 +91,9 @@ class FleetServer(Server):
         bus: Bus | None = None,
         folder: Path | None = None,
         restore: bool | None = None,
+        _frames: Mapping[str, Callable[[], FrameSource]] | None = None,
     ) -> None:
+        self._given_frames = _frames or {}
         if not isinstance(file, (Path, FleetFile)):
             file = check_text(file, "fleet file", least=1)
         self._given = file
@@ -352,7 +354,8 @@ class FleetServer(Server):
         """
         async with contextlib.AsyncExitStack() as stack:
             entry = planned.entry
-            frames = None
+            given = self._given_frames.get(planned.name)
+            frames = None if given is None else FramesOf(given, "replayed")
             if entry.software is not None:
                 device, frames = await self._see(planned, folder, stack)
                 url = device.url

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
@@ -11,7 +11,7 @@ from smartcam._file_values import Age, Patterns, Size, chosen
 from smartcam.fleet._file.ros import Fields
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
 
 class RecordSection(Fields):
@@ -37,6 +37,11 @@ class RecordSection(Fields):
         description="record what went over the wire, too; without it a replay has results and "
         "statuses only",
     )
+    pictures: Literal["none", "judged", "all"] = Field(
+        "none",
+        description="record the pictures of cameras that have frames, too: of each result the one "
+        "that it was made of, or all; the device then streams all the time",
+    )
 
     def chooses(self, camera: str) -> bool:
         """Return True if a camera of this name is recorded."""
@@ -51,8 +56,23 @@ class RecordSection(Fields):
         return folder / Path(self.folder).expanduser()
 
 
-def mistakes_of(section: RecordSection, folder: Path) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the mistakes in the section, and their places."""
+def mistakes_of(
+    section: RecordSection, folder: Path, seeing: Iterable[str]
+) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield the mistakes in the section, and their places.
+
+    Args:
+        section: section of a fleet file.
+        folder: folder that the fleet file is in.
+        seeing: names of the cameras that have frames.
+    """
+    recorded = any(name.endswith("/**") or section.chooses(name) for name in seeing)
+    if section.pictures != "none" and not recorded:
+        yield (
+            ("record", "pictures"),
+            f"expected frames: or software: in the entry of a recorded camera for pictures: "
+            f"{section.pictures}, found none",
+        )
     if section.keep < 2 * section.size:
         yield (
             ("record", "keep"),

@@ -130,6 +130,11 @@ class SharedFrames:
             await source.close()
 
     @property
+    def closed(self) -> bool:
+        """True once the device is given back for good."""
+        return self._closed
+
+    @property
     def viewers(self) -> int:
         """Number of streams."""
         return len(self._viewers)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import replace
 from fractions import Fraction
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, TypeVar
@@ -13,6 +12,7 @@ from smartcam._arguments import check_integer, check_number
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.pictures import decoded
+from smartcam.frames._frame import changed
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._video.frames import from_video, to_video
 
@@ -60,6 +60,7 @@ class H264Encoder:
             bitrate = check_integer(bitrate, "bitrate", 10_000, 1_000_000_000, who)
         self._run = run
         self._rate = Fraction(fps).limit_denominator(1000)
+        self._time_base = 1 / self._rate
         self._options = {
             "preset": "ultrafast",
             "tune": "zerolatency",
@@ -109,16 +110,16 @@ class H264Encoder:
                 self._codec = self._begun(video)
                 self._kind = kind
             video.pts = self._count
-            video.time_base = 1 / self._rate
+            video.time_base = self._time_base
             self._count += 1
             packets = self._codec.encode(video)
-            data = b"".join(bytes(packet) for packet in packets)
-            return replace(frame, data=data, format=find_format("H264"), stride=0)
+            data = bytes(packets[0]) if len(packets) == 1 else b"".join(map(bytes, packets))
+            return changed(frame, data=data, format=find_format("H264"), stride=0)
 
     def _begun(self, video: Any) -> Any:
         codec = load("av").CodecContext.create("libx264", "w")
         codec.width, codec.height, codec.pix_fmt = video.width, video.height, video.format.name
-        codec.framerate, codec.time_base = self._rate, 1 / self._rate
+        codec.framerate, codec.time_base = self._rate, self._time_base
         codec.color_range, codec.colorspace = _colours(video)
         codec.thread_count = 1
         codec.options = self._options
@@ -257,7 +258,7 @@ class H264Decoder:
         pixels = from_video(picture.reformat(format=self._to) if self._to else picture)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
-        return replace(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
+        return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)
 
     def _damaged(self, frame: Frame, got: str) -> FrameFormatError:
         return FrameFormatError(

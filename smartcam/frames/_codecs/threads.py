@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from smartcam._arguments import check_integer, check_kind, check_text
 from smartcam.exceptions import LocalProtocolError
@@ -14,11 +15,18 @@ from smartcam.frames._codecs.h264 import H264Decoder, H264Encoder
 from smartcam.frames._frame import Frame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Coroutine
     from typing import Literal, Self
 
 
 T = TypeVar("T")
+
+MAX_LOOP_TIME: Final = 0.002
+"""Seconds of CPU time that one picture of a stream may take in the event loop. A thread costs two
+wake-ups for each picture, which take longer than a small picture does."""
+
+DECAY: Final = 0.8
+"""Factor by which the longest time of a stream's pictures counts less with each further picture."""
 
 
 def _checked(frame: Frame) -> Frame:
@@ -217,3 +225,53 @@ class Codecs:
         self._free.release()
         if not under_way.cancelled():
             under_way.exception()  # nobody may be there for it any longer
+
+
+class StreamRuns:
+    """Runs the work of one stream in the event loop while its pictures are small, else in a thread.
+
+    It begins in a thread, where the first picture tells how long the others may take, and goes back
+    to it as soon as one takes longer than :data:`MAX_LOOP_TIME`.
+
+    Args:
+        codecs: threads for the work, not closed while it is used.
+    """
+
+    def __init__(self, codecs: Codecs) -> None:
+        self._codecs = codecs
+        self._longest: float | None = None  # seconds of CPU time, the last pictures counting most
+
+    @property
+    def short(self) -> bool:
+        """True if what is run next is run at once, in the event loop."""
+        return self._longest is not None and self._longest <= MAX_LOOP_TIME
+
+    async def __call__(self, work: Callable[[], T]) -> T:
+        """Run the work, and return its result."""
+        if not self.short:
+            return await self._codecs._run(partial(self._timed, work))  # noqa: SLF001
+        self._codecs._open_pool()  # noqa: SLF001 - what is closed runs nothing
+        return self._timed(work)
+
+    def _timed(self, work: Callable[[], T]) -> T:
+        began = time.thread_time()
+        try:
+            return work()
+        finally:
+            took = time.thread_time() - began
+            self._longest = max(took, DECAY * (self._longest or 0.0))
+
+
+def at_once(work: Coroutine[Any, Any, T]) -> T:
+    """Return the result of a coroutine that never waits.
+
+    Raises:
+        RuntimeError: it waits.
+    """
+    try:
+        work.send(None)
+    except StopIteration as done:
+        result: T = done.value
+        return result
+    work.close()
+    raise RuntimeError("it cannot be done without waiting")

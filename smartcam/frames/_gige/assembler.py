@@ -26,7 +26,7 @@ from smartcam.frames._gige.gvsp import HEADER, PacketKind, decode_header
 
 if TYPE_CHECKING:
     from smartcam.frames._gige.block import WholePicture
-    from smartcam.frames._gige.gvsp import PacketHeader
+    from smartcam.frames._gige.gvsp import ImpliedPicture, PacketHeader
 
 MAX_OPEN_BLOCKS: Final = 4
 """Blocks that wait for packets or for an earlier block: at 100 frames/s 40 ms."""
@@ -113,16 +113,24 @@ class Assembler:
         resend: whether the camera is asked for what is missing.
         begins_low: whether a stream whose first block has a low id may have lost those before; else
             they belong to an earlier stream, of which the camera would send them again.
+        implied: picture of blocks that do not say its size; None: such blocks are an error.
     """
 
     def __init__(
-        self, payload_size: int, datagram: int, *, resend: bool = True, begins_low: bool = True
+        self,
+        payload_size: int,
+        datagram: int,
+        *,
+        resend: bool = True,
+        begins_low: bool = True,
+        implied: ImpliedPicture | None = None,
     ) -> None:
         self.counts = PacketCounts()
         self.fault: MessageError | None = None
         """Error for blocks that cannot be read at all, such as a payload type that is no
         picture."""
         self._most, self._datagram, self._resend = payload_size, datagram, resend
+        self._implied = implied
         self._blocks: dict[int, Block] = {}
         self._current: Block | None = None  # that of the last packet
         self._newest = self._closed = 0
@@ -324,6 +332,7 @@ class Assembler:
             datagram=self._datagram,
             most=self._most,
             now=now,
+            implied=self._implied,
         )
         self._blocks[number] = block
         return block

@@ -11,19 +11,17 @@ from smartcam.exceptions import MessageError
 from smartcam.frames._gige.gvsp import (
     EXTENDED_HEADER,
     HEADER,
+    PayloadType,
     bits_of,
     decode_leader,
     decode_trailer,
 )
 
 if TYPE_CHECKING:
-    from smartcam.frames._gige.gvsp import Leader
+    from smartcam.frames._gige.gvsp import ImpliedPicture, Leader, Trailer
 
 PAYLOAD: Final = 0x03000000
 """Kind of a payload packet, above its id: the second word of its header."""
-
-WITH_CHUNKS: Final = 0x4000
-"""Bit of a payload type: chunk data follows."""
 
 PACKET: Final = 0xFFFFFF
 """The id in that word."""
@@ -73,6 +71,7 @@ class Block:
         datagram: bytes of a full packet with its header.
         most: bytes of the largest payload.
         now: seconds.
+        implied: picture of a leader that does not say its size.
     """
 
     __slots__ = (
@@ -89,13 +88,14 @@ class Block:
         "got",
         "header",
         "highest",
+        "implied",
         "last_size",
         "leader",
         "number",
         "over",
         "packets",
         "progress",
-        "rows",
+        "said",
         "seen",
         "short",
         "trailer",
@@ -103,7 +103,15 @@ class Block:
     )
 
     def __init__(
-        self, number: int, block_id: int, *, extended: bool, datagram: int, most: int, now: float
+        self,
+        number: int,
+        block_id: int,
+        *,
+        extended: bool,
+        datagram: int,
+        most: int,
+        now: float,
+        implied: ImpliedPicture | None = None,
     ) -> None:
         self.number, self.block_id, self.extended = number, block_id, extended
         self.header = EXTENDED_HEADER if extended else HEADER
@@ -114,8 +122,9 @@ class Block:
         self.got = self.highest = 0
         self.expected = PAYLOAD | 1  # the header's word that the next packet in order has
         self.leader: Leader | None = None
+        self.implied = implied
         self.trailer: int | None = None
-        self.rows = 0
+        self.said: Trailer | None = None  # what stands in it
         self.short: int | None = None
         self.last_size = self.full
         self.arrived: float | None = None
@@ -174,7 +183,7 @@ class Block:
         Raises:
             MessageError: it is none of a picture, or of one that is larger than said.
         """
-        leader = decode_leader(payload)
+        leader = decode_leader(payload, self.implied)
         need = picture_bytes(leader, leader.height)
         if need > self.packets * self.full:
             raise MessageError(
@@ -190,7 +199,7 @@ class Block:
             return False
         if self.short is not None and packet != self.short + 1:
             return False
-        self.rows = decode_trailer(payload)
+        self.said = decode_trailer(payload)
         self.trailer = packet
         return True
 
@@ -223,29 +232,30 @@ class Block:
     def _expected_packets(self) -> int:
         if self.short is not None:
             return self.short
-        if (
-            self.leader is None or self.leader.payload_type & WITH_CHUNKS
-        ):  # chunks follow the pixels
+        if self.leader is None or self.leader.has_chunks:
             return self.packets
         need = picture_bytes(self.leader, self.leader.height) + self.leader.padding_y
         return max(self.highest, min(self.packets, -(-need // self.full)))
 
     def picture(self, lost: int) -> WholePicture | None:
         """Return the frame, once it is complete; None where its bytes are too few for it."""
-        leader = self.leader
-        if leader is None or self.trailer is None:
+        leader, said = self.leader, self.said
+        if leader is None or self.trailer is None or said is None:
             return None
-        rows = min(self.rows or leader.height, leader.height)
+        rows = min(said.rows or leader.height, leader.height)
         need = picture_bytes(leader, rows)
         there = (self.trailer - 1) * self.full
         if self.trailer > 1 and self.seen[self.trailer - 1]:
             there += self.last_size - self.full
-        if need > there or not rows or not leader.width or self.buffer is None:
+        there = min(there, said.length or there)
+        if not rows or not leader.width or self.buffer is None:
             return None
+        if need > there and leader.payload_type != PayloadType.CHUNK:
+            return None  # of chunk data the features said the size: that is told, not lost
         stride = (leader.width * bits_of(leader.pixel_format) + 7) // 8 + leader.padding_x
-        data = self.buffer[:need]
+        data = self.buffer[: min(need, there)]
         arrived = self.arrived if self.arrived is not None else 0.0
-        payload = self.buffer[:there] if leader.payload_type & WITH_CHUNKS else None
+        payload = self.buffer[:there] if leader.has_chunks else None
         return WholePicture(
             self.number, lost, leader, rows, stride, data, arrived, payload, self.block_id
         )

@@ -22,7 +22,8 @@ from smartcam.frames._gige.control import RequestRefusedError
 from smartcam.frames._gige.device_features import GigEFeatures
 from smartcam.frames._gige.discovery import find, networks
 from smartcam.frames._gige.gvcp import GvcpStatus, Register
-from smartcam.frames._gige.gvsp import IP_UDP
+from smartcam.frames._gige.gvsp import IP_UDP, ImpliedPicture, PayloadType
+from smartcam.frames._gige.messages import in_doubt
 from smartcam.frames._gige.places import found, place, wanted
 from smartcam.frames._gige.session import GigESession
 from smartcam.frames._gige.setup import (
@@ -44,11 +45,12 @@ from smartcam.frames._gige.triggering import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine
+    from collections.abc import Awaitable, Callable, Coroutine, Mapping
 
     from smartcam.frames._address import FrameAddress
     from smartcam.frames._driver import FrameSink, StreamFormat
     from smartcam.frames._events import FrameEvent
+    from smartcam.frames._features import FeatureValue
     from smartcam.frames._frame import FrameTrigger
     from smartcam.frames._gige.assembler import PacketCounts
     from smartcam.frames._gige.block import WholePicture
@@ -360,6 +362,7 @@ class GigEDriver(FrameDriver):
                 size - IP_UDP,
                 resend=resend,
                 begins_low=not self._triggers and not session.streamed,
+                implied=ImpliedPicture(shape.number, shape.format.width, shape.format.height),
             )
             session.streamed = True
             self.counts = assembler.counts
@@ -406,11 +409,15 @@ class GigEDriver(FrameDriver):
             if (leader.pixel_format, leader.width) != (shape.number, shape.format.width):
                 self._end(self._changed(picture, shape))
                 return
+            chunks, remark = self._session.read_chunks(picture)
+            if leader.payload_type == PayloadType.CHUNK and (doubt := in_doubt(picture, chunks)):
+                self._end(FrameFormatError(f"{self.name}: {doubt}", source=self.name))
+                return
             trigger = self._trigger_of(picture, self._session)
             if isinstance(trigger, SmartCamError):
                 self._sink.trigger_failed(trigger)
                 trigger = None
-            self._sink.frame(self._frame(picture, shape, self._session, trigger))
+            self._sink.frame(self._frame(picture, shape, self._session, trigger, chunks, remark))
         fault = None if self._stream is None else self._stream.assembler.fault
         if fault is not None:
             error = FrameFormatError(f"{self.name}: its stream: {fault}", source=self.name)
@@ -432,9 +439,10 @@ class GigEDriver(FrameDriver):
         shape: StreamShape,
         session: GigESession,
         trigger: FrameTrigger | None,
+        chunks: Mapping[str, FeatureValue],
+        remark: str,
     ) -> Frame:
         ticks = session.ticks_per_second
-        chunks, remark = session.read_chunks(picture)
         duration = self._longest(shape, picture.arrived)
         own = chunks.get("ChunkExposureTime") if shape.exposure.is_auto else None
         if isinstance(own, (int, float)) and 0 < own < MAX_NUMBER:

@@ -4,6 +4,9 @@ A frame is a *block*: a leader, the payload cut into packets of one size, the la
 a trailer. Packet ids count from 0, the leader's. Block ids have 16 bits, go from 1 to 65535 and
 then on at 1; or 64 bits where the camera sends extended ids, which a bit of each header says.
 
+Chunk data of the standard's first version (payload type 4) has a leader without the picture's size:
+that is what the camera's features say. A chunk of the picture's own length begins the payload.
+
 Source: GigE Vision 2.0, chapters 23 to 25.
 """
 
@@ -30,6 +33,7 @@ _LONG: Final = struct.Struct(">HHIQI")
 _LEADER: Final = struct.Struct(">HHQ")
 _IMAGE: Final = struct.Struct(">IIIIIHH")
 _TRAILER: Final = struct.Struct(">HHI")
+_CHUNK_TRAILER: Final = struct.Struct(">HHII")
 
 
 def bits_of(pixel_format: int) -> int:
@@ -59,6 +63,15 @@ class PayloadType(IntEnum):
     MULTI_ZONE = 0x0009
     MULTI_PART = 0x000A
     IMAGE_WITH_CHUNKS = 0x4001
+
+
+PICTURES: Final = (
+    PayloadType.IMAGE,
+    PayloadType.IMAGE_WITH_CHUNKS,
+    PayloadType.CHUNK,
+    PayloadType.EXTENDED_CHUNK,
+)
+"""Payload types that hold a picture as it is."""
 
 
 class PacketHeader(NamedTuple):
@@ -100,6 +113,39 @@ class Leader(NamedTuple):
     padding_x: int
     padding_y: int
 
+    @property
+    def has_chunks(self) -> bool:
+        """True if chunk data follows the picture, which is a chunk itself."""
+        return self.payload_type != PayloadType.IMAGE
+
+
+class ImpliedPicture(NamedTuple):
+    """A picture as the camera's features say it, for leaders that do not.
+
+    Attributes:
+        pixel_format: PFNC's number.
+        width: pixels.
+        height: pixels.
+    """
+
+    pixel_format: int
+    width: int
+    height: int
+
+
+class Trailer(NamedTuple):
+    """The contents of a block's last packet.
+
+    Attributes:
+        payload_type: of :class:`PayloadType`.
+        rows: number of rows that were sent; 0: it does not say.
+        length: bytes of the payload; 0: it does not say.
+    """
+
+    payload_type: int
+    rows: int
+    length: int = 0
+
 
 def decode_header(data: bytes | bytearray | memoryview, size: int) -> PacketHeader | None:
     """Read the header of a packet of ``size`` bytes; None where it is too short for one."""
@@ -115,8 +161,12 @@ def decode_header(data: bytes | bytearray | memoryview, size: int) -> PacketHead
     return PacketHeader(status, block, kind & 0x7F, packet, EXTENDED_HEADER)
 
 
-def decode_leader(payload: bytes) -> Leader:
+def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Leader:
     """Read a leader, without its header.
+
+    Args:
+        payload: bytes of the leader.
+        implied: picture of a leader that has no size; None: such a leader is an error.
 
     Raises:
         MessageError: it is too short, or none of an image.
@@ -124,17 +174,10 @@ def decode_leader(payload: bytes) -> Leader:
     if len(payload) < _LEADER.size:
         raise MessageError(f"leader: expected 12 bytes or more, got {len(payload)}", data=payload)
     _, payload_type, ticks = _LEADER.unpack_from(payload)
-    if payload_type not in (PayloadType.IMAGE, PayloadType.IMAGE_WITH_CHUNKS):
-        try:
-            name = PayloadType(payload_type).name
-        except ValueError:
-            name = "unknown"
-        raise MessageError(
-            f"leader: expected an image (0x0001), or one with chunks (0x4001), "
-            f"got payload type {payload_type:#06x} ({name})",
-            offset=2,
-            data=payload,
-        )
+    if payload_type not in PICTURES:
+        raise _no_picture(payload, payload_type)
+    if payload_type == PayloadType.CHUNK and implied is not None:
+        return Leader(payload_type, ticks, *implied, 0, 0)
     if len(payload) < _LEADER.size + _IMAGE.size:
         raise MessageError(f"leader of an image: expected 36 bytes, got {len(payload)}")
     pixel_format, width, height, _, _, padding_x, padding_y = _IMAGE.unpack_from(
@@ -143,13 +186,34 @@ def decode_leader(payload: bytes) -> Leader:
     return Leader(payload_type, ticks, pixel_format, width, height, padding_x, padding_y)
 
 
-def decode_trailer(payload: bytes) -> int:
-    """Read a trailer, without its header: the rows that were sent.
+def _no_picture(payload: bytes, payload_type: int) -> MessageError:
+    try:
+        name = PayloadType(payload_type).name
+    except ValueError:
+        name = "unknown"
+    return MessageError(
+        f"leader: expected an image (0x0001), or one with chunks (0x4001, 0x0004 or 0x0005), "
+        f"got payload type {payload_type:#06x} ({name})",
+        offset=2,
+        data=payload,
+    )
+
+
+def decode_trailer(payload: bytes) -> Trailer:
+    """Read a trailer, without its header.
 
     Raises:
         MessageError: it is too short.
     """
     if len(payload) < _TRAILER.size:
         raise MessageError(f"trailer: expected 8 bytes, got {len(payload)}", data=payload)
-    rows: int = _TRAILER.unpack_from(payload)[2]
-    return rows
+    _, payload_type, number = _TRAILER.unpack_from(payload)
+    if payload_type == PayloadType.CHUNK:
+        return Trailer(payload_type, 0, number)
+    if payload_type != PayloadType.EXTENDED_CHUNK:
+        return Trailer(payload_type, number)
+    if len(payload) < _CHUNK_TRAILER.size:
+        raise MessageError(
+            f"trailer of chunk data: expected 12 bytes or more, got {len(payload)}", data=payload
+        )
+    return Trailer(payload_type, _CHUNK_TRAILER.unpack_from(payload)[3], number)

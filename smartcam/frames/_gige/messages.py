@@ -10,19 +10,20 @@ GenApi 2.0, chapter 2.8.16 (``ChunkID`` and ``EventID`` of a Port).
 from __future__ import annotations
 
 import struct
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from smartcam.exceptions import MessageError
+from smartcam.frames._codecs.threads import at_once
+from smartcam.frames._gige.block import picture_bytes
 from smartcam.frames._gige.features import GenicamFeatures
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Mapping
+    from collections.abc import Mapping
 
     from smartcam.frames._features import FeatureValue
+    from smartcam.frames._gige.block import WholePicture
     from smartcam.frames._gige.description import Element
     from smartcam.frames._gige.features import DeviceMemory
-
-T = TypeVar("T")
 
 MAX_CHUNKS: Final = 256
 """Chunks behind one picture."""
@@ -61,6 +62,27 @@ def cut_chunks(payload: memoryview) -> dict[int, memoryview]:
         found[number] = payload[begin : end - _ENDING.size]
         end = begin
     return found
+
+
+def in_doubt(picture: WholePicture, chunks: Mapping[str, FeatureValue]) -> str:
+    """Return why a picture whose leader has no size may be of another one; "" where it is not.
+
+    Args:
+        picture: picture of the size that the camera's features say.
+        chunks: values that came with it.
+    """
+    leader = picture.leader
+    need, size = picture_bytes(leader, picture.rows), f"{leader.width}x{leader.height}"
+    try:
+        *_, first = cut_chunks(picture.payload or memoryview(b"")).values()
+    except (MessageError, ValueError) as exc:
+        return f"a picture of {size} in chunk data that cannot be read: {exc}"
+    if len(first) != need:
+        return f"a picture of {size} has {need} bytes, the chunk that came has {len(first)}"
+    for name, said in (("ChunkWidth", leader.width), ("ChunkHeight", leader.height)):
+        if chunks.get(name, said) != said:
+            return f"its picture is {size} by its features, {name} is {chunks[name]}"
+    return ""
 
 
 class MessageFeatures(GenicamFeatures):
@@ -102,8 +124,8 @@ class MessageFeatures(GenicamFeatures):
             names = [name for number in parts for name in self._by_number.get(number, ())]
             for name in names[:MAX_MESSAGE_FEATURES]:
                 try:
-                    values[name] = _at_once(self._shown(self._named(name)))
-                except MessageError as exc:
+                    values[name] = at_once(self._shown(self._named(name)))
+                except (MessageError, RuntimeError) as exc:
                     problems.append(f"{name}: {exc}")
         finally:
             self._parts = {}
@@ -160,14 +182,3 @@ def _port_numbers(nodes: Mapping[str, Element], kind: str) -> dict[str, int]:
             except ValueError as exc:
                 raise MessageError(f"Port {node.name}: {kind} {text[:40]!r} is no number") from exc
     return found
-
-
-def _at_once(work: Coroutine[Any, Any, T]) -> T:
-    """Return the result of a coroutine that never waits."""
-    try:
-        work.send(None)
-    except StopIteration as done:
-        result: T = done.value
-        return result
-    work.close()
-    raise MessageError("its value cannot be read from the message alone")

@@ -280,7 +280,9 @@ class Planes(PixelLayout):
 
     def grey(self, picture: RawPicture) -> NDArray[Any]:
         """Return Y, a view."""
-        return self.planes(picture)[0]
+        self.check(picture)
+        _, _, width, height, stride = picture
+        return _view(picture, f"<u{self.size_of}", (height, width), (stride, self.size_of))
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""

@@ -244,6 +244,7 @@ def _tight(plane: Any, found: PixelFormat) -> bytes:
     return rows[:, : plane.width * size].tobytes()
 
 
+@lru_cache(maxsize=256)  # asked for each frame
 def colour_properties(found: PixelFormat) -> tuple[int, int]:
     """Return AVColorRange and AVColorSpace of a format."""
     matrix = getattr(found.layout, "matrix", "601 full")  # without one: grey, or red, green, blue

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._arguments import check_callable, check_kind
 from smartcam._client._inside import Interpretation
+from smartcam._extras import from_part
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError, RecordingError, SmartCamError
 from smartcam.models import CameraEvent, Result, StatusChanged
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet import FleetServer
     from smartcam.fleet._inside import RecordSection
+    from smartcam.recording._folders.pictures import FleetPictures
     from smartcam.recording._folders.track import CameraTrack, RecordingAccount
     from smartcam.recording._mcap.form import Item
 
@@ -89,6 +91,7 @@ class FleetRecorder(Server):
         self._server, self._on_trouble, self._clock = server, on_trouble, _clock
         self._writer: FolderWriter | None = None
         self._observer: Observer | None = None
+        self._pictures: FleetPictures | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
 
     async def start(self) -> None:
@@ -124,20 +127,33 @@ class FleetRecorder(Server):
             await _whole(writer.stop)
             raise
         kind = _Frames if section.frames else _Hooks
-        self._observer = kind(self._server, section, writer)
+        self._pictures = self._made_pictures(writer)
+        self._observer = kind(self._server, section, writer, self._pictures)
         self._server.observers.append(self._observer)
+
+    def _made_pictures(self, writer: FolderWriter) -> FleetPictures | None:
+        if self.section.pictures == "none":
+            return None
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._folders.pictures import FleetPictures
+
+        return FleetPictures(self._server, writer, all_of_them=self.section.pictures == "all")
 
     async def stop(self) -> None:
         """Write what waits and end the files; 30 s at most, usually some milliseconds.
 
         Cancellation: the thread goes on to the end of it.
         """
-        writer, observer = self._writer, self._observer
-        self._observer = None
+        writer, observer, pictures = self._writer, self._observer, self._pictures
+        self._observer = self._pictures = None
         if observer is not None:
             self._server.observers.remove(observer)
-        if writer is not None:
-            await _whole(writer.stop)
+        try:
+            if pictures is not None:
+                await pictures.stop()
+        finally:
+            if writer is not None:
+                await _whole(writer.stop)
 
     @property
     def accounts(self) -> dict[str, RecordingAccount]:
@@ -168,8 +184,15 @@ async def _whole(work: Callable[[], None]) -> None:
 class _Hooks(Observer):
     """Hands what an agent's sessions see to the writer."""
 
-    def __init__(self, server: FleetServer, section: RecordSection, writer: FolderWriter) -> None:
+    def __init__(
+        self,
+        server: FleetServer,
+        section: RecordSection,
+        writer: FolderWriter,
+        pictures: FleetPictures | None,
+    ) -> None:
         self._server, self._section, self._writer = server, section, writer
+        self._pictures = pictures
         self._tracks: dict[str, CameraTrack | None] = {}  # None: it is not recorded
 
     def on_state(self, event: CameraEvent) -> None:
@@ -179,6 +202,8 @@ class _Hooks(Observer):
             if isinstance(event, StatusChanged):
                 track.endian = self._endian(event.camera) or 0
             self._writer.put(track, event, 0, event=True)
+            if self._pictures is not None:
+                self._pictures.follow(track)
 
     def on_result(self, result: Result) -> None:
         """Keep a result."""
@@ -186,6 +211,8 @@ class _Hooks(Observer):
         if track is not None:
             came = _SeenResult(result, self._endian(result.camera))
             self._writer.put(track, came, 4 * len(result.raw))
+            if self._pictures is not None:
+                self._pictures.result(track, result)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Keep an error."""

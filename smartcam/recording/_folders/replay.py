@@ -11,15 +11,15 @@ from smartcam._arguments import check_all, check_callable, check_flag, check_tex
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError
 from smartcam.recording._reader import check_recording
-from smartcam.recording._replays.replay import check_speed, replay
+from smartcam.recording._replays.replay import ReplayedCamera, check_speed, replay
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from smartcam.fleet import FleetServer
+    from smartcam.frames import FrameSource
     from smartcam.recording._reader import RecordedCamera, Recording
     from smartcam.recording._replays.lines import ReplayedLines
-    from smartcam.recording._replays.replay import ReplayedCamera
 
 
 class FleetReplay(Server):
@@ -31,7 +31,8 @@ class FleetReplay(Server):
             print(played.server.urls)
 
     Each camera begins when its session does, all of them at about the same time; what a fleet's
-    programs trigger gets what was recorded for a trigger, what came by itself comes again.
+    programs trigger gets what was recorded for a trigger, what came by itself comes again. The
+    frames of a BVS camera are the recorded pictures of the results, each with its result.
 
     Args:
         recording: recording to play; usually a folder of a :class:`FleetRecorder`.
@@ -119,12 +120,17 @@ class FleetReplay(Server):
             return
         async with contextlib.AsyncExitStack() as stack:
             entries: dict[str, Any] = {}
+            frames: dict[str, Callable[[], FrameSource]] = {}
             fleet = None
             for name, camera in self._played.items():
                 await stack.enter_async_context(camera)
                 known = self._recording.camera(name)
                 fleet = fleet or known.facts.get("fleet")
                 entries[name] = {"url": camera.url, **_said(known)}
+                if isinstance(camera, ReplayedCamera):
+                    pictures = camera._show_pictures(self._recording, name)  # noqa: SLF001
+                    if pictures is not None:
+                        frames[name] = pictures.source
             told: dict[str, Any] = {"listen": self._listen, "cameras": entries}
             if fleet is not None:
                 told["fleet"] = fleet
@@ -132,7 +138,7 @@ class FleetReplay(Server):
                 file = FleetFile.model_validate(told)
             except ValueError as exc:
                 raise ConfigurationError(f"recording {self._recording.path}: {exc}") from exc
-            server = await stack.enter_async_context(FleetServer(file))
+            server = await stack.enter_async_context(FleetServer(file, _frames=frames))
             self._server, self._stack = server, stack.pop_all()
 
     async def stop(self) -> None:

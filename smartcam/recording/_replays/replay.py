@@ -17,11 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import PrivateAttr
 
 from smartcam._arguments import check_callable, check_flag, check_kind, check_number
+from smartcam._extras import from_part
 from smartcam.emulator import Application, EmulatedCamera, LineCamera
 from smartcam.emulator._inside import check_options, emulated_class, wrap_number
 from smartcam.exceptions import ConfigurationError
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     from smartcam.layout import Field
     from smartcam.models import ByteOrder, Status
     from smartcam.recording._reader import Recording
+    from smartcam.recording._replays.pictures import ReplayedPictures
 from smartcam.recording._replays.schedule import ReplayPlan, Take, TakeList
 
 MAX_SPEED = 1000.0
@@ -112,6 +115,8 @@ class _Track:
     rest: list[bytes] = field(default_factory=list[bytes])
     # how to give containers the client's numbers; None: they keep their own
     numbers: _Numbers | None = None
+    # is told each container that is given, as it was recorded
+    told: Callable[[bytes], None] = lambda _: None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
         """End the inspection: return its container; None where it sends nothing."""
@@ -119,6 +124,8 @@ class _Track:
         if take is None or not take.containers:
             return None
         containers = take.containers
+        for data in containers:
+            self.told(data)
         if self.numbers is not None:
             containers = [self.numbers.put(data, number, byte_order) for data in containers]
         first, *self.rest = containers
@@ -245,6 +252,25 @@ class ReplayedCamera(EmulatedCamera):
         self._round: float | None = None  # when the present round of conditions began
         self._changed = 0  # changes of conditions in it
         self._change_alarm: TimerHandle | None = None
+        self._pictures: ReplayedPictures | None = None
+
+    def _show_pictures(self, recording: Recording, camera: str) -> ReplayedPictures | None:
+        """Return the recorded pictures of the results, shown as these are given; None: no pictures.
+
+        Args:
+            recording: recording that is played.
+            camera: name of the camera in it.
+        """
+        if not recording.counts.pictures:
+            return None
+        with from_part("frames", "pictures need"):
+            from smartcam.recording._replays.pictures import ReplayedPictures
+
+        shown = ReplayedPictures(recording, camera, self.plan.applications, self.speed)
+        for number, track in self._tracks.items():
+            track.told = partial(shown.given, number)
+        self._pictures = None if shown.first is None else shown
+        return self._pictures
 
     @property
     def remaining(self) -> int:
@@ -297,6 +323,8 @@ class ReplayedCamera(EmulatedCamera):
     def _begin(self, track: _Track, take: Take | None) -> None:
         """Begin an inspection, which takes as long as the recorded one."""
         track.current, self._armed = take, None
+        if self._pictures is not None:
+            self._pictures.begins()
         if take is not None:
             self.device.change_run(late=max(0.0, take.seconds / self.speed - MIN_INSPECTION_TIME))
 
@@ -337,6 +365,8 @@ class ReplayedCamera(EmulatedCamera):
 
     def _begin_unasked(self, track: _Track, take: Take) -> None:
         if not track.waits:
+            for data in take.containers:
+                track.told(data)
             self._send(take.containers)
         elif self.device.trigger():
             self._begin(track, take)

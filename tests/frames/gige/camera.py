@@ -244,6 +244,7 @@ class Camera:
         taken_by: address of another application that controls it.
         mute_when_taken: it answers nothing instead of ACCESS_DENIED, as aravis' fake camera.
         payload_type: payload type in leader and trailer.
+        chunk_type: the same while the camera sends chunk data: 0x4001, 4 or 5.
         latches: whether its clock can be read by a register.
         plan: what becomes of the next triggers, one after the other: "" for a picture, "ignore",
             "busy", "missed" by an event, "lose" for no packet, "cut" for a packet that never
@@ -271,6 +272,7 @@ class Camera:
     taken_by: str | None = None
     mute_when_taken: bool = False
     payload_type: int = 1
+    chunk_type: int = 0x4001
     description: bytes = DESCRIPTION.encode()
     url: bytes = b""
     heartbeat: float = 3.0
@@ -441,7 +443,7 @@ class Camera:
             (self.start if value else self.stop)()
             return 0
         if address == CHUNKS:
-            self.payload_type = 0x4001 if value else 1
+            self.payload_type = self.chunk_type if value else 1
             self.words[PAYLOAD_EXTRA] = len(self.chunks(0)) if value else 0
         if address in (USER_LOAD, USER_SAVE):
             asyncio.get_running_loop().call_later(0.1, self.user_set, address)
@@ -643,7 +645,12 @@ class Camera:
             ">HHQIIIIIHH", 0, self.payload_type, ticks, self.words[FORMAT], self.words[WIDTH],
             self.words[HEIGHT], 0, 0, 0, 0,
         )  # fmt: skip
-        trailer = struct.pack(">HHI", 0, self.payload_type, self.words[HEIGHT])
+        said = {4: (len(data),), 5: (len(data), self.words[HEIGHT], 7)}.get(
+            self.payload_type, (self.words[HEIGHT],)
+        )
+        trailer = struct.pack(f">HH{len(said)}I", 0, self.payload_type, *said)
+        if self.payload_type == 4:  # chunk data of the first version: no size
+            leader = leader[:12]
         payload = [header(3, 1 + at) + part for at, part in enumerate(parts)]
         return [header(1, 0) + leader, *payload, header(2, len(parts) + 1) + trailer]
 

@@ -9,9 +9,10 @@ from tests.frames.gige import camera as cameras
 from tests.frames.gige.camera import camera, number_in
 
 
-async def test_values_that_come_with_a_picture_are_on_its_frame() -> None:
+@pytest.mark.parametrize("chunk_type", [0x4001, 4, 5])
+async def test_values_that_come_with_a_picture_are_on_its_frame(chunk_type: int) -> None:
     async with (
-        camera() as there,
+        camera(chunk_type=chunk_type) as there,
         smartcam.frames.open(
             f"gige://127.0.0.1:{there.port}?packet_size=576&feature.ChunkModeActive=true"
         ) as source,
@@ -60,3 +61,35 @@ async def test_chunk_data_that_cannot_be_read_is_told_and_the_picture_stays() ->
         assert number_in(frame)
         assert frame.chunks == {}
         assert "chunk data" in frame.remark
+
+
+@pytest.mark.parametrize("rows", [40, 47])
+async def test_chunk_data_of_another_size_than_the_features_say_is_no_picture(rows: int) -> None:
+    async with (
+        camera(chunk_type=4) as there,
+        smartcam.frames.open(
+            f"gige://127.0.0.1:{there.port}?packet_size=576&feature.ChunkModeActive=true"
+        ) as source,
+        source.reader() as reader,
+    ):
+        frame = await anext(reader)
+        assert (frame.width, frame.height, frame.stride) == (64, 48, 64)
+        there.words[cameras.HEIGHT] = rows  # a lock that it does not keep
+        with pytest.raises(
+            smartcam.exceptions.FrameFormatError,
+            match=rf"64x48 has 3072 bytes, the chunk that came has {64 * rows}",
+        ):
+            await _until_the_end(reader)
+
+
+async def _until_the_end(reader: smartcam.frames.FrameReader) -> None:
+    async for frame in reader:
+        assert frame.height == 48
+
+
+async def test_chunk_data_without_its_ends_is_no_picture() -> None:
+    async with camera(payload_type=4) as there:
+        there.words[cameras.PAYLOAD_EXTRA] = 700
+        async with smartcam.frames.open(f"gige://127.0.0.1:{there.port}?packet_size=576") as source:
+            with pytest.raises(smartcam.exceptions.FrameFormatError, match="cannot be read"):
+                await source.newest()

@@ -6,15 +6,16 @@ import asyncio
 import collections
 import contextlib
 import time
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError
-from smartcam.frames._codecs.threads import Codecs
-from smartcam.frames._frame import Frame, Moment
+from smartcam.frames._codecs.threads import Codecs, StreamRuns, at_once
+from smartcam.frames._frame import Frame, Moment, changed
 from smartcam.frames._pixels.formats import find_format
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from smartcam.frames._codecs.h264 import H264Decoder
     from smartcam.frames._driver import FrameSink
     from smartcam.frames._streaming.rtp.assembling import AccessUnit
@@ -102,6 +103,9 @@ class UnitDecoding:
         self._shown = False
         self._ended = False
         self._codecs = Codecs(threads=1)
+        self._run = StreamRuns(self._codecs)
+        self._decoder: H264Decoder | None = None
+        self._idle = False  # that nothing is being decoded, nor waits
         self._task: asyncio.Task[None] | None = None
 
     async def begin(self, source: UnitSource) -> None:
@@ -154,11 +158,17 @@ class UnitDecoding:
             self._anew |= any(one.begins for one, _ in self._units)
             self._units.clear()
             source.want_picture()
-        self._came.set()
+        if self._idle and self._units and self._run.short and not self._ended:
+            with self._told():
+                at_once(self._decode_next())
+        if self._units:
+            self._came.set()
 
-    async def _decode(self) -> None:
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        """Tell the sink of an error, whatever it is."""
         try:
-            await self._decode_all()
+            yield
         except FrameSourceError as error:
             self.over(error)
         except Exception as exc:  # noqa: BLE001 - readers are told, whatever it is
@@ -166,31 +176,38 @@ class UnitDecoding:
             failed.__cause__ = exc
             self.over(failed)
 
-    async def _decode_all(self) -> None:
-        decoder = self._decoder()
-        while not self._ended:
-            if not self._units:
-                self._came.clear()
-                await self._came.wait()
-                continue
-            unit, device_time = self._units.popleft()
-            begins = unit.begins or self._anew
-            behind = not begins and self._pace.goes_back(unit)
-            missing = self._pace.lost(unit) + self._skipped
-            self._missed += missing
-            if behind and not self._reorders:
-                self._reorders = begins = True
-            if begins:
-                decoder = self._decoder()
-                unit = self._with_sets(unit)
-            elif missing:
-                decoder.lost()
-            self._skipped, self._anew = 0, False
-            await self._give(decoder, unit, device_time)
+    async def _decode(self) -> None:
+        """Decode what cannot be decoded as soon as it comes."""
+        with self._told():
+            while not self._ended:
+                if not self._units:
+                    self._came.clear()
+                    self._idle = True
+                    await self._came.wait()
+                self._idle = False
+                if self._units:
+                    await self._decode_next()
+                    await asyncio.sleep(0)  # pictures that came together do not hold up the loop
 
-    def _decoder(self) -> H264Decoder:
-        run = self._codecs._run  # noqa: SLF001 - as the decoders that the codecs give out
-        return self._plan.coding.decoder(run, reorders=self._reorders, to=self._plan.to)
+    async def _decode_next(self) -> None:
+        unit, device_time = self._units.popleft()
+        begins = unit.begins or self._anew
+        behind = not begins and self._pace.goes_back(unit)
+        missing = self._pace.lost(unit) + self._skipped
+        self._missed += missing
+        if behind and not self._reorders:
+            self._reorders = begins = True
+        if begins or self._decoder is None:
+            self._decoder = self._made_decoder()
+            unit = self._with_sets(unit) if begins else unit
+        elif missing:
+            self._decoder.lost()
+        self._skipped, self._anew = 0, False
+        await self._give(self._decoder, unit, device_time)
+
+    def _made_decoder(self) -> H264Decoder:
+        reorders, to = self._reorders, self._plan.to
+        return self._plan.coding.decoder(self._run, reorders=reorders, to=to)
 
     def _with_sets(self, unit: AccessUnit) -> AccessUnit:
         if not self._plan.sets or self._plan.coding.size_in(unit.data) is not None:
@@ -259,7 +276,7 @@ class UnitDecoding:
         self._shown = True
         self._number += 1 + lost
         if not self._ended:
-            self._sink.frame(replace(picture, sequence=self._number, lost=lost))
+            self._sink.frame(changed(picture, sequence=self._number, lost=lost))
 
 
 class _UnitPace:

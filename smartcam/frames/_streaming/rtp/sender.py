@@ -18,7 +18,8 @@ from smartcam.exceptions import (
     LocalProtocolError,
     MessageError,
 )
-from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._codecs.h264 import H264Encoder
+from smartcam.frames._codecs.threads import Codecs, StreamRuns
 from smartcam.frames._source import FrameSource
 from smartcam.frames._streaming.rtp import packets as wire
 from smartcam.frames._streaming.rtp.feedback import Audience, PacketHistory
@@ -30,7 +31,6 @@ from smartcam.frames._streaming.rtp.sockets import SocketPair, host_and_port, re
 if TYPE_CHECKING:
     from typing import Self
 
-    from smartcam.frames._codecs.h264 import H264Encoder
     from smartcam.frames._frame import Frame
     from smartcam.frames._streaming.rtp.feedback import RtpReceiver
     from smartcam.frames._streaming.rtp.sockets import Endpoint
@@ -43,6 +43,9 @@ REPORT_INTERVAL: Final = 2.0
 
 MIN_KEY_FRAME_INTERVAL: Final = 0.2
 """Seconds between two key frames made on request, since key frames are large."""
+
+BEGINS_SPS: Final = b"\0\0\1\x67"
+"""Start code and head of a sequence's parameters, as x264 writes them."""
 
 FULL_SOCKET_TIMEOUT: Final = 1.0
 """Seconds that a full socket is waited for before the next frame is tried all the same."""
@@ -144,7 +147,7 @@ class RtpSender:
         self._entered = False
 
     def _made_encoder(self, fps: float) -> H264Encoder:
-        return self._codecs.h264_encoder(fps=fps, **self._options)  # type: ignore[arg-type]
+        return H264Encoder(StreamRuns(self._codecs), fps=fps, **self._options)  # type: ignore[arg-type]
 
     @property
     def sdp(self) -> str:
@@ -285,7 +288,8 @@ class RtpSender:
     def _put(self, link: _RtpOutlet, encoded: Frame) -> bool:
         """Send a frame's packets; return whether the socket took them all."""
         data = bytes(encoded.data)
-        self._sets = parameter_sets(data) or self._sets
+        if BEGINS_SPS in data:
+            self._sets = parameter_sets(data) or self._sets
         self._ticks = max(self._ticks + 1, int(encoded.captured * CLOCK_RATE))
         sequence = self._packetizer.sequence
         to = link.to[1:]

@@ -11,7 +11,8 @@ from smartcam._arguments import check_flag, check_integer, check_kind, check_num
 from smartcam._finishing import finish
 from smartcam._server import Server
 from smartcam.exceptions import ConfigurationError, LocalProtocolError
-from smartcam.frames._codecs.threads import Codecs
+from smartcam.frames._codecs.h264 import H264Encoder
+from smartcam.frames._codecs.threads import Codecs, StreamRuns
 from smartcam.frames._source import FrameSource
 from smartcam.frames._streaming.rtsp.addresses import NAME
 from smartcam.frames._streaming.rtsp.authentication import Authentication
@@ -182,9 +183,8 @@ class RtspServer(Server):
             if id(source) in shared:
                 continue
             rate = self._fps if self._fps is not None else _rate(source)
-            encoder = codecs.h264_encoder(
-                fps=rate, keyint=self._keyint, crf=self._crf, bitrate=self._bitrate
-            )
+            options = {"keyint": self._keyint, "crf": self._crf, "bitrate": self._bitrate}
+            encoder = H264Encoder(StreamRuns(codecs), fps=rate, **options)  # type: ignore[arg-type]
             shared[id(source)] = SharedH264(source, encoder), rate
         return {name: RtspStream(name, *shared[id(one)]) for name, one in self._sources.items()}
 

@@ -1,0 +1,147 @@
+"""Record the pictures of an agent's cameras beside their results."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from smartcam.backoff import Backoff
+from smartcam.exceptions import SmartCamError
+from smartcam.frames._inside import FrameTap
+from smartcam.recording._judged import PictureMatcher
+from smartcam.recording._mcap.form import MAX_PICTURE_SIZE_BYTES, RecordedError, RecordedPicture
+from smartcam.recording._recorder import MAX_WAITING_BYTES
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from smartcam.fleet import FleetServer
+    from smartcam.frames import Frame, FrameSource
+    from smartcam.models import Result
+    from smartcam.recording._folders.track import CameraTrack
+    from smartcam.recording._folders.writer import FolderWriter
+
+logger: logging.Logger = logging.getLogger("smartcam.recording")
+
+MAX_MATCHED_BYTES: Final = 1 << 26
+"""Bytes of a camera's last pictures that are kept until the result that was made of one comes."""
+
+MAX_BYTES_WITH_PICTURES: Final = 3 * MAX_WAITING_BYTES // 4
+"""Bytes that may wait for the disk behind a picture: the rest of the room is for results."""
+
+RETRY: Final = Backoff(initial=1.0, maximum=30.0)
+"""Delays before pictures that do not come are tried again."""
+
+
+class FleetPictures:
+    """Puts the pictures of cameras into their recordings, for as long as the cameras are there.
+
+    Args:
+        server: agent that has the cameras.
+        writer: writer of the recordings.
+        all_of_them: whether every picture is recorded, or of each result the one it was made of.
+    """
+
+    def __init__(self, server: FleetServer, writer: FolderWriter, *, all_of_them: bool) -> None:
+        self._server, self._writer, self._all = server, writer, all_of_them
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._matchers: dict[str, PictureMatcher] = {}
+
+    def follow(self, track: CameraTrack) -> None:
+        """Record the pictures of a camera from now on; nothing is done where they are already."""
+        task = self._tasks.get(track.camera)
+        if task is None or task.done():
+            name = f"smartcam.recordings.pictures[{track.camera}]"
+            loop = asyncio.get_running_loop()
+            self._tasks[track.camera] = loop.create_task(self._record(track), name=name)
+
+    def result(self, track: CameraTrack, result: Result[Any]) -> None:
+        """Record the picture that a result was made of."""
+        matcher = self._matchers.get(track.camera)
+        if matcher is not None:
+            matcher.results.append(result)
+            self._settle(track, matcher)
+
+    async def stop(self) -> None:
+        """Record no more pictures.
+
+        Cancellation: takes effect when the tasks have ended, which wait for nothing.
+        """
+        tasks = [*self._tasks.values()]
+        self._tasks.clear()
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+
+    async def _record(self, track: CameraTrack) -> None:
+        """Record until the agent has the camera, or pictures of it, no longer."""
+        delays, told = RETRY.delays(), ""
+        while True:
+            host = self._server.hosts.get(track.camera)
+            if host is None or host.frames.closed or host.frames.make is None:
+                return
+            why = "they ended"
+            try:
+                if await self._take_all(track, await host.frames.source()):
+                    delays, told = RETRY.delays(), ""
+            except (SmartCamError, OSError) as exc:
+                why = str(exc)
+            except Exception as exc:  # a driver may be anybody's
+                logger.exception("%s ! its pictures are not recorded", track.camera)
+                why = repr(exc)
+            if why != told and not host.frames.closed:
+                told = why
+                self._tell(track, why)
+            await asyncio.sleep(next(delays))
+
+    async def _take_all(self, track: CameraTrack, source: FrameSource) -> bool:
+        """Take pictures until the source ends; return whether any came."""
+        came = False
+        matcher = PictureMatcher(MAX_MATCHED_BYTES)
+
+        def take(frame: Frame) -> bool:
+            nonlocal came
+            came = True
+            picture = RecordedPicture(track.camera, _time_of(frame), frame)
+            if self._all:
+                return self._put(track, picture)
+            matcher.add_picture(picture)
+            self._settle(track, matcher)
+            return True
+
+        tap = FrameTap(source, take, lambda: self._writer.waiting > MAX_BYTES_WITH_PICTURES // 2)
+        if not self._all:
+            self._matchers[track.camera] = matcher
+        try:
+            await tap.ended()
+        finally:
+            self._matchers.pop(track.camera, None)
+            tap.close()
+        return came
+
+    def _settle(self, track: CameraTrack, matcher: PictureMatcher) -> None:
+        for _, picture, _ in matcher.settled_by_time():
+            if picture is not None:
+                self._put(track, RecordedPicture(track.camera, _time_of(picture), picture))
+
+    def _put(self, track: CameraTrack, picture: RecordedPicture) -> bool:
+        """Have a picture written, or left out and counted where results might find no room."""
+        size = memoryview(picture.frame.data).nbytes
+        fits = self._writer.waiting + size <= MAX_BYTES_WITH_PICTURES
+        return self._writer.put(
+            track, picture, size if fits and size <= MAX_PICTURE_SIZE_BYTES else -1
+        )
+
+    def _tell(self, track: CameraTrack, why: str) -> None:
+        """Tell the log and the recording that a camera's pictures do not come."""
+        logger.warning("%s ! its pictures are not recorded: %s", track.camera, why)
+        text = f"its pictures are not recorded: {why}"
+        error = RecordedError(track.camera, datetime.now(UTC), "FrameSourceError", text, None)
+        self._writer.put(track, error, len(text))
+
+
+def _time_of(frame: Frame) -> datetime:
+    return datetime.fromtimestamp(max(0.0, frame.utc), UTC)

@@ -1,0 +1,168 @@
+"""The pictures of recorded results, each shown when a replay gives its result again.
+
+A smart camera whose wire has no pictures, such as a BVS camera, shows them beside it: as the frames
+of the camera at an agent. A result is known by its application and its bytes; where results with
+the same bytes cannot be told apart, they have no picture.
+"""
+
+from __future__ import annotations
+
+import collections
+import logging
+import time
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+from smartcam.exceptions import FrameSourceError
+from smartcam.frames import FrameAddress, FrameDriver, FrameSource, StreamFormat
+from smartcam.frames._inside import changed
+from smartcam.recording._replays.schedule import MAX_REPLAY
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from smartcam.frames import Frame, FrameSink
+    from smartcam.recording._reader import Recording
+    from smartcam.recording._replays.schedule import TakeList
+
+_log = logging.getLogger(__name__)
+
+
+class _ShownPicture(NamedTuple):
+    """A picture, and the seconds from its capture to its result."""
+
+    frame: Frame
+    seconds: float
+
+
+class ReplayedPictures:
+    """The pictures of a replayed camera's results.
+
+    Args:
+        recording: recording that is played.
+        camera: name of the camera in it.
+        applications: plan of what is played, by application.
+        speed: factor by which it is played faster than recorded.
+
+    Attributes:
+        name: name of the camera.
+        shown: picture of the last result that was given; None before the first, and where it has
+            none.
+        first: first picture that there is; None: there is none.
+    """
+
+    def __init__(
+        self, recording: Recording, camera: str, applications: Mapping[int, TakeList], speed: float
+    ) -> None:
+        self.name = camera
+        self.shown: Frame | None = None
+        self.sinks: set[FrameSink] = set()
+        self._speed, self._began = speed, 0.0
+        self._given: collections.Counter[tuple[int, bytes]] = collections.Counter()
+        self._pictures = _told_apart(recording, camera, applications)
+        self.first: Frame | None = next(
+            (one.frame for some in self._pictures.values() for one in some if one is not None), None
+        )
+
+    def source(self) -> FrameSource:
+        """Return a source of the pictures, not open."""
+        return FrameSource(_ResultPictures(self), timeout=None, stall=None, linger=2.0)
+
+    def begins(self) -> None:
+        """Note that an inspection begins: its picture is exposed from now on."""
+        self._began = time.monotonic()
+
+    def given(self, application: int, data: bytes) -> None:
+        """Show the picture of a result that is given now."""
+        key = application, data
+        pictures = self._pictures.get(key)
+        found = None
+        if pictures:
+            found = pictures[self._given[key] % len(pictures)]
+            self._given[key] += 1
+        if found is None:
+            self.shown = None
+            return
+        frame, seconds = found
+        now = time.monotonic()
+        captured = min(now, max(self._began, now - seconds / self._speed))
+        duration = min(frame.duration / self._speed, captured - self._began)
+        self.shown = changed(frame, captured=captured, duration=duration)
+        for sink in tuple(self.sinks):
+            sink.frame(self.shown)
+
+
+def _told_apart(
+    recording: Recording, camera: str, applications: Mapping[int, TakeList]
+) -> dict[tuple[int, bytes], list[_ShownPicture | None]]:
+    """Return the pictures of results with the same bytes, in order, where that is their order."""
+    found: dict[tuple[int, bytes], list[_ShownPicture | None]] = {}
+    size = 0
+    for result, picture, _ in recording.judged(camera):
+        some = found.setdefault((result.application, result.raw), [])
+        size += 0 if picture is None else memoryview(picture.data).nbytes
+        if picture is None or size > MAX_REPLAY:
+            some.append(None)
+        else:
+            some.append(_ShownPicture(picture, result.received_at.timestamp() - picture.utc))
+    if size > MAX_REPLAY:
+        _log.warning("%s: pictures behind the first %d bytes are not shown", camera, MAX_REPLAY)
+    counts = _in_one_order(applications)
+    return {key: some for key, some in found.items() if counts.get(key) == len(some)}
+
+
+def _in_one_order(applications: Mapping[int, TakeList]) -> dict[tuple[int, bytes], int]:
+    """Return the number of containers with the same bytes, of those that come in one order.
+
+    Triggered ones and those that come by themselves are played each in an order of their own.
+    """
+    triggered: collections.Counter[tuple[int, bytes]] = collections.Counter()
+    unasked: collections.Counter[tuple[int, bytes]] = collections.Counter()
+    for number, takes in applications.items():
+        for count, some in ((triggered, takes.triggered), (unasked, takes.unasked)):
+            count.update((number, data) for take in some for data in take.containers)
+    both = triggered.keys() & unasked.keys()
+    return {key: n for count in (triggered, unasked) for key, n in count.items() if key not in both}
+
+
+class _ResultPictures(FrameDriver):
+    """Gives the picture of each result that a replay gives, after that of the last one."""
+
+    times_frames: ClassVar[bool] = True
+
+    def __init__(self, pictures: ReplayedPictures) -> None:
+        super().__init__(FrameAddress.parse("replayed://"))
+        self._pictures = pictures
+        self._sink: FrameSink | None = None
+
+    @property
+    def name(self) -> str:
+        """The camera's name."""
+        return self._pictures.name
+
+    async def open(self) -> StreamFormat:
+        """Return the format of the first picture.
+
+        Raises:
+            FrameSourceError: there is none.
+        """
+        first = self._pictures.first
+        if first is None:
+            raise FrameSourceError(f"{self.name}: no result has a picture", source=self.name)
+        return StreamFormat(first.format, first.width, first.height)
+
+    async def start(self, sink: FrameSink) -> None:
+        """Give the picture of the last result, and those of the next ones."""
+        self._sink = sink
+        self._pictures.sinks.add(sink)
+        if self._pictures.shown is not None:
+            sink.frame(self._pictures.shown)
+
+    async def stop(self) -> None:
+        """Give nothing more."""
+        if self._sink is not None:
+            self._pictures.sinks.discard(self._sink)
+            self._sink = None
+
+    async def close(self) -> None:
+        """Have nothing left. Idempotent."""
+        await self.stop()
