@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +12,23 @@ import pytest
 
 import smartcam.inspection
 from smartcam.calibration import calibrate_sheet, fit_plane
+from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import Inspection, Picture
 from smartcam.inspection._measure.edges import Edge
 from smartcam.inspection._measure.features import FoundPoint, FoundShape, strip_between
 from smartcam.inspection._measure.fits import Edges
-from smartcam.inspection._measure.planes import PIXELS, plane_of
+from smartcam.inspection._measure.planes import PIXELS, Plane, plane_of
 from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
 from smartcam.inspection._measure.values import (
+    Value,
     distance,
     line_of,
     point_of,
     width,
     with_calibration,
 )
-from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET
+from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET, truth
 from tests.calibration.test_sheet import seen, touched
 from tests.inspection.measurekit import HOLE, RADIUS, WIDE, plate, program
 
@@ -281,7 +284,7 @@ def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> Non
 def test_calibration_without_a_known_error_adds_none_and_says_so() -> None:
     found = fit_plane(GRID[[0, 2, 6]], tilted(GRID)[[0, 2, 6]], model="affine")
     assert found.touch_sigma is None
-    assert plane_of(found).unverified
+    assert plane_of(found).remark == "sigma is without the touches' error, which nothing tells"
 
 
 def test_line_that_a_lens_bends_is_straight_in_the_calibrated_plane() -> None:
@@ -303,12 +306,58 @@ def test_lengths_on_a_sheet_are_those_on_paper() -> None:
     calibration = calibrate_sheet(seen(sigma=0.05), touched(SIGMA), camera=CAMERA)
     flat = plane_of(calibration)
     pixels = CAMERA.project(TARGET.points[[0, 8]] @ SEEN.rotation.T + SEEN.translation)
-    strip = strip_between(pixels[0], pixels[1], 9.0)
-    sides = strip.length / 2 * np.array([-1, 1])
-    nothing = 1e-12 * np.eye(2)
-    pair = [FoundPoint(strip, Edge(s, nothing, 0, 1e-6, 99.0, 0.8, 0.0, 0.0)) for s in sides]
-    found = with_calibration(lambda one: distance(*(point_of(end, one) for end in pair)), flat)
+    found = ends_on_sheet(pixels, flat)
     assert abs(found.value - 200.0) < 4 * found.sigma < 2.0
+
+
+def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
+    """Return the distance of two pixels, known exactly, in a plane."""
+    strip = strip_between(pixels[0], pixels[1], 9.0)
+    nothing = 1e-12 * np.eye(2)
+    ends = [
+        FoundPoint(strip, Edge(s * strip.length / 2, nothing, 0, 1e-6, 99.0, 0.8, 0.0, 0.0))
+        for s in (-1, 1)
+    ]
+    return with_calibration(lambda one: distance(*(point_of(end, one) for end in ends)), plane)
+
+
+@pytest.mark.parametrize(
+    "pixels", [[[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.0]]]
+)
+@pytest.mark.parametrize(
+    ("number", "least", "most"),
+    [(40, 0.7, 1.5), pytest.param(600, 0.9, 1.1, marks=pytest.mark.long)],
+)
+def test_sigma_on_a_sheet_has_the_lens_error_in_it(
+    pixels: Any, number: int, least: float, most: float
+) -> None:
+    """Calibrations by lenses that are as wrong as their covariance says; chance does 3 % of 600."""
+    spread = np.array([1.5, 1.5, 1.0, 1.0, 3e-3, 5e-3, 1e-4, 1e-4, 0.0])
+    mixed = np.eye(9)
+    mixed[0, 1] = mixed[1, 0] = 0.9  # of the focal lengths
+    mixed[4, 5] = mixed[5, 4] = -0.8  # of k1 and k2
+    covariance = mixed * np.outer(spread, spread)
+    at = np.array(pixels)
+    true = 1e3 * float(np.linalg.norm(np.diff(truth(at), axis=0)))
+    errors, sigmas, without = [], [], []
+    for seed in range(number):
+        off = np.random.default_rng([seed, 7]).multivariate_normal(np.zeros(9), covariance)
+        calibration = calibrate_sheet(
+            seen(sigma=0.05, seed=seed),
+            replace(touched(1e-5, seed), touch_sigma=1e-5),
+            camera=with_lens(CAMERA, lens_values(CAMERA) + off),
+            lens_covariance=covariance,
+        )
+        found = ends_on_sheet(at, plane_of(calibration))
+        errors.append(found.value - true)
+        sigmas.append(found.sigma)
+        unknown = replace(calibration, lens_covariance=None)
+        if not seed:
+            without.append(ends_on_sheet(at, plane_of(unknown)).sigma)
+            assert "the lens' error" in plane_of(unknown).remark
+    observed = float(np.sqrt(np.mean(np.square(errors))))
+    assert least < float(np.sqrt(np.mean(np.square(sigmas)))) / observed < most
+    assert without[0] < 0.5 * observed
 
 
 def test_place_beyond_the_calibrated_plane_is_told() -> None:

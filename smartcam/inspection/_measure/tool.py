@@ -65,9 +65,6 @@ if TYPE_CHECKING:
 CIRCLE_CORNERS: Final = 72
 """Corners of the polygon that a circle is drawn as."""
 
-NO_ERROR_KNOWN: Final = "sigma is without the calibration's own error, which nothing tells"
-"""Remark on values by a calibration whose touches had no known error."""
-
 METRES: Final = {"mm": 1e-3, "px": 1.0, "deg": math.pi / 180}
 """SI units of the units that people see; pixels stay pixels."""
 
@@ -285,7 +282,7 @@ class _EdgeFinder:
             edges=np.concatenate(self._edges or none),
             left_out=np.concatenate(self._left_out or none),
             missed=tuple(self._missed),
-            remark=NO_ERROR_KNOWN if self.plane.unverified else "",
+            remark=self.plane.remark,
         )
 
     def drawn(self, text: str, *, wrong: bool) -> list[Drawing]:
