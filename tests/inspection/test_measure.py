@@ -14,6 +14,7 @@ import smartcam.inspection
 from smartcam.calibration import calibrate_sheet, fit_plane
 from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.exceptions import ConfigurationError
+from smartcam.frames import Frame, Moment, find_format
 from smartcam.inspection import Inspection, Picture
 from smartcam.inspection._measure.edges import Edge
 from smartcam.inspection._measure.features import FoundPoint, FoundShape, strip_between
@@ -197,6 +198,82 @@ def test_colour_that_is_cut_off_is_told_unless_it_is_allowed(tmp_path: Path) -> 
     assert found.findings["measure"].details.trouble is None
 
 
+def limited(least: float, most: float, bits: int = 8, noise: float = 0.3) -> Any:
+    """Return a plate of so little noise that pixels of one level are nearly equal, in video range.
+
+    ``least``, ``most``: levels of 8 bits of the dark and the bright side, before they are cut off.
+    """
+    step = 2 ** (bits - 8)
+    levels = least + (most - least) * (
+        plate(noise=0.0, bits=16).astype(float) / 65535 - 45 / 255
+    ) / (150 / 255)
+    levels += np.random.default_rng(3).normal(0, noise, levels.shape)
+    kind = np.uint8 if bits == 8 else np.uint16
+    return np.rint(step * levels.clip(16, 235)).astype(kind)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(
+    ("least", "most", "end"),
+    [(-10, 200, "black"), (60, 260, "white"), (14, 180, "black"), (60, 200, ""), (17.5, 233, "")],
+)
+def test_levels_that_video_cuts_off_are_told(
+    tmp_path: Path, least: float, most: float, end: str, bits: int
+) -> None:
+    found = inspected(tmp_path, WIDTH, limited(least, most, bits))
+    details = found.findings["measure"].details
+    if end:
+        assert details.trouble is NoValueReason.SATURATED
+        assert f"{end} to the limit" in found.reason
+    else:
+        assert abs(details.value - WIDE) < 4 * details.sigma
+
+
+def test_one_colour_that_is_cut_off_is_told_in_every_kind_of_frame(tmp_path: Path) -> None:
+    red = np.minimum(1.6 * limited(20, 200), 255)
+    colours = np.stack([red, limited(20, 120), limited(20, 90)], axis=2).round().astype(np.uint8)
+    y, u, v = (
+        (colours.astype(float) @ one + offset).clip(0, 255).round()
+        for one, offset in (
+            ([0.299, 0.587, 0.114], 0.0),
+            ([-0.168736, -0.331264, 0.5], 128.0),
+            ([0.5, -0.418688, -0.081312], 128.0),
+        )
+    )
+    height, width = red.shape
+    pairs = np.stack([y[:, ::2], u[:, ::2], y[:, 1::2], v[:, ::2]], axis=2)
+    bayer = colours[:, :, 1].copy()
+    bayer[::2, ::2], bayer[1::2, 1::2] = colours[::2, ::2, 0], colours[1::2, 1::2, 2]
+    tool = program(tmp_path, WIDTH)
+    for name, wire, a_pixel in (
+        ("RGB8", colours, 3),
+        ("YCbCr422_8", pairs.astype(np.uint8), 2),
+        ("BayerRG8", bayer, 1),
+    ):
+        frame = Frame(
+            data=wire.tobytes(),
+            format=find_format(name),
+            width=width,
+            height=height,
+            stride=a_pixel * width,
+            captured=0.0,
+            utc=0.0,
+            moment=Moment.ARRIVAL,
+            sequence=1,
+            source="cam",
+        )
+        found = tool.inspect(frame)
+        assert found.findings["measure"].details.trouble is NoValueReason.SATURATED, name
+
+
+def test_colour_that_would_be_less_than_nothing_is_told(tmp_path: Path) -> None:
+    colours = np.stack([limited(20, 200), limited(20, 90), limited(20, 60)], axis=2)
+    assert inspected(tmp_path, WIDTH, colours).findings["measure"].details.trouble is None
+    colours[:, :, 2] = np.where(colours[:, :, 0] > 180, 0, colours[:, :, 2])
+    found = inspected(tmp_path, WIDTH, colours)
+    assert found.findings["measure"].details.trouble is NoValueReason.SATURATED
+
+
 def test_picture_of_another_size_is_told_rather_than_measured_elsewhere(tmp_path: Path) -> None:
     found = inspected(tmp_path, WIDTH, plate()[:100, :100])
     assert found.findings["measure"].details.trouble is NoValueReason.OUTSIDE
@@ -321,17 +398,24 @@ def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
     return with_calibration(lambda one: distance(*(point_of(end, one) for end in ends)), plane)
 
 
+FAR, ACROSS_ALL = [[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.0]]
+"""Pixels of two points on the sheet."""
+
+
 @pytest.mark.parametrize(
-    "pixels", [[[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.0]]]
-)
-@pytest.mark.parametrize(
-    ("number", "least", "most"),
-    [(40, 0.7, 1.5), pytest.param(600, 0.9, 1.1, marks=pytest.mark.long)],
+    ("pixels", "number", "least", "most"),
+    [
+        (FAR, 20, 0.6, 1.7),
+        *(
+            pytest.param(one, 400, 0.9, 1.1, marks=[pytest.mark.long, pytest.mark.widest])
+            for one in (FAR, ACROSS_ALL)
+        ),
+    ],
 )
 def test_sigma_on_a_sheet_has_the_lens_error_in_it(
     pixels: Any, number: int, least: float, most: float
 ) -> None:
-    """Calibrations by lenses that are as wrong as their covariance says; chance does 3 % of 600."""
+    """Calibrations by lenses that are as wrong as their covariance says; chance does 4 % of 400."""
     spread = np.array([1.5, 1.5, 1.0, 1.0, 3e-3, 5e-3, 1e-4, 1e-4, 0.0])
     mixed = np.eye(9)
     mixed[0, 1] = mixed[1, 0] = 0.9  # of the focal lengths

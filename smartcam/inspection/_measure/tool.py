@@ -174,7 +174,8 @@ class _EdgeFinder:
         self.plane = plane
         self.reference = view.reference
         self._image = view.picture.levels
-        self._white = float(2**view.picture.depth - 1)
+        self._top = 2**view.picture.depth - 1
+        self._ends = view.picture.ends
         self._clipped = view.picture.clipped
         self._regions: list[Array] = []  # corners
         self._edges: list[Array] = []
@@ -190,9 +191,10 @@ class _EdgeFinder:
         return EdgeSettings(
             polarity=search.polarity,
             smoothing=search.smoothing,
-            contrast=search.contrast * self._white / 255,
+            contrast=search.contrast * self._top / 255,
             most_blur=search.blur,
-            white=self._white,
+            black=float(self._ends[0]),
+            white=float(self._ends[1]),
             cut_off=search.cut_off,
             clipped=self._clipped,
         )
