@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.emulator import WireCamera
-    from smartcam.emulator._inside import InspectionOrder, Values
+    from smartcam.emulator._inside import InspectionOrder, LastReport, Values
     from smartcam.frames import FrameSource
     from smartcam.inspection._cell import CellCamera
     from smartcam.inspection._program import Program
@@ -167,6 +167,14 @@ class SoftwareDevice(Server):
     def interpret_as(self) -> dict[int, str]:
         """The layout of the results of each application."""
         return {number: one.interpret_as for number, one in self.camera.programs.items()}
+
+    def last_sent(self) -> tuple[int, LastReport | None]:
+        """Return the number of the session, 0 without one, and the last report of a run.
+
+        Of a BVS camera: others send no containers.
+        """
+        device = self.emulator.device
+        return (device.sessions if device.connected else 0), device.last_report
 
     async def start(self) -> None:
         """Open the source of the frames, then the port.
