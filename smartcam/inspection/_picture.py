@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam._arguments import check_integer, check_path, wrong_argument
+from smartcam._arguments import check_integer, check_kind, check_path, wrong_argument
 from smartcam._extras import load
 from smartcam._forks import cached_property
 from smartcam.exceptions import FrameFormatError
@@ -66,6 +66,8 @@ class Picture:
         self.depth: int = (
             most if depth is None else check_integer(depth, "depth", 1, most, "Picture")
         )
+        if frame is not None:
+            check_kind(frame, Frame, "frame", "a Frame, or None", "Picture")
         self.frame: Frame | None = frame
         self.size: tuple[int, int] = (width, height)
         self._pixels = pixels

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from pydantic import ValidationError
 
-from smartcam._arguments import check_application, check_path, check_text
+from smartcam._arguments import check_application, check_path, check_text, wrong_argument
 from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
 from smartcam._whole_files import replace_file
@@ -24,7 +25,6 @@ from smartcam.layout._inside import load as load_yaml
 from smartcam.registry import TOOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from smartcam.inspection._program import Program
@@ -83,6 +83,8 @@ class Teaching:
         Raises:
             ConfigurationError: a tool or a setting is wrong; the text says which.
         """
+        if not isinstance(tools, Mapping):
+            raise wrong_argument("tools", "a mapping from tools to their settings", tools)
         software = self._software(self._read())
         software["applications"][self.application] = self._changed(tools)
         try:

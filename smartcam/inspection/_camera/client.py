@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from smartcam._arguments import check_kind
+from smartcam._arguments import check_flag, check_kind
 from smartcam._finishing import finish
 from smartcam.client import SmartCamera
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError, UnsupportedError
@@ -126,19 +126,21 @@ class SoftwareCamera(SmartCamera[ValueT]):
             timeout: seconds; default the camera's ``request_timeout``.
 
         Raises:
+            ConfigurationError: an argument is of another kind.
             UnsupportedError: the result's picture is not known, or not any more.
             ResponseTimeoutError: it was not made in time.
 
         Cancellation: safe.
         """
         check_kind(result, Result, "result", "a Result", "read_judged_image")
+        drawn = check_flag(drawn, "drawn", "read_judged_image")
+        limit = self._limit(timeout, self.settings.request_timeout)
         judged = self._pairs.judged_of(result)
         if judged is None:
             raise UnsupportedError(
                 f"{self.name}: the picture of result {result.number} is not here: expected one of "
                 f"the last {MAX_KEPT} results of this camera"
             )
-        limit = self._limit(timeout, self.settings.request_timeout)
         return await self._png(judged, limit, drawn=drawn)
 
     def _tell_picture(self, result: Result[Any], judged: Judged) -> None:
