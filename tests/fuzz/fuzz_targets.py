@@ -178,7 +178,7 @@ TARGETS = {
         Target("spec", 128, 22, _SPEC + _LAYOUT, shares="texts"),
         Target("cell_file", 512, 2, _CELL + _YAML, shares="cells"),
         Target("gs1", 96, 22, _GS1, shares="cells"),
-        Target("program_result", 64, 6, _NUMBERS, shares="cells"),
+        Target("program_result", 160, 6, _NUMBERS, shares="cells"),
     )
 }
 """Every target by name, in the order in which they run."""
