@@ -99,7 +99,8 @@ def _of_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
     findings = [*seen.values()]
     counts = [int(one.values.get("count", 0)) for one in findings]
     found: dict[str, Any] = {"count": [min(counts), max(counts)]}
-    remark = f"{min(counts)} to {max(counts)} spots in {_pictures(len(seen))}"
+    many = f"{min(counts)} to {max(counts)}" if min(counts) < max(counts) else f"{max(counts)}"
+    remark = f"{many} spots in {_pictures(len(seen))}"
     each = [one.records or (one.values,) for one in findings]
     areas = [float(record["area"]) for records in each for record in records if record.get("area")]
     if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
@@ -109,9 +110,9 @@ def _of_present(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _L
             f", of {min(areas):.0f} to {max(areas):.0f} pixels; area has {AREA_MARGIN:.0%} more "
             "to both sides"
         )
-    return _Learned(
-        found, f"{remark}."
-    )  # of spots that are not in the result nobody knows the area
+    elif any(counts):  # of spots that are not in the result nobody knows the area
+        remark += "; area stays as it is, as the result does not have all of them (most)"
+    return _Learned(found, f"{remark}.")
 
 
 def _of_compare(seen: Mapping[str, Finding], _settings: Mapping[str, Any]) -> _Learned:

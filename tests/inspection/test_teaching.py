@@ -99,6 +99,8 @@ def test_what_others_wrote_meanwhile_stays(path: Path) -> None:
         ({"present": {"gray": [0, 9]}}, "present.gray: .*did you mean 'grey'"),
         ({"present": {"grey": [9, 0]}}, "present.grey"),
         ({"nothing_like_it": {}}, "nothing_like_it"),
+        ({"measure": {"width": {"acros": 3}}}, "measure.width.acros: .*did you mean 'across'"),
+        ({"measure": {"distance": {"first": {"lin": 3}}}}, "first.lin: .*did you mean 'line'"),
         ({}, "tool"),
     ],
 )
@@ -125,7 +127,7 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
     program = teaching.program(tools)
     found, remarks = learned(tools, {str(n): program.inspect(one) for n, one in enumerate(good)})
     assert remarks == [
-        "present: 2 to 2 spots in 3 pictures, of 81 to 121 pixels; area has 20% more to both sides."
+        "present: 2 spots in 3 pictures, of 81 to 121 pixels; area has 20% more to both sides."
     ]
     assert found["present"]["count"] == [2, 2]
     assert found["present"]["area"] == [64, 146]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from smartcam._arguments import check_flag, check_kind
 from smartcam._finishing import finish
+from smartcam._suggestions import did_you_mean
 from smartcam.client import SmartCamera
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError, UnsupportedError
 from smartcam.inspection._camera.device import SoftwareDevice
@@ -182,5 +183,8 @@ def find_camera(url: str) -> CellCamera:
         return next(iter(cameras.values()))
     there = ", ".join(cameras)
     if mark:
-        raise ConfigurationError(f"{path} has no software camera {name!r:.80}; it has {there}")
+        raise ConfigurationError(
+            f"{path} has no software camera {name!r:.80}; it has {there}"
+            f"{did_you_mean(name, cameras)}"
+        )
     raise ConfigurationError(f"{path} has several software cameras: name one of {there} behind #")
