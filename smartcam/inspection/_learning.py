@@ -49,7 +49,7 @@ MAX_DIGITS: Final = 9
 
 
 class Lesson(NamedTuple):
-    """What good pictures taught.
+    """The tolerances that good pictures taught.
 
     Attributes:
         tools: settings of the tools by their keys, with the tolerances that were learned.
@@ -199,7 +199,7 @@ def _on_one_turn(values: Array) -> Array:
 
 
 def _far(values: Array, sigmas: Array) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Return which values (N,) are so far from the others that they are of another part."""
+    """Return a mask of the values (N,) that are too far from the others to be of the same part."""
     if not len(values):
         return np.zeros(0, dtype=bool)
     away = np.abs(values - np.median(values))
@@ -231,7 +231,7 @@ def _text(values: Array, spread: float, guard: float, old: Tolerance | None, uni
 
 
 def _spreads(number: int, *, sided: bool) -> float:
-    """Return how many standard deviations of so many normal values have most parts in them.
+    """Return the standard deviations of so many normal values that have most parts in them.
 
     By Howe to both sides, which is Natrella's approximation to one side.
     """

@@ -133,7 +133,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any]) -> Plane:
 
 
 def _remark(calibration: Any, plane: Any) -> str:
-    """Return what sigma is without; "" where all errors are known."""
+    """Return the errors that sigma is without; "" where all are known."""
     unknown = ["the touches' error"] if plane.touch_sigma is None else []
     if calibration.kind == "sheet" and calibration.lens_covariance is None:
         unknown.append("the lens' error" if calibration.camera else "the lens' distortion")
