@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import smartcam.inspection
-from smartcam.calibration import calibrate_sheet, fit_plane
-from smartcam.calibration._lens.bundle import lens_values, with_lens
+from smartcam.calibration import CameraModel, calibrate_sheet, fit_plane
 from smartcam.exceptions import ConfigurationError
 from smartcam.frames import Frame, Moment, find_format
 from smartcam.inspection import Inspection, Picture
@@ -398,6 +397,12 @@ def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
     return with_calibration(lambda one: distance(*(point_of(end, one) for end in ends)), plane)
 
 
+def wrong_lens(off: Any) -> CameraModel:
+    """Return the camera with fx, fy, cx, cy and coefficients that are off by so much (9,)."""
+    shift = np.array([[off[0], 0.0, off[2]], [0.0, off[1], off[3]], [0.0, 0.0, 0.0]])
+    return replace(CAMERA, matrix=CAMERA.matrix + shift, distortion=CAMERA.distortion + off[4:])
+
+
 FAR, ACROSS_ALL = [[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.0]]
 """Pixels of two points on the sheet."""
 
@@ -429,7 +434,7 @@ def test_sigma_on_a_sheet_has_the_lens_error_in_it(
         calibration = calibrate_sheet(
             seen(sigma=0.05, seed=seed),
             replace(touched(1e-5, seed), touch_sigma=1e-5),
-            camera=with_lens(CAMERA, lens_values(CAMERA) + off),
+            camera=wrong_lens(off),
             lens_covariance=covariance,
         )
         found = ends_on_sheet(at, plane_of(calibration))
