@@ -13,13 +13,14 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from smartcam.exceptions import SmartCamError
+    from smartcam.frames import Frame
     from smartcam.models import CameraEvent, Result
 
 __all__ = ["Observer", "TraceEntry"]
 
 logger: logging.Logger = logging.getLogger("smartcam.client")
 
-_HOOKS = ("on_frame", "on_state", "on_result", "on_error")
+_HOOKS = ("on_frame", "on_state", "on_result", "on_picture", "on_error")
 
 
 class TraceEntry(NamedTuple):
@@ -73,6 +74,12 @@ class Observer:
         for is counted and not interpreted.
         """
 
+    def on_picture(self, result: Result, frame: Frame) -> None:
+        """See the picture that a result was made of, right before the result.
+
+        Cameras that have it call this: software cameras.
+        """
+
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """See an error.
 
@@ -102,6 +109,7 @@ class Observers:
                 raise wrong_argument("observers", "objects of classes of Observer", one)
         self._on_state = self._overriding("on_state")
         self._on_result = self._overriding("on_result")
+        self._on_picture = self._overriding("on_picture")
         self.see_states: bool = bool(self._on_state)
         self.see_results: bool = bool(self._on_result)
 
@@ -130,6 +138,11 @@ class Observers:
         """Tell all of a result."""
         for hook in self._on_result:
             self._call(hook, result)
+
+    def picture(self, result: Result, frame: Frame) -> None:
+        """Tell all of the picture that a result was made of."""
+        for hook in self._on_picture:
+            self._call(hook, result, frame)
 
     def error(
         self, camera: str, error: SmartCamError, triggered_at: datetime | None = None

@@ -7,7 +7,8 @@ import contextlib
 import inspect
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator
-from datetime import datetime
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,18 @@ from smartcam.emulator import (
 from smartcam.fleet._inside import RecordSection
 from smartcam.frames import Codecs, FrameGroup, FrameSource, RateControl, RtpSender, RtspServer
 from smartcam.outlets import Outlets
+from smartcam.inspection import (
+    Picture,
+    Software,
+    SoftwareDevice,
+    Teaching,
+    Tool,
+    load_cell,
+    make_camera,
+    register_tool,
+    software_mistakes,
+)
+from smartcam.models import Result
 from smartcam.recording import (
     FleetRecorder,
     FleetReplay,
@@ -106,6 +119,8 @@ def wrong(kinds: dict[str, str]) -> Iterator[tuple[str, str]]:
         for odd in ODD.keys() - KINDS[kind]:
             yield argument, odd
 
+
+RESULT = Result("cam", 7, None, 1, None, datetime(2030, 1, 1, tzinfo=UTC), None, b"", None)
 
 LONGEST_TEXT = 2000
 """Characters of an error's text that quotes an argument, whatever that is."""
@@ -222,6 +237,45 @@ def test_numbers_of_numpy_are_numbers() -> None:
 # ---------------------------------------------------------------------- all else
 
 
+CELL = """
+cameras:
+  cam: {software: {frames: "synthetic://", applications: {7: {present: {grey: [0, 90]}}}}}
+"""
+
+
+def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
+    """Give what inspects pictures."""
+    folder.mkdir(exist_ok=True)
+    path = folder / "cell.yaml"
+    path.write_text(CELL, encoding="utf-8")
+    cell = load_cell(path)["cam"]
+    camera: Any = smartcam.connect(f"software:{path}")
+    program, teaching = cell.program(7), Teaching(path, "cam", 7)
+    software = {"software": Software(frames="x", applications={7: {"present": {"grey": [0, 90]}}})}
+
+    def mistakes(name: Any = "cam", folder: Any = folder, **more: Any) -> Any:
+        return [*software_mistakes(name, **{**software, **more}, folder=folder)]
+
+    return {
+        "CellCamera.program": (cell.program, {}),
+        "Inspection.payload": (program.inspect(frame).payload, {}),
+        "Picture.__init__": (Picture, {"pixels": np.zeros((4, 4), np.uint8)}),
+        "Picture.of": (Picture.of, {}),
+        "Picture.read": (Picture.read, {}),
+        "Program.inspect": (program.inspect, {"source": frame}),
+        "SoftwareCamera.read_drawn_image": (camera.read_drawn_image, {}),
+        "SoftwareCamera.read_judged_image": (camera.read_judged_image, {"result": RESULT}),
+        "SoftwareDevice.__init__": (SoftwareDevice, {"camera": cell}),
+        "Teaching.__init__": (Teaching, {"path": path, "camera": "cam", "application": 7}),
+        "Teaching.program": (teaching.program, {}),
+        "Teaching.save": (teaching.save, {}),
+        "load_cell": (load_cell, {}),
+        "make_camera": (make_camera, {"name": "cam", **software, "folder": folder}),
+        "register_tool": (register_tool, {"name": "odd", "tool": Tool}),
+        "software_mistakes": (mistakes, {}),
+    }
+
+
 @contextlib.asynccontextmanager
 async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str, Any]]]]:
     """Give every other callable of the table by its name, and what it is given otherwise."""
@@ -268,6 +322,7 @@ async def things() -> AsyncIterator[dict[str, tuple[Callable[..., Any], dict[str
             "load_scenario": (load_scenario, {"path": "none.yaml"}),
             "load_scenarios": (load_scenarios, {"path": "none.yaml"}),
             "EmulatedFleet.__init__": (EmulatedFleet, {"scenarios": [Scenario(name="a")]}),
+            **inspecting(Path(folder), frame),
             "Recorder.__init__": (Recorder, {"path": "x"}),
             "Recorder.add_picture": (Recorder("y").add_picture, {"frame": frame}),
             "RotatingRecorder.__init__": (RotatingRecorder, {"path": "x"}),

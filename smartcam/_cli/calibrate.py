@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Mapping
 
     from smartcam.calibration import Folder
+    from smartcam.calibration._inside import Lens
     from smartcam.calibration.wizards import CalibrationService, Wizard, WizardSession
     from smartcam.frames import FrameSource
-    from smartcam.geometry import CameraModel
     from smartcam.models import Localization
 
 ABORTED = 130
@@ -334,9 +334,11 @@ class _Sources:
             **self._taking(),
             "save_to": folder.calibration,
             "suggested": target,
-            "camera": lens,
+            "camera": None if lens is None else lens.camera,
         }
-        return [*found, sheet_wizard(**pictures, connect=connect), hand_eye_wizard(**pictures)]
+        known = None if lens is None else lens.covariance
+        sheet = sheet_wizard(**pictures, lens_covariance=known, connect=connect)
+        return [*found, sheet, hand_eye_wizard(**pictures)]
 
     async def localize(self) -> list[Localization]:
         from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
@@ -390,11 +392,11 @@ class _Sources:
         return await asyncio.to_thread(decode_picture, data, name)
 
 
-def _read_lens(path: str) -> CameraModel:
+def _read_lens(path: str) -> Lens:
     from smartcam.calibration._inside import read_lenses
 
     try:
         with naming(f"--lens {path}"):
-            return read_lenses(path).lenses[0].camera
+            return read_lenses(path).lenses[0]
     except CalibrationError as exc:
         raise ConfigurationError(f"--lens: {exc}") from exc

@@ -97,6 +97,8 @@ def picture_files(path: Path) -> Iterator[Path]:
     from smartcam._natural import natural
 
     if not path.is_dir():
+        if not path.exists():
+            raise ConfigurationError(f"{path}: there is no such file or folder")
         yield path
         return
     found = [one for one in path.iterdir() if one.suffix.lower() in SUFFIXES]

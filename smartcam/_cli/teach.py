@@ -49,7 +49,11 @@ LINGER: Final = 3.0
     help="Change a setting, such as 'present.region=[10, 10, 80, 60]'; VALUE is YAML, an empty one "
     "takes the setting out. A tool that is not there is added. Repeatable.",
 )
-@click.option("--learn", is_flag=True, help="Set tolerances by which all PICTURES are good.")
+@click.option(
+    "--learn",
+    is_flag=True,
+    help="Set tolerances from the PICTURES, which show good parts, and say what they follow from.",
+)
 @click.option("--save", is_flag=True, help="Write the file.")
 @page_options("", always=True)
 @option("--seconds")
@@ -107,18 +111,22 @@ def _change(
     tools = _changed(teaching.tools, changes)
     program = teaching.program(tools)
     pictures = [(file, Picture.read(file)) for file in files]
+    remarks: list[str] = []
     if learn:
         if not pictures:
             raise click.UsageError("--learn: expected PICTURES of good parts, got none")
-        tools = learned(tools, [program.inspect(picture) for _, picture in pictures])
+        tools, remarks = learned(tools, {str(file): program.inspect(one) for file, one in pictures})
         program = teaching.program(tools)
     for file, picture in pictures:
         _show(str(file), program.inspect(picture), options)
     if save:
         teaching.save(tools)
     value = {"application": teaching.application, "tools": tools, "saved": save}
+    if learn:
+        value["learned"] = remarks
     text = [f"{'saved' if save else 'not saved'}: application {teaching.application}"]
     text += [f"  {key}: {settings}" for key, settings in tools.items()]
+    text += [f"learned {one}" for one in remarks]
     options.show(value, "\n".join(text))
 
 

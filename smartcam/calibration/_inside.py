@@ -9,7 +9,8 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.calibration._drawing.files import draw_file
     from smartcam.calibration._files.load import AnyCalibration
-    from smartcam.calibration._lens.comparison import compare_lenses, rig_difference
+    from smartcam.calibration._least_squares import independent_parts
+    from smartcam.calibration._lens.comparison import Lens, compare_lenses, rig_difference
     from smartcam.calibration._lens.uncertainty import MapFigures
     from smartcam.calibration._plane.drawing import draw
     from smartcam.calibration._printing.sheets import on_paper
@@ -46,6 +47,7 @@ __all__ = [
     "CalibrationStart",
     "CameraInfo",
     "Input",
+    "Lens",
     "MapFigures",
     "PixelPoseRequest",
     "Rectification",
@@ -58,6 +60,7 @@ __all__ = [
     "doubt_of",
     "draw",
     "draw_file",
+    "independent_parts",
     "listing",
     "on_paper",
     "parse_camera_info",
@@ -73,7 +76,8 @@ if not TYPE_CHECKING:
         {
             "_drawing.files": "draw_file",
             "_files.load": "AnyCalibration",
-            "_lens.comparison": "compare_lenses rig_difference",
+            "_least_squares": "independent_parts",
+            "_lens.comparison": "Lens compare_lenses rig_difference",
             "_lens.uncertainty": "MapFigures",
             "_plane.drawing": "draw",
             "_printing.sheets": "on_paper",

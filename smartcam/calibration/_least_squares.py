@@ -36,6 +36,8 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e12
 RANK = 1e-14
 """Singular values of a matrix with a unit diagonal are rounding below this part of the largest."""
 
+RANK_OF_COVARIANCE = 1e-12
+"""Eigenvalues of a covariance with a unit diagonal are rounding below this part of the largest."""
 
 MAX_UNKNOWNS_BY_SVD = 60
 """Unknowns, beyond which singular values cost too much time to be looked at first."""
@@ -180,3 +182,12 @@ def inverse_scaled(matrix: Array) -> Array:
     outer = np.outer(scale, scale)
     inverse = np.linalg.pinv(matrix / outer, rcond=RANK, hermitian=True)
     return np.asarray(inverse / outer, dtype=np.float64)
+
+
+def independent_parts(covariance: Array) -> Array:
+    """Return independent vectors (K, S) of one standard deviation, whose squares add up to it."""
+    scale = unit_diagonal(covariance)
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = values > RANK_OF_COVARIANCE * values.max(initial=0.0)
+    parts: Array = (vectors[:, kept] * np.sqrt(values[kept])).T * scale
+    return parts

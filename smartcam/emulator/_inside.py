@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
+    from smartcam.emulator._bvs.device import LastReport
     from smartcam.emulator._camera import CONDITIONS
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._clock import Clock, RealClock, TimerHandle
@@ -39,6 +40,7 @@ __all__ = [
     "InspectedJob",
     "InspectionOrder",
     "Inspector",
+    "LastReport",
     "LineCodec",
     "LineServer",
     "Observation",
@@ -62,6 +64,7 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
+            "_bvs.device": "LastReport",
             "_camera": "CONDITIONS",
             "_client_link": "ClientLink",
             "_clock": "Clock RealClock TimerHandle",

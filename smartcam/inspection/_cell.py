@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from smartcam._arguments import check_application_or_name, check_path, check_text
+from smartcam._arguments import (
+    check_application_or_name,
+    check_kind,
+    check_path,
+    check_text,
+)
 from smartcam._suggestions import did_you_mean
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.inspection._program import (
@@ -221,6 +226,9 @@ def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
             ``place``: the keys that lead there.
         MissingExtraError: what it needs is not installed.
     """
+    check_kind(software, Software, "software", "a Software", "make_camera")
+    folder = check_path(folder, "folder", "make_camera")
+    name = check_text(name, "name", "make_camera")
     setup = ToolSetup(folder=folder, calibration=_calibration(software, folder))
     names = _names(software)
     made: dict[int, list[ProgramStep]] = {}
@@ -234,7 +242,7 @@ def make_camera(name: str, software: Software, folder: Path) -> CellCamera:
         except ConfigurationError as exc:
             raise ProgramError(str(exc), ("applications", number)) from exc
     return CellCamera(
-        name=check_text(name, "name", "make_camera"),
+        name=name,
         frames=software.frames_address(folder),
         calibration=setup.calibration,
         programs=programs,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
+from smartcam._arguments import check_choice, check_integer
 from smartcam._forks import cached_property
 
 if TYPE_CHECKING:
@@ -94,10 +95,16 @@ class Inspection:
         Args:
             byte_order: order of the bytes of a number.
             sequence: value of the ``@sequence`` field; None: 0 where the layout has one.
+
+        Raises:
+            ConfigurationError: an argument is wrong, or the sequence number does not fit its field.
         """
+        order = check_choice(byte_order, "byte_order", ("little", "big"), "payload")
+        if sequence is not None:
+            sequence = check_integer(sequence, "sequence", -(1 << 31), 0xFFFFFFFF, "payload")
         if self.layout.sequence_field is None:
             sequence = None
-        return self.layout.build(self.values, byte_order, sequence=sequence)
+        return self.layout.build(self.values, cast("ByteOrder", order), sequence=sequence)
 
     @cached_property
     def value(self) -> Record:

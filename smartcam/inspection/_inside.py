@@ -8,12 +8,8 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.inspection._camera.judged_frames import judged_source
-    from smartcam.inspection._teaching import (
-        learned,
-        read_settings,
-        setting_text,
-        tool_settings,
-    )
+    from smartcam.inspection._learning import learned
+    from smartcam.inspection._teaching import read_settings, setting_text, tool_settings
 
 __all__ = [
     "judged_source",
@@ -28,6 +24,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_camera.judged_frames": "judged_source",
-            "_teaching": "learned read_settings setting_text tool_settings",
+            "_learning": "learned",
+            "_teaching": "read_settings setting_text tool_settings",
         },
     )

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from smartcam._arguments import check_integer, check_path, wrong_argument
+from smartcam._arguments import check_integer, check_kind, check_path, wrong_argument
 from smartcam._extras import load
 from smartcam._forks import cached_property
 from smartcam.exceptions import FrameFormatError
@@ -22,6 +22,10 @@ MAX_SIDE_PX: Final = 20_000
 
 MAX_FILE_BYTES: Final = 1 << 28
 """Bytes that a picture's file may have."""
+
+LIMITED_BLACK: Final = 16
+LIMITED_WHITE: Final = 235
+"""Levels of black and white of video's limited range, of 8 bits (ITU-R BT.601)."""
 
 
 class Picture:
@@ -62,6 +66,8 @@ class Picture:
         self.depth: int = (
             most if depth is None else check_integer(depth, "depth", 1, most, "Picture")
         )
+        if frame is not None:
+            check_kind(frame, Frame, "frame", "a Frame, or None", "Picture")
         self.frame: Frame | None = frame
         self.size: tuple[int, int] = (width, height)
         self._pixels = pixels
@@ -137,13 +143,34 @@ class Picture:
         return mixed
 
     @cached_property
+    def ends(self) -> tuple[int, int]:
+        """The levels of :attr:`levels` at which black and white are cut off.
+
+        They are the least and the largest that there can be; or those of video's limited range, 16
+        and 235 of 8 bits, where the picture has many bright or dark levels and none beyond these.
+        """
+        return _ends(self.levels, self.depth)
+
+    @cached_property
     def clipped(self) -> NDArray[np.bool_] | None:
-        """Mask of pixels with a colour at its top, (H, W); None where there are no colours."""
-        if self._pixels.ndim == 2:
+        """Mask of pixels with a colour that is cut off, (H, W); None where there are no colours.
+
+        A colour is cut off at its top, and at its bottom where another one is bright: there a
+        camera that mixes its colours would have less than nothing. Where the dark is black in all
+        of its colours, :attr:`levels` tell it.
+        """
+        if not self.has_colours:
             return None
-        top = 2**self.depth - 1
-        red, green, blue = (self._pixels[:, :, one] >= top for one in range(3))
-        mask: NDArray[np.bool_] = red | green | blue
+        sent = self._pixels.ndim == 3
+        colours = self._pixels if sent or self.frame is None else self.frame.rgb()
+        depth = min(self.depth, 8 * colours.dtype.itemsize)
+        made = 0 if sent else 1  # what a camera made of its colours is a level off
+        bright = colours.max(axis=2) > 2**depth // 4
+        mask = np.zeros(bright.shape, dtype=bool)
+        for one in range(3):
+            black, white = _ends(colours[:, :, one], depth)
+            mask |= colours[:, :, one] >= white - made
+            mask |= bright & (colours[:, :, one] <= black + made)
         return mask
 
     @cached_property
@@ -160,6 +187,14 @@ class Picture:
             colours = self.frame.rgb()
             return _eight_bits(colours, min(self.depth, 8 * colours.dtype.itemsize))
         return np.repeat(self.grey[:, :, np.newaxis], 3, axis=2)
+
+
+def _ends(levels: NDArray[Any], depth: int) -> tuple[int, int]:
+    """Return the levels at which samples of so many bits are cut off."""
+    top, step = 2**depth - 1, 2 ** (depth - 8) if depth >= 8 else 0
+    black, white = LIMITED_BLACK * step, LIMITED_WHITE * step
+    least, most = int(levels.min()), int(levels.max())
+    return (black if least == black else 0), (white if step and most == white else top)
 
 
 def _eight_bits(pixels: NDArray[Any], depth: int) -> NDArray[np.uint8]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast, get_args
 
 from pydantic import ValidationError
 
@@ -338,8 +338,9 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
     try:
         settings = model.model_validate({} if given is None else given)
     except ValidationError as exc:
-        first = exc.errors(include_url=False)[0]
-        text = first["msg"].removeprefix("Value error, ") + hint(first, model.model_fields)
+        errors = exc.errors(include_url=False)  # what is missing may be what is written wrong
+        first = next((one for one in errors if one["type"] == "extra_forbidden"), errors[0])
+        text = first["msg"].removeprefix("Value error, ") + hint(first, _known(model, first["loc"]))
         raise ProgramError(text, (key, *first["loc"])) from exc
     try:
         return ProgramStep(name, tool_class(settings, setup), own=True)
@@ -347,6 +348,15 @@ def make_step(key: str, given: object, setup: ToolSetup, others: Iterable[str] =
         raise ProgramError(str(exc), (key, *exc.place)) from exc
     except (SmartCamError, OSError) as exc:
         raise ProgramError(str(exc), (key,)) from exc
+
+
+def _known(model: Any, place: tuple[int | str, ...]) -> Iterable[str]:
+    """Return the settings that there are where an error is."""
+    for key in place[:-1]:
+        field = getattr(model, "model_fields", {}).get(key)
+        inner = () if field is None else (field.annotation, *get_args(field.annotation))
+        model = next((one for one in inner if hasattr(one, "model_fields")), None)
+    return getattr(model, "model_fields", ())
 
 
 def register_tool(name: str, tool: type[AnyTool]) -> None:

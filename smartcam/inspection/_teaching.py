@@ -7,38 +7,30 @@ written.
 from __future__ import annotations
 
 import io
-import math
 import re
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from pydantic import ValidationError
 
-from smartcam._arguments import check_application, check_path, check_text
+from smartcam._arguments import check_application, check_path, check_text, wrong_argument
 from smartcam._extras import load
 from smartcam._suggestions import did_you_mean
 from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._cell import Software, make_camera
-from smartcam.inspection._program import ProgramError, split_name
+from smartcam.inspection._program import ProgramError
 from smartcam.layout._inside import BadYamlError
 from smartcam.layout._inside import load as load_yaml
 from smartcam.registry import TOOLS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from smartcam.inspection._finding import Finding, Inspection
     from smartcam.inspection._program import Program
 
 MAX_FILE_BYTES: Final = 1 << 22
 """Bytes of a cell file that is taught."""
-
-AREA_MARGIN: Final = 0.2
-"""Share by which a spot may be smaller or larger than those of the good pictures."""
-
-DIFFERENCE_MARGIN: Final = 1.5
-"""Times as many pixels may differ as in the good pictures."""
 
 LINE_WIDTH: Final = 4096
 """Characters after which a written line is wrapped: none is."""
@@ -91,6 +83,8 @@ class Teaching:
         Raises:
             ConfigurationError: a tool or a setting is wrong; the text says which.
         """
+        if not isinstance(tools, Mapping):
+            raise wrong_argument("tools", "a mapping from tools to their settings", tools)
         software = self._software(self._read())
         software["applications"][self.application] = self._changed(tools)
         try:
@@ -213,60 +207,6 @@ def _flow(value: Any) -> Any:
         return value
     made.fa.set_flow_style()
     return made
-
-
-# ---------------------------------------------------------------------- tolerances
-
-
-def learned(
-    tools: Mapping[str, Mapping[str, Any]], good: Sequence[Inspection]
-) -> dict[str, dict[str, Any]]:
-    """Return the tools with tolerances by which all of the good pictures are good.
-
-    Args:
-        tools: settings of the tools by their keys.
-        good: inspections of good pictures by these tools.
-    """
-    found = {key: dict(given) for key, given in tools.items()}
-    for key, settings in found.items():
-        kind, name = split_name(key)
-        seen = [one.findings[name] for one in good if name in one.findings]
-        if seen and kind in _LEARNERS:
-            settings.update(_LEARNERS[kind](seen))
-    return found
-
-
-def _of_present(seen: Sequence[Finding]) -> dict[str, Any]:
-    counts = [int(one.values.get("count", 0)) for one in seen]
-    found: dict[str, Any] = {"count": [min(counts), max(counts)]}
-    each = [one.records or (one.values,) for one in seen]
-    areas = [float(record["area"]) for records in each for record in records if record.get("area")]
-    if areas and all(len(records) >= count for records, count in zip(each, counts, strict=True)):
-        least, most = (1 - AREA_MARGIN) * min(areas), (1 + AREA_MARGIN) * max(areas)
-        found["area"] = [max(1, math.floor(least)), math.ceil(most)]
-    return found  # of spots that are not in the result nobody knows the area
-
-
-def _of_compare(seen: Sequence[Finding]) -> dict[str, Any]:
-    most = max(int(one.values.get("differing", 0)) for one in seen)
-    return {"allowed": math.ceil(DIFFERENCE_MARGIN * most)}
-
-
-def _of_read(seen: Sequence[Finding]) -> dict[str, Any]:
-    texts = {
-        str(one["text"])
-        for found in seen
-        for one in (found.records or (found.values,))
-        if one.get("text")
-    }
-    return {"expect": re.escape(texts.pop())} if len(texts) == 1 else {}
-
-
-_LEARNERS: Final[dict[str, Callable[[Sequence[Finding]], dict[str, Any]]]] = {
-    "compare": _of_compare,
-    "present": _of_present,
-    "read": _of_read,
-}
 
 
 # ---------------------------------------------------------------------- settings

@@ -142,13 +142,16 @@ class Recorder(Observer):
     Args:
         path: the file; the usual ending is ``.mcap``.
         overwrite: take the place of a file that is there.
+        pictures: keep the pictures that results were made of, where a camera has them, as software
+            cameras do.
 
     Attributes:
         path: path that was given.
     """
 
-    def __init__(self, path: str | Path, *, overwrite: bool = False) -> None:
+    def __init__(self, path: str | Path, *, overwrite: bool = False, pictures: bool = True) -> None:
         self.path: Path = check_path(path, "path", "recording")
+        self._pictures = check_flag(pictures, "pictures", "recording")
         self._overwrite = check_flag(overwrite, "overwrite", "recording")
         self._more = threading.Condition()
         self._items: list[Item | Description] = []
@@ -286,6 +289,11 @@ class Recorder(Observer):
     def on_result(self, result: Result) -> None:
         """Keep a result."""
         self._put(result, 4 * len(result.raw), "results")
+
+    def on_picture(self, result: Result, frame: Frame) -> None:
+        """Keep the picture that a result was made of, unless ``pictures`` says otherwise."""
+        if self._pictures:
+            self.add_picture(frame, camera=result.camera, result=result)
 
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Keep an error."""

@@ -171,16 +171,21 @@ class TeachSite(ThreadedSite):
         return found
 
     def learn(self, given: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
-        """Return the tools' settings, as texts, by which the good pictures are good.
+        """Return the tools' settings, as texts, by which the good pictures are good; and why.
 
         Raises:
             ConfigurationError: a tool or setting is wrong.
         """
         self.try_tools(given)
-        seen = [self._tried[number] for number in good if number in self._tried]
+        seen = {
+            f"{number}: {self.pictures[number].name}": self._tried[number]
+            for number in good
+            if number in self._tried
+        }
         if not seen:
             raise ConfigurationError("expected good pictures to learn from, got none")
-        return texts_of(learned(read_settings(given), seen))
+        lesson = learned(read_settings(given), seen)
+        return {"tools": texts_of(lesson.tools), "learned": lesson.remarks}
 
     def state(self) -> dict[str, Any]:
         """Return the beginning of the page, as values for JSON."""
@@ -282,8 +287,8 @@ async def _try(site: TeachSite, call: CallRequest) -> object:
     "POST", f"{API}/learn", body=LearnBody, sample=_SAMPLE.replace("}}}", '}}, "good": [1]}')
 )
 async def _learn(site: TeachSite, call: CallRequest) -> object:
-    """The tools with tolerances by which all of the good pictures are good."""
-    return {"tools": await site.work(site.learn, call.body.tools, call.body.good)}
+    """The tools with tolerances by which the good pictures are good, and what they follow from."""
+    return await site.work(site.learn, call.body.tools, call.body.good)
 
 
 @CALLS.add("POST", f"{API}/save", body=ToolsBody, sample=_SAMPLE)

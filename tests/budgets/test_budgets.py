@@ -40,6 +40,9 @@ FUZZED = {
     "scenario": "scenarios",
     "address": "",  # the program's own option
     "spec": "layouts",
+    "cell_file": "cell files",
+    "gs1": "GS1 elements",
+    "program_result": "containers: record",
 }
 """By target of the fuzzing: the row of the table."""
 

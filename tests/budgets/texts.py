@@ -26,6 +26,9 @@ from smartcam.frames._gige import description as _description
 from smartcam.frames._gige import expressions as _expressions
 from smartcam.frames._gige.features import GenicamFeatures
 from smartcam.frames._inside import entry_point, jpeg_header, read_bitmap
+from smartcam.inspection import load_cell
+from smartcam.inspection._read.gs1 import elements
+from smartcam.inspection._read.tool import MAX_TEXT_BYTES as MAX_CODE_BYTES
 from smartcam.interpreters import Context, Reader, resolve, run
 from smartcam.layout import Layout
 from smartcam.layout._inside import load, pack_texts
@@ -165,6 +168,39 @@ _FLEETS: dict[str, Make] = {
         "**/", "name: a\nrecord: {folder: x, cameras: ['", "!']}\n"
     ),
     "keys that are aliases": lambda size: f"x:\n{_laughs(size)}? [*a9]\n: 1\n",
+}
+_APPLICATIONS = "cameras:\n  c:\n    software:\n      frames: x\n      applications:\n"
+_CELL_FILES: dict[str, Make] = {
+    "cameras": fill_text(
+        "  c{}: {software: {frames: x, applications: {7: {present: {grey: [0, 9]}}}}}\n",
+        "cameras:\n",
+    ),
+    "cameras of a fleet": fill_text("  c{}: {url: bvs://h{}}\n", "cameras:\n"),
+    "applications": fill_text("        {}: {present: {grey: [0, 9]}}\n", _APPLICATIONS),
+    "wrong applications": fill_text("        {}: {no{}: 1}\n", _APPLICATIONS),
+    "applications that follow": lambda size: (
+        _APPLICATIONS
+        + "".join(
+            f"        {n}: {{name: n{n}, present: {{grey: [0, 9], follow: n{n + 1}}}}}\n"
+            for n in range(size // 60)
+        )
+    ),
+    "tools": fill_text("          present t{}: {grey: [0, 9]}\n", f"{_APPLICATIONS}        7:\n"),
+    "settings": fill_text("s{}: 1, ", f"{_APPLICATIONS}        7: {{read: {{", "}}\n"),
+    "corners of a region": fill_text(
+        "[{}, 1], ", f"{_APPLICATIONS}        7: {{read: {{region: [", "]}}\n"
+    ),
+    "a pattern": fill_text("(a+)", f"{_APPLICATIONS}        7: {{read: {{expect: '", "'}}\n"),
+    "repetitions in a pattern": fill_text(
+        "(", f"{_APPLICATIONS}        7: {{read: {{expect: '", "a+)+'}}\n"
+    ),
+}
+_ELEMENTS: dict[str, Make] = {
+    "elements of a length": fill_text("11250101"),
+    "elements with an end": fill_text("10A\x1d"),
+    "one element": fill_text("a", "10"),
+    "separators": fill_text("\x1d"),
+    "no numbers": fill_text("\u00b2"),
 }
 
 _JSON: dict[str, Make] = {
@@ -638,6 +674,24 @@ TEXTS: tuple[Parser, ...] = (
         size=2500,
         short=PAST_LOOKAHEAD,
         needs=("yaml",),
+    ),
+    Parser(
+        "cell files",
+        from_file(load_cell, "a.yaml"),
+        _CELL_FILES,
+        MAX_YAML_TEXT,
+        "layout._yamls.MAX_YAML_TEXT",
+        size=2500,
+        short=PAST_LOOKAHEAD,
+        needs=("yaml", "cv2", "zxingcpp"),
+    ),
+    Parser(
+        "GS1 elements",
+        elements,
+        _ELEMENTS,
+        MAX_CODE_BYTES,
+        "inspection._read.tool.MAX_TEXT_BYTES",
+        size=1000,
     ),
     Parser(
         "GenICam: descriptions",

@@ -198,6 +198,7 @@ def test_sheet_saved_and_loaded_is_the_same(tmp_path: Path) -> None:
     [
         ("matrix", [[0.0] * 3] * 3, "expected one that can be inverted"),
         ("covariance", [[0.0]] * 9, "expected 9 rows of 9"),
+        ("lens_covariance", [[1.0]], "lens_covariance: expected shape (9, 9)"),
         ("rms", -1.0, "rms: Input should be greater than or equal to 0"),
         ("target", {"kind": "moon"}, "expected a kind of"),
         ("plane", {}, "stored plane calibration"),
@@ -207,6 +208,25 @@ def test_sheet_from_data_that_are_none_is_refused(name: str, value: object, text
     data = json.loads(json.dumps(calibrate_sheet(seen(), touched(), camera=CAMERA).to_data()))
     with refused("SHAPE", text):
         SheetCalibration.from_data({**data, name: value})
+
+
+def test_errors_of_the_lens_are_in_those_that_are_predicted(tmp_path: Path) -> None:
+    covariance = np.diag([4.0, 4.0, 1.0, 1.0, 1e-6, 1e-6, 1e-8, 1e-8, 0.0])
+    view, plane = seen(sigma=0.01), touched(SIGMA)
+    alone = calibrate_sheet(view, plane, camera=CAMERA)
+    known = calibrate_sheet(view, plane, camera=CAMERA, lens_covariance=covariance)
+    assert len(known.lens_planes) == 8
+    assert (known.predicted_error(field()) > alone.predicted_error(field())).all()
+    known.save(tmp_path / "table.json")
+    loaded = SheetCalibration.load(tmp_path / "table.json")
+    assert np.array_equal(loaded.predicted_error(field()), known.predicted_error(field()))
+    older = alone.to_data()
+    del older["lens_covariance"]
+    assert SheetCalibration.from_data(older).lens_covariance is None
+    with refused("SHAPE", "lens_covariance: expected shape (0, 0)"):
+        calibrate_sheet(view, plane, lens_covariance=covariance)
+    with refused("NOT_FINITE", "lens_covariance"):
+        calibrate_sheet(view, plane, camera=CAMERA, lens_covariance=covariance * np.nan)
 
 
 def test_service_loads_copies_and_transforms_by_a_sheet(tmp_path: Path) -> None:

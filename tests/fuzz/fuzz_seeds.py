@@ -218,6 +218,42 @@ def _spec() -> Iterator[bytes]:
     yield from (text.encode() for text in (*SPECS, *layouts(), f"table: {LOCALIZATIONS}"))
 
 
+def _cell_file() -> Iterator[bytes]:
+    for text in re.findall(r"^```yaml\n(.*?)^```$", documents(), re.DOTALL | re.MULTILINE):
+        if "software:" in text or "present" in text or "measure" in text:
+            yield text.encode()
+            yield f"cameras: {{c: {{software: {{frames: x, {text}}}}}}}".encode()
+    yield from (text.encode() for text in ODD_YAML)
+    for tool in (
+        "present: {grey: [0, 90]}",
+        "read: {codes: [QRCode], expect: '[0-9]+'}",
+        "measure: {width: {across: [[1, 1], [9, 1]]}, tolerance: 9 +- 1 px}",
+        "measure: {circle: {centre: [30, 30], radius: 25}}",
+        "present: {grey: [0, 9]}, read two: {follow: present, region: [0, 0, 5, 9]}",
+        "read: {expect: '(a+)+'}",
+    ):
+        application = f"applications: {{7: {{{tool}}}}}"
+        yield f"cameras: {{c: {{software: {{frames: x, {application}}}}}}}".encode()
+
+
+def _gs1() -> Iterator[bytes]:
+    yield from (
+        b"0104012345678901",
+        b"\x1d010401234567890110AB\x1d21X",
+        b"3103001750",
+        b"8005",
+        b"",
+    )
+    yield from (b"10AB", b"10\x1d", b"xx", b"01040", "10\u00b2".encode(), b"00\x1d\x1d\xff")
+
+
+def _program_result() -> Iterator[bytes]:
+    for program in range(4):
+        for value in range(23):
+            yield bytes((program, 2, 0, value, value, value)) + b"a reason"
+        yield bytes((program, 0, 0)) + "\u00fc".encode() * 50 + b"\0\xff"
+
+
 _MAKERS: dict[str, Callable[[], Iterator[bytes]]] = {
     "framing": _framing,
     "messages": _messages,
@@ -230,4 +266,7 @@ _MAKERS: dict[str, Callable[[], Iterator[bytes]]] = {
     "layout_file": _layout_file,
     "address": _address,
     "spec": _spec,
+    "cell_file": _cell_file,
+    "gs1": _gs1,
+    "program_result": _program_result,
 }

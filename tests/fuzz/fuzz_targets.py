@@ -32,7 +32,7 @@ class Target(NamedTuple):
         max_length: bytes of an input at most.
         share: of ``--runs``, in proportion to the others: the fast ones get more.
         words: what its inputs are made of, for whoever changes them.
-        shares: ``texts`` where it stands with others in ``fuzz_texts``.
+        shares: ``texts`` where it stands with others in ``fuzz_texts``, as ``cells``.
     """
 
     name: str
@@ -152,6 +152,15 @@ _SPEC = _words(
     *("localizations", "strings50", "50ByteStrings", "Localizations", "record", "table", "raw"),
     *(": ", LocalizationsInterpreter.default_layout or "", "table: int32", "records: ("),
 )
+_CELL = _words(
+    *("cameras:\n  cam: ", "software: ", "frames: x", "applications: ", "calibration: c.json"),
+    *("{7: {", "name: a", "sequence: true", "rate: 5", "keep: {folder: k}", "drawn: false"),
+    *("read: ", "present: ", "compare: ", "measure: ", "present two: ", "follow: a", "region: "),
+    *("[0, 0, 9, 9]", "[[0, 0], [9, 0], [9, 9]]", "grey: [0, 90]", "codes: [QRCode]", "expect: "),
+    *("(a+)+", "[0-9]{12}", "width: {across: [[1, 1], [9, 1]]}", "tolerance: 9 +- 1 px", "most: 5"),
+    *("circle: {centre: [9, 9], radius: 5}", "line: {along: [[1, 1], [9, 1]]}", "guard: 0"),
+)
+_GS1 = _words("\x1d", "01", "10", "3103", "8005", "21", "00", "9", "04012345678901", "\u00b2")
 
 TARGETS = {
     target.name: target
@@ -167,6 +176,9 @@ TARGETS = {
         Target("layout_file", 256, 2, _LAYOUT + _YAML + _LAYOUT_FILE, shares="texts"),
         Target("address", 96, 22, _ADDRESS, shares="texts"),
         Target("spec", 128, 22, _SPEC + _LAYOUT, shares="texts"),
+        Target("cell_file", 512, 2, _CELL + _YAML, shares="cells"),
+        Target("gs1", 96, 22, _GS1, shares="cells"),
+        Target("program_result", 160, 6, _NUMBERS, shares="cells"),
     )
 }
 """Every target by name, in the order in which they run."""

@@ -89,6 +89,23 @@ async def test_results_are_typed_by_the_program_without_interpret_as(
         assert (found.ok, found.reason, found.level) == (False, "201 is too bright", 201)
 
 
+async def test_threads_take_turns_more_often_while_tools_are_at_work(
+    cell: Path, gate: Gate
+) -> None:
+    before = sys.getswitchinterval()
+    async with opened(cell) as camera:
+        for _ in range(20):  # what the interpreter cuts off does not add up
+            await triggered(camera)
+        assert sys.getswitchinterval() == pytest.approx(before, abs=3e-6)
+        await camera.switch_application(12)
+        trigger = asyncio.ensure_future(triggered(camera))
+        await until(lambda: gate.has(1))
+        assert sys.getswitchinterval() == pytest.approx(min(before, 0.001), abs=3e-6)
+        gate.open.set()
+        await trigger
+        assert sys.getswitchinterval() == pytest.approx(before, abs=3e-6)
+
+
 async def test_the_camera_runs_its_first_application_from_the_beginning(cell: Path) -> None:
     async with opened(cell) as camera:
         assert camera.active_application == 7

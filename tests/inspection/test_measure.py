@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +11,24 @@ import numpy as np
 import pytest
 
 import smartcam.inspection
-from smartcam.calibration import calibrate_sheet, fit_plane
+from smartcam.calibration import CameraModel, calibrate_sheet, fit_plane
 from smartcam.exceptions import ConfigurationError
+from smartcam.frames import Frame, Moment, find_format
 from smartcam.inspection import Inspection, Picture
 from smartcam.inspection._measure.edges import Edge
 from smartcam.inspection._measure.features import FoundPoint, FoundShape, strip_between
 from smartcam.inspection._measure.fits import Edges
-from smartcam.inspection._measure.planes import PIXELS, plane_of
+from smartcam.inspection._measure.planes import PIXELS, Plane, plane_of
 from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
 from smartcam.inspection._measure.values import (
+    Value,
     distance,
     line_of,
     point_of,
     width,
     with_calibration,
 )
-from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET
+from tests.calibration.sheetkit import CAMERA, SEEN, SIGMA, TARGET, truth
 from tests.calibration.test_sheet import seen, touched
 from tests.inspection.measurekit import HOLE, RADIUS, WIDE, plate, program
 
@@ -194,6 +197,82 @@ def test_colour_that_is_cut_off_is_told_unless_it_is_allowed(tmp_path: Path) -> 
     assert found.findings["measure"].details.trouble is None
 
 
+def limited(least: float, most: float, bits: int = 8, noise: float = 0.3) -> Any:
+    """Return a plate of so little noise that pixels of one level are nearly equal, in video range.
+
+    ``least``, ``most``: levels of 8 bits of the dark and the bright side, before they are cut off.
+    """
+    step = 2 ** (bits - 8)
+    levels = least + (most - least) * (
+        plate(noise=0.0, bits=16).astype(float) / 65535 - 45 / 255
+    ) / (150 / 255)
+    levels += np.random.default_rng(3).normal(0, noise, levels.shape)
+    kind = np.uint8 if bits == 8 else np.uint16
+    return np.rint(step * levels.clip(16, 235)).astype(kind)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(
+    ("least", "most", "end"),
+    [(-10, 200, "black"), (60, 260, "white"), (14, 180, "black"), (60, 200, ""), (17.5, 233, "")],
+)
+def test_levels_that_video_cuts_off_are_told(
+    tmp_path: Path, least: float, most: float, end: str, bits: int
+) -> None:
+    found = inspected(tmp_path, WIDTH, limited(least, most, bits))
+    details = found.findings["measure"].details
+    if end:
+        assert details.trouble is NoValueReason.SATURATED
+        assert f"{end} to the limit" in found.reason
+    else:
+        assert abs(details.value - WIDE) < 4 * details.sigma
+
+
+def test_one_colour_that_is_cut_off_is_told_in_every_kind_of_frame(tmp_path: Path) -> None:
+    red = np.minimum(1.6 * limited(20, 200), 255)
+    colours = np.stack([red, limited(20, 120), limited(20, 90)], axis=2).round().astype(np.uint8)
+    y, u, v = (
+        (colours.astype(float) @ one + offset).clip(0, 255).round()
+        for one, offset in (
+            ([0.299, 0.587, 0.114], 0.0),
+            ([-0.168736, -0.331264, 0.5], 128.0),
+            ([0.5, -0.418688, -0.081312], 128.0),
+        )
+    )
+    height, width = red.shape
+    pairs = np.stack([y[:, ::2], u[:, ::2], y[:, 1::2], v[:, ::2]], axis=2)
+    bayer = colours[:, :, 1].copy()
+    bayer[::2, ::2], bayer[1::2, 1::2] = colours[::2, ::2, 0], colours[1::2, 1::2, 2]
+    tool = program(tmp_path, WIDTH)
+    for name, wire, a_pixel in (
+        ("RGB8", colours, 3),
+        ("YCbCr422_8", pairs.astype(np.uint8), 2),
+        ("BayerRG8", bayer, 1),
+    ):
+        frame = Frame(
+            data=wire.tobytes(),
+            format=find_format(name),
+            width=width,
+            height=height,
+            stride=a_pixel * width,
+            captured=0.0,
+            utc=0.0,
+            moment=Moment.ARRIVAL,
+            sequence=1,
+            source="cam",
+        )
+        found = tool.inspect(frame)
+        assert found.findings["measure"].details.trouble is NoValueReason.SATURATED, name
+
+
+def test_colour_that_would_be_less_than_nothing_is_told(tmp_path: Path) -> None:
+    colours = np.stack([limited(20, 200), limited(20, 90), limited(20, 60)], axis=2)
+    assert inspected(tmp_path, WIDTH, colours).findings["measure"].details.trouble is None
+    colours[:, :, 2] = np.where(colours[:, :, 0] > 180, 0, colours[:, :, 2])
+    found = inspected(tmp_path, WIDTH, colours)
+    assert found.findings["measure"].details.trouble is NoValueReason.SATURATED
+
+
 def test_picture_of_another_size_is_told_rather_than_measured_elsewhere(tmp_path: Path) -> None:
     found = inspected(tmp_path, WIDTH, plate()[:100, :100])
     assert found.findings["measure"].details.trouble is NoValueReason.OUTSIDE
@@ -281,7 +360,7 @@ def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> Non
 def test_calibration_without_a_known_error_adds_none_and_says_so() -> None:
     found = fit_plane(GRID[[0, 2, 6]], tilted(GRID)[[0, 2, 6]], model="affine")
     assert found.touch_sigma is None
-    assert plane_of(found).unverified
+    assert plane_of(found).remark == "sigma is without the touches' error, which nothing tells"
 
 
 def test_line_that_a_lens_bends_is_straight_in_the_calibrated_plane() -> None:
@@ -303,12 +382,71 @@ def test_lengths_on_a_sheet_are_those_on_paper() -> None:
     calibration = calibrate_sheet(seen(sigma=0.05), touched(SIGMA), camera=CAMERA)
     flat = plane_of(calibration)
     pixels = CAMERA.project(TARGET.points[[0, 8]] @ SEEN.rotation.T + SEEN.translation)
-    strip = strip_between(pixels[0], pixels[1], 9.0)
-    sides = strip.length / 2 * np.array([-1, 1])
-    nothing = 1e-12 * np.eye(2)
-    pair = [FoundPoint(strip, Edge(s, nothing, 0, 1e-6, 99.0, 0.8, 0.0, 0.0)) for s in sides]
-    found = with_calibration(lambda one: distance(*(point_of(end, one) for end in pair)), flat)
+    found = ends_on_sheet(pixels, flat)
     assert abs(found.value - 200.0) < 4 * found.sigma < 2.0
+
+
+def ends_on_sheet(pixels: Any, plane: Plane) -> Value:
+    """Return the distance of two pixels, known exactly, in a plane."""
+    strip = strip_between(pixels[0], pixels[1], 9.0)
+    nothing = 1e-12 * np.eye(2)
+    ends = [
+        FoundPoint(strip, Edge(s * strip.length / 2, nothing, 0, 1e-6, 99.0, 0.8, 0.0, 0.0))
+        for s in (-1, 1)
+    ]
+    return with_calibration(lambda one: distance(*(point_of(end, one) for end in ends)), plane)
+
+
+def wrong_lens(off: Any) -> CameraModel:
+    """Return the camera with fx, fy, cx, cy and coefficients that are off by so much (9,)."""
+    shift = np.array([[off[0], 0.0, off[2]], [0.0, off[1], off[3]], [0.0, 0.0, 0.0]])
+    return replace(CAMERA, matrix=CAMERA.matrix + shift, distortion=CAMERA.distortion + off[4:])
+
+
+FAR, ACROSS_ALL = [[100.0, 100.0], [700.0, 500.0]], [[60.0, 300.0], [740.0, 300.0]]
+"""Pixels of two points on the sheet."""
+
+
+@pytest.mark.parametrize(
+    ("pixels", "number", "least", "most"),
+    [
+        (FAR, 12, 0.5, 2.0),
+        *(
+            pytest.param(one, 100, 0.8, 1.25, marks=[pytest.mark.long, pytest.mark.widest])
+            for one in (FAR, ACROSS_ALL)
+        ),
+    ],
+)
+def test_sigma_on_a_sheet_has_the_lens_error_in_it(
+    pixels: Any, number: int, least: float, most: float
+) -> None:
+    """Calibrations by lenses that are as wrong as their covariance says; chance does 7 % of 100."""
+    spread = np.array([1.5, 1.5, 1.0, 1.0, 3e-3, 5e-3, 1e-4, 1e-4, 0.0])
+    mixed = np.eye(9)
+    mixed[0, 1] = mixed[1, 0] = 0.9  # of the focal lengths
+    mixed[4, 5] = mixed[5, 4] = -0.8  # of k1 and k2
+    covariance = mixed * np.outer(spread, spread)
+    at = np.array(pixels)
+    true = 1e3 * float(np.linalg.norm(np.diff(truth(at), axis=0)))
+    errors, sigmas, without = [], [], []
+    for seed in range(number):
+        off = np.random.default_rng([seed, 7]).multivariate_normal(np.zeros(9), covariance)
+        calibration = calibrate_sheet(
+            seen(sigma=0.05, seed=seed),
+            replace(touched(1e-5, seed), touch_sigma=1e-5),
+            camera=wrong_lens(off),
+            lens_covariance=covariance,
+        )
+        found = ends_on_sheet(at, plane_of(calibration))
+        errors.append(found.value - true)
+        sigmas.append(found.sigma)
+        unknown = replace(calibration, lens_covariance=None)
+        if not seed:
+            without.append(ends_on_sheet(at, plane_of(unknown)).sigma)
+            assert "the lens' error" in plane_of(unknown).remark
+    observed = float(np.sqrt(np.mean(np.square(errors))))
+    assert least < float(np.sqrt(np.mean(np.square(sigmas)))) / observed < most
+    assert without[0] < 0.5 * observed
 
 
 def test_place_beyond_the_calibrated_plane_is_told() -> None:

@@ -1,12 +1,17 @@
-"""Tolerances: how they are written, and when a value is good."""
+"""Tolerances: how they are written, when a value is good, and how they are learned of pictures."""
 
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from smartcam.exceptions import ConfigurationError
+from smartcam.inspection import Finding
+from smartcam.inspection._learning import GOOD_SHARE, Lesson, learned
 from smartcam.inspection._measure.tolerances import Tolerance
 
 
@@ -76,3 +81,124 @@ def test_directions_are_compared_whatever_whole_turns_are_between_them() -> None
     assert back.complaint(math.nan, 0.01, 2.0)
     assert Tolerance.parse("-5 to 5 deg").complaint(-179.99, 0.01, 2.0)
     assert Tolerance.parse("180 +- 1 mm").complaint(-180.0, 0.01, 2.0)
+
+
+# ---------------------------------------------------------------------- learned ones
+
+SIGMA = 0.01
+
+
+def lesson(
+    values: list[float], before: str | None = None, *, unit: str = "px", **more: Any
+) -> Lesson:
+    """Return what good pictures with these measured values teach; NaN: an edge was not found."""
+    good: dict[str, Any] = {}
+    for number, value in enumerate(values, 1):
+        there = math.isfinite(value)
+        details = SimpleNamespace(value=value, sigma=SIGMA if there else math.nan, unit=unit)
+        found = Finding(ok=there, reason="" if there else "no edge: none", details=details)
+        good[f"part{number}.png"] = SimpleNamespace(findings={"measure": found})
+    settings = {"width": {}, **more, **({} if before is None else {"tolerance": before})}
+    return learned({"measure": settings}, good)
+
+
+def tolerance(found: Lesson) -> Tolerance:
+    return Tolerance.parse(found.tools["measure"]["tolerance"])
+
+
+def values_of(number: int, seed: int, mean: float = 92.4, spread: float = 0.05) -> list[float]:
+    given: list[float] = np.random.default_rng(seed).normal(mean, spread, number).tolist()
+    return given
+
+
+def test_good_values_are_inside_with_their_guard_and_the_words_say_what_of() -> None:
+    values = values_of(20, 1)
+    found = lesson(values)
+    limits = tolerance(found)
+    assert all(limits.complaint(one, SIGMA, 2.0) == "" for one in values)
+    assert limits.complaint(92.9, SIGMA, 2.0)
+    (remark,) = found.remarks
+    assert remark.startswith(f"measure: tolerance {limits.text}, from 20 pictures: mean 92.")
+    assert "standard deviation 0.0" in remark
+    assert "of which measuring makes 0.01 px" in remark
+    assert "Not learned from" not in remark
+
+
+@pytest.mark.parametrize("number", [5, 20, 100])
+def test_other_good_parts_are_inside_in_as_many_lessons_as_promised(number: int) -> None:
+    lessons, shares = 200, []
+    for seed in range(lessons):
+        found = lesson(values_of(number, seed, 0.0, 1.0), guard=0)
+        if "tolerance" not in found.tools["measure"]:
+            continue  # one of five was left out
+        limits = tolerance(found)
+        inside = [math.erf(one / math.sqrt(2)) / 2 for one in (limits.least, limits.most)]
+        shares.append(inside[1] - inside[0] >= GOOD_SHARE)
+    assert len(shares) >= 0.95 * lessons
+    assert sum(shares) >= 0.91 * len(shares)  # 95 % are promised, give or take 1.5 %
+
+
+def test_a_value_far_from_the_others_is_left_out_and_named() -> None:
+    values = [*values_of(12, 3), 99.0, math.nan]
+    found = lesson(values)
+    limits = tolerance(found)
+    assert limits.complaint(99.0, SIGMA, 2.0)
+    assert limits.most < 93
+    assert found.remarks[0].endswith(
+        "Not learned from: part14.png (no edge), part13.png (99 px is far from the others)."
+    )
+
+
+@pytest.mark.parametrize("values", [[92.4] * 4, [math.nan] * 9, [92.4, 92.5, 92.4, 92.6, 120.0]])
+def test_too_few_values_leave_the_tolerance_as_it_is(values: list[float]) -> None:
+    found = lesson(values, "90 to 95 px")
+    assert found.tools["measure"]["tolerance"] == "90 to 95 px"
+    assert "expected 5 good pictures with a value or more, got" in found.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("before", "form", "unit"),
+    [
+        ("at most 99 um", "at most ", " um"),
+        ("at least 0.1 cm", "at least ", " cm"),
+        ("11 to 12 inch", "", " inch"),
+        ("9 +- 1 px", "", " mm"),
+        (None, "", " mm"),
+    ],
+)
+def test_form_and_unit_stay_as_they_were_written(before: str | None, form: str, unit: str) -> None:
+    values = values_of(10, 4, 12.0, 0.02)
+    found = lesson(values, before, unit="mm")
+    limits = tolerance(found)
+    assert limits.text.startswith(form)
+    assert limits.text.endswith(unit)
+    assert (form == "") == math.isfinite(limits.most - limits.least)
+    assert all(limits.complaint(one, SIGMA, 2.0) == "" for one in values)
+
+
+def test_directions_on_both_sides_of_a_half_turn_are_near_each_other() -> None:
+    values = [179.9, -179.9, 179.95, -179.95, 180.0, -179.98]
+    limits = tolerance(lesson(values, unit="deg"))
+    assert limits.most - limits.least < 3
+    assert all(limits.complaint(one, SIGMA, 2.0) == "" for one in values)
+
+
+def test_pictures_that_are_all_the_same_get_the_room_that_measuring_needs() -> None:
+    limits = tolerance(lesson([92.4] * 6))
+    assert limits.complaint(92.4, SIGMA, 2.0) == ""
+    assert 0.02 < limits.most - 92.4 < 0.1
+
+
+def test_a_tool_that_was_not_asked_teaches_nothing() -> None:
+    good: Any = {
+        "a.png": SimpleNamespace(findings={"present": Finding(ok=False, reason="outside")}),
+        "b.png": SimpleNamespace(findings={"present": Finding(ok=True, values={"count": 2})}),
+    }
+    found = learned({"present": {}}, good)
+    assert found.tools == {"present": {"count": [2, 2]}}
+    assert found.remarks == [
+        "present: 2 spots in 1 picture; area stays as it is, as the result does not have all of "
+        "them (most). Not learned from: a.png (outside)."
+    ]
+    del good["b.png"]
+    assert learned({"present": {"count": 3}}, good).tools == {"present": {"count": 3}}

@@ -103,6 +103,40 @@ async def test_a_drawn_region_is_tried_learned_and_saved(page: Page, path: Path)
     assert f"region: {region}" in text
 
 
+async def test_a_way_is_drawn_and_a_measured_tolerance_is_learned(
+    page: Page, tmp_path: Path
+) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "cameras:\n  cam: {software: {frames: shots, applications: {\n"
+        "    8: {measure: {width: {strip: 12}}}}}} # plates\n".replace(
+            "{strip", "{across: [[9, 40], [29, 40]], strip"
+        )
+    )
+    rng, files = np.random.default_rng(1), []
+    for number in range(1, 8):
+        pixels = np.full((120, 320), 40.0)
+        pixels[:, 100 : 220 + 40 * (number == 7)] = 200
+        blurred = cv2.GaussianBlur(pixels, (0, 0), 1.0) + rng.normal(0, 2, pixels.shape)
+        files.append(tmp_path / f"plate{number}.png")
+        cv2.imwrite(str(files[-1]), blurred.clip(0, 255).astype(np.uint8))
+    async with opened(page, TeachSite(Teaching(path, "cam", 8), files)):
+        await see(page, "#rows tr[data-picture='1'] .bad", "no edge")
+        await drag(page, (0.15, 0.5), (0.9, 0.5))
+        await see(page, "#rows tr[data-picture='1']", "width 1")
+        assert "strip: 12" in await page.input_value("#set-width")
+        await page.click("#learn")
+        await see(page, "#learned li", "from 6 pictures: mean 1")
+        await see(page, "#learned li", "Not learned from: 7: plate7.png")
+        await see(page, "#rows tr[data-picture='7'] .bad", "is above")
+        await see(page, "#counts", "1 judged otherwise")
+        await page.click("#save")
+        await see(page, "#saved", "Saved in")
+    assert (await asyncio.to_thread(path.read_text)).endswith(" # plates\n")
+    tolerance = load_cell(path)["cam"].programs[8].steps[0].tool.settings.tolerance
+    assert 119 < tolerance.least < 120 < tolerance.most < 121
+
+
 async def test_a_wrong_setting_is_told_beside_it_and_nothing_is_saved(
     page: Page, path: Path
 ) -> None:

@@ -99,6 +99,8 @@ def test_what_others_wrote_meanwhile_stays(path: Path) -> None:
         ({"present": {"gray": [0, 9]}}, "present.gray: .*did you mean 'grey'"),
         ({"present": {"grey": [9, 0]}}, "present.grey"),
         ({"nothing_like_it": {}}, "nothing_like_it"),
+        ({"measure": {"width": {"acros": 3}}}, "measure.width.acros: .*did you mean 'across'"),
+        ({"measure": {"distance": {"first": {"lin": 3}}}}, "first.lin: .*did you mean 'line'"),
         ({}, "tool"),
     ],
 )
@@ -123,7 +125,10 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
     tools: dict[str, dict[str, Any]] = {"present": {"grey": [0, 120], "area": [1, 9999], "most": 4}}
     good = [spots(10, 10), spots(9, 11), spots(10, 11)]
     program = teaching.program(tools)
-    found = learned(tools, [program.inspect(one) for one in good])
+    found, remarks = learned(tools, {str(n): program.inspect(one) for n, one in enumerate(good)})
+    assert remarks == [
+        "present: 2 spots in 3 pictures, of 81 to 121 pixels; area has 20% more to both sides."
+    ]
     assert found["present"]["count"] == [2, 2]
     assert found["present"]["area"] == [64, 146]
     taught = teaching.program(found)
@@ -134,8 +139,8 @@ def test_tolerances_make_the_good_pictures_good_and_others_not(path: Path) -> No
 def test_tolerances_of_areas_that_nobody_knows_are_not_made_up(path: Path) -> None:
     tools = {"present": {"grey": [0, 120]}}  # only the largest is in the result
     program = Teaching(path, "cam", 7).program(tools)
-    found = learned(tools, [program.inspect(spots(10, 6))])
-    assert found == {"present": {"grey": [0, 120], "count": [2, 2]}}
+    found = learned(tools, {"one": program.inspect(spots(10, 6))})
+    assert found.tools == {"present": {"grey": [0, 120], "count": [2, 2]}}
 
 
 @pytest.mark.parametrize("value", [[1, 2], 3, 0.5, True, "a", r"\d{3}", {"hue": [1, 2]}, "12", ""])

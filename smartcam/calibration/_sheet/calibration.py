@@ -4,7 +4,9 @@
 
     view = find_target(image, target)
     plane = fit_corners(target, [0, 8, 45, 53], touches, touch_sigma=0.0002, tool_z=(0, 0, -1))
-    calibration = calibrate_sheet(view, plane, camera=camera)
+    calibration = calibrate_sheet(
+        view, plane, camera=lens.camera, lens_covariance=lens.covariance
+    )
     calibration.transform([[412.5, 300.0]])         # pixels, v down: metres of the robot
 
 The robot touches corners of the sheet, or its rays; the camera need not find what is touched.
@@ -22,17 +24,19 @@ from smartcam._arguments import check_flag
 from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
 from smartcam.calibration._homography import derivatives
+from smartcam.calibration._least_squares import independent_parts
+from smartcam.calibration._lens.bundle import lens_values, with_lens
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
 from smartcam.calibration._verdict import CalibrationVerdict, Judgement
 from smartcam.calibration._views import TargetView
 from smartcam.geometry import CameraModel, Code, Remark
-from smartcam.geometry._inside import Array
+from smartcam.geometry._inside import Array, check_finite
 from smartcam.models import Localization
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import ArrayLike
 
@@ -68,6 +72,8 @@ class SheetCalibration(storage.SavedCalibration):
         view: the target as the camera saw it.
         sheet: map from pixels to the sheet.
         plane: map from the sheet's metres to the robot.
+        lens_covariance: (4 + K, 4 + K), covariance of the lens' values, as
+            :attr:`IntrinsicCalibration.covariance` has it; None: not known, or there is no lens.
         rms: standard deviation of a coordinate of the view's points from the fit, pixels.
         camera_frame: name of the frame that localizations must come in; None for any.
         remarks: what one should know of the view.
@@ -77,6 +83,7 @@ class SheetCalibration(storage.SavedCalibration):
     kind: ClassVar[str] = KIND
     _called: ClassVar[str] = "sheet's calibration"
     _keys: ClassVar[storage.Keys] = {"sheet": "", "remarks": "warnings"}
+    _later: ClassVar[frozenset[str]] = frozenset({"lens_covariance"})
     _others: ClassVar[storage.Others] = {
         "target": (storage.StoredTarget, lambda one: one.view.target),
         "camera": (CameraModel | None, lambda one: one.sheet.camera),
@@ -88,6 +95,7 @@ class SheetCalibration(storage.SavedCalibration):
     sheet: SheetPlane
     plane: Annotated[PlaneCalibration, PLANE]
     rms: storage.NonNegative
+    lens_covariance: Annotated[Array, storage.matrix()] | None = None
     camera_frame: str | None = None
     remarks: storage.Remarks = ()
 
@@ -103,6 +111,10 @@ class SheetCalibration(storage.SavedCalibration):
             raise storage.refused(context["called"], text, matrix.tolist())
         found["sheet"] = SheetPlane(found["view"].size, matrix, covariance, found["camera"])
         return super()._read(found, context)
+
+    def _check(self, _found: Mapping[str, Any], called: str) -> None:
+        if self.lens_covariance is not None:
+            _check_lens(self.lens_covariance, self.camera, called)
 
     @property
     def camera(self) -> CameraModel | None:
@@ -151,6 +163,20 @@ class SheetCalibration(storage.SavedCalibration):
             y_down=self.y_down,
         )
         return chain.then(chain_of(self.plane))
+
+    @cached_property
+    def lens_planes(self) -> tuple[SheetPlane, ...]:
+        """The maps from pixels to the sheet by lenses that are one standard deviation off.
+
+        The lenses are off in independent ways, whose squares add up to ``lens_covariance``; where
+        the sheet lies is found anew by each, from the same view.
+        """
+        if self.camera is None or self.lens_covariance is None:
+            return ()
+        values, off = lens_values(self.camera), independent_parts(self.lens_covariance)
+        return tuple(
+            look_at_sheet(self.view, with_lens(self.camera, values + one)).plane for one in off
+        )
 
     def transform(self, pixels: ArrayLike) -> Array:
         """Map pixels to the points of the plane that they show, in the robot's space.
@@ -208,14 +234,15 @@ class SheetCalibration(storage.SavedCalibration):
         return self.plane.to_robot(self.sheet.solve(Poses.of(parts)).put(parts), tool_flip=flip)
 
     def covariance_at(self, pixels: ArrayLike) -> Array:
-        """Return the covariance of mapped pixels that the noise of view and touches causes.
+        """Return the covariance of mapped pixels that the noise of view, touches and lens causes.
 
         Args:
             pixels: (K, 2), v down.
 
         Returns:
-            (K, 3, 3), m^2, along the robot's axes. Errors of the lens are not in it, and the noise
-            of the camera when it sees the point comes on top.
+            (K, 3, 3), m^2, along the robot's axes. Errors of the lens are in it where
+            ``lens_covariance`` tells them; the noise of the camera when it sees the point comes on
+            top.
 
         Raises:
             CalibrationError: as :meth:`transform`; UNVERIFIED: nothing tells the touches' sigma.
@@ -223,7 +250,11 @@ class SheetCalibration(storage.SavedCalibration):
         flat = self.sheet.on_sheet(pixels)
         # to first order: D C D^T with the map's derivative D
         slopes = derivatives(self.plane.matrix, flat)
-        seen = slopes @ self.sheet.covariance_at(pixels) @ slopes.swapaxes(1, 2)
+        on_sheet = self.sheet.covariance_at(pixels)
+        for one in self.lens_planes:
+            off = one.on_sheet(pixels) - flat
+            on_sheet = on_sheet + off[:, :, None] * off[:, None, :]
+        seen = slopes @ on_sheet @ slopes.swapaxes(1, 2)
         covariance: Array = self.plane.covariance_at(flat) + seen
         return covariance
 
@@ -237,16 +268,25 @@ class SheetCalibration(storage.SavedCalibration):
         return error
 
 
+def _check_lens(covariance: Array, camera: CameraModel | None, called: str) -> None:
+    """Raise (SHAPE, NOT_FINITE) where a covariance is none of a lens' values."""
+    count = 0 if camera is None else 4 + len(camera.distortion)
+    storage.check_shape(covariance, (count, count), called, "lens_covariance")
+    check_finite(covariance, f"{called}: lens_covariance")
+
+
 @takes(
     view=of_class("TargetView"),
     plane=of_class("PlaneCalibration"),
     camera=or_none(of_class("CameraModel")),
+    lens_covariance=or_none(numbers),
 )
 def calibrate_sheet(
     view: TargetView,
     plane: PlaneCalibration,
     *,
     camera: CameraModel | None = None,
+    lens_covariance: ArrayLike | None = None,
     camera_frame: str | None = None,
 ) -> SheetCalibration:
     """Return the way from pixels to the robot.
@@ -256,12 +296,19 @@ def calibrate_sheet(
         plane: map from the sheet's metres to the robot: of :func:`fit_corners`, or of
             :func:`~smartcam.calibration.fit_touches` with the origin at (0, 0).
         camera: the lens, for images of the same size; None: a homography of the view's points.
+        lens_covariance: (4 + K, 4 + K), covariance of the lens' values, as
+            :attr:`IntrinsicCalibration.covariance` has it; None: not known. Predicted errors have
+            it in them.
         camera_frame: name of the frame that localizations must come in; None for any.
 
     Raises:
         CalibrationError: TOO_FEW, COLLINEAR, WRONG_SIZE, NOT_FINITE, POOR_FIT, MIRRORED: see
-            :func:`~smartcam.calibration._sheet.plane.look_at_sheet`.
+            :func:`~smartcam.calibration._sheet.plane.look_at_sheet`. SHAPE or NOT_FINITE: no such
+            covariance.
     """
+    if lens_covariance is not None:
+        lens_covariance = storage.as_array(lens_covariance)
+        _check_lens(lens_covariance, camera, "calibrate_sheet")
     found = look_at_sheet(view, camera)
     remarks: list[Remark] = []
     if camera is None:
@@ -283,6 +330,7 @@ def calibrate_sheet(
         view=view,
         sheet=found.plane,
         plane=plane,
+        lens_covariance=lens_covariance,
         rms=found.rms,
         camera_frame=camera_frame,
         remarks=tuple(remarks),

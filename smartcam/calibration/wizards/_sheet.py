@@ -45,6 +45,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from numpy.typing import ArrayLike
+
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration._targets import Target
     from smartcam.calibration.wizards._pictures import Pictures, TakePicture
@@ -63,6 +65,7 @@ def sheet_wizard(
     read_robot: ReadRobot | None = None,
     suggested: Target | None = None,
     camera: CameraModel | None = None,
+    lens_covariance: ArrayLike | None = None,
     connect: Mapping[str, Any] | None = None,
     awaited: str = "",
 ) -> Wizard:
@@ -83,6 +86,7 @@ def sheet_wizard(
         read_robot: reads the robot's pose; None: it is typed.
         suggested: the target that lies there, as the default of what is asked.
         camera: the lens, kept with each picture; None: a homography of what is seen.
+        lens_covariance: covariance of the lens' values, as :func:`calibrate_sheet` takes it.
         connect: what :func:`smartcam.connect` takes for the camera, ``url`` among it, for the lines
             that use the result; None: it cannot be asked.
         awaited: description, for people, of the picture that ``take_picture`` waits for, as
@@ -111,7 +115,7 @@ def sheet_wizard(
         source = _SheetSource(about, read_robot, target)
         # pixels count down, positions that are mapped count up
         source.connect = None if connect is None else {**connect, "y_down": True}
-        await source.ask_picture(taker(take_picture), camera, awaited)
+        await source.ask_picture(taker(take_picture), camera, lens_covariance, awaited)
         return await source.run(str(parameters.get("name", KIND)), save_to)
 
     return Wizard(name=KIND, version=1, script=script, steps=10)
@@ -133,16 +137,23 @@ class _SheetSource(PointSource):
         self._target = target
         self._view: TargetView
         self._camera: CameraModel | None = None
+        self._lens_covariance: list[list[float]] | None = None
         self._svg = ""
 
     async def ask_picture(
-        self, take_picture: TakePicture, lens: CameraModel | None, awaited: str
+        self,
+        take_picture: TakePicture,
+        lens: CameraModel | None,
+        lens_covariance: ArrayLike | None,
+        awaited: str,
     ) -> None:
         """Ask for the picture, and keep what was found in it."""
 
         async def look(_answers: Answers) -> dict[str, Any]:
             image = await take_picture()
-            return await asyncio.to_thread(_found, image, self._target, lens)
+            found = await asyncio.to_thread(_found, image, self._target, lens)
+            known = None if lens_covariance is None else np.asarray(lens_covariance).tolist()
+            return {**found, "lens_covariance": known}
 
         step = Step(
             id="picture",
@@ -157,6 +168,7 @@ class _SheetSource(PointSource):
         found = (await ask(step, look)).outcome
         self._view = TargetView.from_data(found["view"], target=self._target)
         self._camera = None if found["camera"] is None else CameraModel.from_data(found["camera"])
+        self._lens_covariance = found.get("lens_covariance")  # older journals have none
         self._svg = found["preview"]
 
     def shown(self, mark: Mark) -> dict[str, Any]:
@@ -260,14 +272,23 @@ class _SheetSource(PointSource):
 
     def outcome(self, plane: PlaneCalibration) -> Calibrated:
         frame = self.about["camera_frame"] or None
-        found = calibrate_sheet(self._view, plane, camera=self._camera, camera_frame=frame)
+        found = calibrate_sheet(
+            self._view,
+            plane,
+            camera=self._camera,
+            lens_covariance=self._lens_covariance,
+            camera_frame=frame,
+        )
         _, figures, lines, _ = calibrated_plane(plane)
         seen, predicted = len(self._view.ids), None
         notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
         if plane.touch_sigma is not None:
             errors = found.predicted_error(self._view.points)
             predicted = 1e3 * math.sqrt(float((errors**2).mean()))
-            unknown = "" if found.camera else "; what the lens distorts comes on top"
+            unknown = "; what the lens distorts comes on top"
+            if found.camera is not None:
+                known = found.lens_covariance is not None
+                unknown = "" if known else "; the lens' own error, which is not known, comes on top"
             notes.append(
                 f"predicted error from pixel to robot {predicted:.3f} mm rms where the target was "
                 f"seen{unknown}"

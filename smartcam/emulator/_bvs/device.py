@@ -162,6 +162,7 @@ class Device:
         self._mode = Mode.STOPPED
         self._events: dict[_Event, tuple[int, Callable[[], None]]] = {}
         self._session = False
+        self.sessions: int = 0
         self._owes_switch = False  # the session's
         self.last_report: LastReport | None = None
         self._output: list[m.Message] = []
@@ -293,6 +294,7 @@ class Device:
         Source: SC manual p. 28, 29 (published); that in ``bid`` no status comes: inferred.
         """
         self._session, self._owes_switch = True, False
+        self.sessions += 1
         self._enter(DeviceState.CONNECTED)
         self._output = [m.ConnectAnswer(version=PROTOCOL_VERSION)]
         self._reported = None

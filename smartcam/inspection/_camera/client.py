@@ -6,13 +6,16 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
+from smartcam._arguments import check_flag, check_kind
 from smartcam._finishing import finish
+from smartcam._suggestions import did_you_mean
 from smartcam.client import SmartCamera
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError, UnsupportedError
 from smartcam.inspection._camera.device import SoftwareDevice
+from smartcam.inspection._camera.pairing import MAX_KEPT, JudgedResults
 from smartcam.inspection._camera.pictures import png_of
 from smartcam.inspection._cell import load_cell
-from smartcam.models import Capabilities, ValueT
+from smartcam.models import Capabilities, Result, ValueT
 from smartcam.settings import SOFTWARE_SCHEME, Address, CameraSettings
 
 if TYPE_CHECKING:
@@ -53,7 +56,12 @@ class SoftwareCamera(SmartCamera[ValueT]):
         }
         emulator = self._device.emulator
         address = Address("bvs", "bvs", emulator.host, 1, emulator.dialect)
-        super().__init__(CameraSettings.of(address, given), observers=observers)
+        self._pairs = JudgedResults(
+            self._device.last_sent, lambda: self.statistics().received, self._tell_picture
+        )
+        self._device.eyes.viewers.add(self._pairs.take)
+        settings = CameraSettings.of(address, given)
+        super().__init__(settings, observers=[self._pairs, *observers])
 
     @property
     def capabilities(self) -> Capabilities:
@@ -70,6 +78,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return self._device.eyes.trouble
 
     async def open(self) -> Self:
+        self._pairs.begin()
         try:
             await self._device.start()
             self._go_to(self.settings.address._replace(port=self._device.emulator.port))
@@ -104,11 +113,48 @@ class SoftwareCamera(SmartCamera[ValueT]):
         limit = self._limit(timeout, self.settings.request_timeout)
         return await self._picture(limit, drawn=True)
 
+    async def read_judged_image(
+        self, result: Result[Any], *, drawn: bool = False, timeout: float | None = None
+    ) -> bytes:
+        """Return the picture that a result was made of, a PNG's bytes.
+
+        The pictures of the last 8 results are there. A recorder among the camera's observers keeps
+        them all.
+
+        Args:
+            result: result of this camera.
+            drawn: with the marks of the tools.
+            timeout: seconds; default the camera's ``request_timeout``.
+
+        Raises:
+            ConfigurationError: an argument is of another kind.
+            UnsupportedError: the result's picture is not known, or not any more.
+            ResponseTimeoutError: it was not made in time.
+
+        Cancellation: safe.
+        """
+        check_kind(result, Result, "result", "a Result", "read_judged_image")
+        drawn = check_flag(drawn, "drawn", "read_judged_image")
+        limit = self._limit(timeout, self.settings.request_timeout)
+        judged = self._pairs.judged_of(result)
+        if judged is None:
+            raise UnsupportedError(
+                f"{self.name}: the picture of result {result.number} is not here: expected one of "
+                f"the last {MAX_KEPT} results of this camera"
+            )
+        return await self._png(judged, limit, drawn=drawn)
+
+    def _tell_picture(self, result: Result[Any], judged: Judged) -> None:
+        self._observers.picture(result, judged.frame)
+
     async def _picture(self, timeout: float, *, drawn: bool) -> bytes:
         self._require_session()
         judged = self.judged
         if judged is None:
             raise UnsupportedError(f"{self.name}: no picture was judged yet: trigger first")
+        return await self._png(judged, timeout, drawn=drawn)
+
+    async def _png(self, judged: Judged, timeout: float, *, drawn: bool) -> bytes:
         try:
             async with asyncio.timeout(timeout):
                 return await asyncio.to_thread(png_of, judged, drawn=drawn)
@@ -137,5 +183,8 @@ def find_camera(url: str) -> CellCamera:
         return next(iter(cameras.values()))
     there = ", ".join(cameras)
     if mark:
-        raise ConfigurationError(f"{path} has no software camera {name!r:.80}; it has {there}")
+        raise ConfigurationError(
+            f"{path} has no software camera {name!r:.80}; it has {there}"
+            f"{did_you_mean(name, cameras)}"
+        )
     raise ConfigurationError(f"{path} has several software cameras: name one of {there} behind #")

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from smartcam import frames
+from smartcam._arguments import check_choice, check_kind, check_port
 from smartcam._server import Server
 from smartcam.emulator import EmulatedCamera, EmulatedInSight
 from smartcam.emulator._inside import InspectedApplication, InspectedJob, Inspector
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._camera.eyes import Eyes
 from smartcam.inspection._camera.keeper import PictureKeeper
+from smartcam.inspection._cell import CellCamera
 from smartcam.layout import Layout
 from smartcam.models import Status
 from smartcam.settings import validated
@@ -23,9 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from smartcam.emulator import WireCamera
-    from smartcam.emulator._inside import InspectionOrder, Values
+    from smartcam.emulator._inside import InspectionOrder, LastReport, Values
     from smartcam.frames import FrameSource
-    from smartcam.inspection._cell import CellCamera
     from smartcam.inspection._program import Program
 
 _log: Final = logging.getLogger("smartcam.inspection")
@@ -77,7 +79,11 @@ class SoftwareDevice(Server):
         quirks: dict[str, Any] | None = None,
         seed: int | None = None,
     ) -> None:
-        self.camera = camera
+        self.camera = check_kind(camera, CellCamera, "camera", "a CellCamera", "SoftwareDevice")
+        protocol = check_choice(protocol, "protocol", ("bvs", "insight"), "SoftwareDevice")
+        port = check_port(port, "SoftwareDevice")
+        if quirks is not None:
+            check_kind(quirks, Mapping, "quirks", "a mapping, or None", "SoftwareDevice")
         recorded = _RECORDED.match(camera.frames) is not None
         make = partial(source_of, camera.frames, recorded=recorded)
         make()  # what cannot work is told now
@@ -110,7 +116,7 @@ class SoftwareDevice(Server):
                 seed=seed or 0,
             )
             self.emulator.device.sight = self._sight
-        elif protocol == "bvs":
+        else:
             self.emulator = EmulatedCamera(
                 [self._application(program) for program in camera.programs.values()],
                 builtins=False,
@@ -122,10 +128,6 @@ class SoftwareDevice(Server):
                 name=camera.name,
                 quirks={"busy_while_processing": True, **(quirks or {})},
                 seed=seed,
-            )
-        else:
-            raise ConfigurationError(
-                f"{camera.name}: a software camera speaks bvs or insight, not {protocol!r:.60}"
             )
 
     def _application(self, program: Program) -> InspectedApplication:
@@ -167,6 +169,14 @@ class SoftwareDevice(Server):
     def interpret_as(self) -> dict[int, str]:
         """The layout of the results of each application."""
         return {number: one.interpret_as for number, one in self.camera.programs.items()}
+
+    def last_sent(self) -> tuple[int, LastReport | None]:
+        """Return the number of the session, 0 without one, and the last report of a run.
+
+        Of a BVS camera: others send no containers.
+        """
+        device = self.emulator.device
+        return (device.sessions if device.connected else 0), device.last_report
 
     async def start(self) -> None:
         """Open the source of the frames, then the port.

@@ -123,6 +123,7 @@ class EdgeSettings:
         smoothing: standard deviation of the Gaussian whose derivative finds edges, pixels.
         contrast: grey levels from one side of an edge to the other one at least.
         most_blur: pixels of blur that an edge may have.
+        black: least grey level that the picture can have.
         white: largest grey level that the picture can have.
         cut_off: whether edges beside levels that are cut off at black or white count.
         clipped: mask (H, W) of other pixels that are cut off, as of one colour; None: of none.
@@ -132,6 +133,7 @@ class EdgeSettings:
     smoothing: float = 1.2
     contrast: float = 10.0
     most_blur: float = 5.0
+    black: float = 0.0
     white: float = 255.0
     cut_off: bool = False
     clipped: NDArray[np.bool_] | None = field(default=None, repr=False, compare=False)
@@ -480,7 +482,7 @@ def _part(mask: NDArray[np.bool_], pixels: StripPixels) -> Array:
 
 def _cut_off(pixels: StripPixels, settings: EdgeSettings) -> Array:
     """Return the parts (N, 2) of the pixels that are black, and white, to the limit."""
-    black, white = pixels.levels <= 0, pixels.levels >= settings.white
+    black, white = pixels.levels <= settings.black, pixels.levels >= settings.white
     return np.column_stack([_part(black, pixels), _part(white, pixels)])
 
 

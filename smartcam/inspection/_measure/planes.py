@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from smartcam.calibration._inside import independent_parts
 from smartcam.exceptions import CalibrationError, ConfigurationError
 from smartcam.inspection._measure.fits import Edges
 from smartcam.inspection._measure.troubles import NotMeasuredError, NoValueReason
@@ -39,8 +40,8 @@ class Plane(NamedTuple):
     map: Callable[[Array], Array]
     # maps that are off by one standard deviation each, in independent ways
     variants: tuple[Callable[[Array], Array], ...] = ()
-    # True if nothing tells the errors of the map
-    unverified: bool = False
+    # for people, what of the map's errors nothing tells
+    remark: str = ""
 
     def points(self, pixels: Array) -> Array:
         """Return pixels (N, 2) in the plane; NotMeasuredError: it does not reach there."""
@@ -98,7 +99,10 @@ def plane_of(calibration: Any) -> Plane:
         variants = [
             dataclasses.replace(calibration, plane=one)
             for one in _plane_variants(calibration.plane)
-        ] + _view_variants(calibration)
+        ] + [
+            dataclasses.replace(calibration, sheet=one)
+            for one in (*_view_variants(calibration.sheet), *calibration.lens_planes)
+        ]
         return _with_variants(calibration, calibration.plane, variants)
     raise ConfigurationError(
         "measure: calibration: expected one of a plane, with or without a lens, as fit_plane and "
@@ -124,8 +128,16 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any]) -> Plane:
         "mm",
         mapped(calibration),
         tuple(mapped(one) for one in variants),
-        plane.touch_sigma is None,
+        _remark(calibration, plane),
     )
+
+
+def _remark(calibration: Any, plane: Any) -> str:
+    """Return the errors that sigma is without; "" where all are known."""
+    unknown = ["the touches' error"] if plane.touch_sigma is None else []
+    if calibration.kind == "sheet" and calibration.lens_covariance is None:
+        unknown.append("the lens' error" if calibration.camera else "the lens' distortion")
+    return f"sigma is without {' and '.join(unknown)}, which nothing tells" if unknown else ""
 
 
 def _plane_variants(plane: Any) -> list[Any]:
@@ -134,28 +146,12 @@ def _plane_variants(plane: Any) -> list[Any]:
     matrix = plane.place.inward(plane.matrix)
     return [
         dataclasses.replace(plane, matrix=plane.place.outward(matrix + part.reshape(4, 3)))
-        for part in _parts(plane.unit_covariance * plane.touch_sigma**2)
+        for part in independent_parts(plane.unit_covariance * plane.touch_sigma**2)
     ]
 
 
-def _view_variants(calibration: Any) -> list[Any]:
-    sheet = calibration.sheet
+def _view_variants(sheet: Any) -> list[Any]:
     return [
-        dataclasses.replace(
-            calibration,
-            sheet=type(sheet)(
-                sheet.size, sheet.matrix + part.reshape(3, 3), sheet.covariance, sheet.camera
-            ),
-        )
-        for part in _parts(sheet.covariance)
+        type(sheet)(sheet.size, sheet.matrix + part.reshape(3, 3), sheet.covariance, sheet.camera)
+        for part in independent_parts(sheet.covariance)
     ]
-
-
-def _parts(covariance: Array) -> Array:
-    """Return independent vectors (K, M) of one standard deviation, whose squares add up to it."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    scale[scale == 0.0] = 1.0
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 1e-12 * values.max(initial=0.0)
-    parts: Array = (vectors[:, kept] * np.sqrt(values[kept])).T * scale
-    return parts

@@ -78,6 +78,11 @@ class Tolerance(NamedTuple):
         name, factor = UNITS[unit]
         return cls(least * factor, most * factor, name, plain)
 
+    @property
+    def written_unit(self) -> str:
+        """The unit that the text has, one of :data:`UNITS`."""
+        return self.text[len(self.text.rstrip(_LETTERS)) :]
+
     def complaint(self, value: float, sigma: float, guard: float) -> str:
         """Return why a value is not good; "" where it is.
 

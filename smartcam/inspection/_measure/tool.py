@@ -65,9 +65,6 @@ if TYPE_CHECKING:
 CIRCLE_CORNERS: Final = 72
 """Corners of the polygon that a circle is drawn as."""
 
-NO_ERROR_KNOWN: Final = "sigma is without the calibration's own error, which nothing tells"
-"""Remark on values by a calibration whose touches had no known error."""
-
 METRES: Final = {"mm": 1e-3, "px": 1.0, "deg": math.pi / 180}
 """SI units of the units that people see; pixels stay pixels."""
 
@@ -177,7 +174,8 @@ class _EdgeFinder:
         self.plane = plane
         self.reference = view.reference
         self._image = view.picture.levels
-        self._white = float(2**view.picture.depth - 1)
+        self._top = 2**view.picture.depth - 1
+        self._ends = view.picture.ends
         self._clipped = view.picture.clipped
         self._regions: list[Array] = []  # corners
         self._edges: list[Array] = []
@@ -193,9 +191,10 @@ class _EdgeFinder:
         return EdgeSettings(
             polarity=search.polarity,
             smoothing=search.smoothing,
-            contrast=search.contrast * self._white / 255,
+            contrast=search.contrast * self._top / 255,
             most_blur=search.blur,
-            white=self._white,
+            black=float(self._ends[0]),
+            white=float(self._ends[1]),
             cut_off=search.cut_off,
             clipped=self._clipped,
         )
@@ -285,7 +284,7 @@ class _EdgeFinder:
             edges=np.concatenate(self._edges or none),
             left_out=np.concatenate(self._left_out or none),
             missed=tuple(self._missed),
-            remark=NO_ERROR_KNOWN if self.plane.unverified else "",
+            remark=self.plane.remark,
         )
 
     def drawn(self, text: str, *, wrong: bool) -> list[Drawing]:

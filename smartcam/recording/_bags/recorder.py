@@ -15,6 +15,8 @@ from smartcam.ros2 import RosTypes
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from smartcam.frames import Frame
+    from smartcam.models import Result
     from smartcam.observers import TraceEntry
     from smartcam.recording._mcap.form import Item
 
@@ -60,6 +62,9 @@ class BagRecorder(Recorder):
         """Keep a container for the case that it cannot be read."""
         if entry.message == "ResultContainer":
             self._put(entry, len(entry.hex))
+
+    def on_picture(self, result: Result, frame: Frame) -> None:
+        """Keep none: a bag has no pictures."""
 
     @property
     def bag_counts(self) -> BagCounts:

@@ -83,25 +83,58 @@ $("canvas").addEventListener("pointerdown", (event) => {
   event.preventDefault();
 });
 $("canvas").addEventListener("pointermove", (event) => {
-  if (corner) outline(box(place(event)));
+  if (corner) outline(place(event));
 });
 $("canvas").addEventListener("pointerup", (event) => {
   if (!corner) return;
-  const wanted = box(place(event));
-  corner = null;
-  $("drawn").setAttribute("hidden", "");
-  if (wanted[2] >= 2 && wanted[3] >= 2) set("region", `[${wanted.join(", ")}]`);
+  const end = place(event);
+  const [wanted, begin] = [box(end), corner];
+  hideOutline();
+  if (measured()) {
+    if (Math.hypot(end[0] - begin[0], end[1] - begin[1]) >= 2) setWay(begin, end);
+  } else if (wanted[2] >= 2 && wanted[3] >= 2) set("region", `[${wanted.join(", ")}]`);
 });
-$("canvas").addEventListener("pointercancel", () => {
-  corner = null;
-  $("drawn").setAttribute("hidden", "");
-});
+$("canvas").addEventListener("pointercancel", hideOutline);
 
 const box = ([x, y]) => [Math.min(x, corner[0]), Math.min(y, corner[1]), Math.abs(x - corner[0]), Math.abs(y - corner[1])];
 
-function outline([x, y, width, height]) {
-  $("drawn").removeAttribute("hidden");
-  for (const [name, value] of Object.entries({ x: x - 0.5, y: y - 0.5, width, height })) $("drawn").setAttribute(name, value);
+function outline(end) {
+  const [x, y, width, height] = box(end);
+  const shape = measured() ? $("drawn-way") : $("drawn");
+  const values = measured() ? { x1: corner[0], y1: corner[1], x2: end[0], y2: end[1] } : { x: x - 0.5, y: y - 0.5, width, height };
+  shape.removeAttribute("hidden");
+  for (const [name, value] of Object.entries(values)) shape.setAttribute(name, value);
+}
+
+function hideOutline() {
+  corner = null;
+  for (const id of ["drawn", "drawn-way"]) $(id).setAttribute("hidden", "");
+}
+
+// Measurements have no region: a drag is the way of their strip, along their line, or from the
+// centre of their circle to its rim. Those of two things are written by hand.
+const pair = (begin, end) => `[[${begin.join(", ")}], [${end.join(", ")}]]`;
+const WAYS = {
+  width: (begin, end) => ({ across: pair(begin, end) }),
+  edge: (begin, end) => ({ across: pair(begin, end) }),
+  line: (begin, end) => ({ along: pair(begin, end) }),
+  circle: (begin, end) => ({ centre: `[${begin.join(", ")}]`, radius: String(Math.round(Math.hypot(end[0] - begin[0], end[1] - begin[1]))) }),
+};
+const VALUE = String.raw`(\[\s*\[[^\]]*\]\s*,\s*\[[^\]]*\]\s*\]|\[[^\]]*\]|[-+.\d]+)`;
+
+const measured = () => kindOf(current) === "measure";
+
+function setWay(begin, end) {
+  const given = Object.keys(tools[current]).filter((name) => tools[current][name].trim());
+  if (given.includes("distance") || given.includes("angle")) return setText("problem", "A distance or an angle has two things: write them by hand.");
+  const name = Object.keys(WAYS).find((one) => given.includes(one)) ?? "width";
+  let text = tools[current][name] ?? "";
+  for (const [key, value] of Object.entries(WAYS[name](begin, end))) {
+    const there = new RegExp(String.raw`\b${key}:\s*${VALUE}`);
+    if (there.test(text)) text = text.replace(there, `${key}: ${value}`);
+    else text = text.trim() ? text.replace(/^\s*\{/, `{${key}: ${value}, `) : `{${key}: ${value}}`;
+  }
+  set(name, text);
 }
 
 // ---------------------------------------------------------------------- the tools
@@ -113,7 +146,8 @@ function listTools() {
   if (!(current in tools)) current = Object.keys(tools)[0] ?? "";
   $("tool").value = current;
   $("remove").disabled = !current;
-  $("whole").disabled = !current;
+  $("whole").disabled = !current || measured();
+  setText("how", measured() ? "Drag in the picture across the two edges of a width or over one edge, along a line, or from a circle's centre to its rim: whichever has a setting; without one, a width." : "Drag in the picture to draw the region in which the tool looks.");
   const fields = state.kinds[kindOf(current)] ?? {};
   $("settings").replaceChildren(...Object.entries(fields).map(([name, about]) => {
     const input = make("input", { id: `set-${name}`, name, value: tools[current][name] ?? "", spellcheck: false });
@@ -232,7 +266,9 @@ function count() {
 $("learn").addEventListener("click", async () => {
   try {
     const good = state.pictures.map(({ number }) => number).filter((number) => !bad.has(number));
-    ({ tools } = await (await call("/api/learn", { tools, good })).json());
+    const answer = await (await call("/api/learn", { tools, good })).json();
+    tools = answer.tools;
+    $("learned").replaceChildren(...answer.learned.map((text) => make("li", { textContent: text })));
     setText("problem", "");
     listTools();
     changed();
