@@ -11,7 +11,7 @@ from asyncua.common.instantiate_util import instantiate
 
 from smartcam.outlets._opcua.book import KeptResult
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, VISION, Transition, node_ids, state_ids
-from smartcam.outlets._opcua.values import MAX_FIELDS, plain, type_of
+from smartcam.outlets._opcua.values import MAX_FIELDS, TYPES, plain, type_of
 from smartcam.outlets._records import records_of
 
 if TYPE_CHECKING:
@@ -151,14 +151,10 @@ class CameraNodes:
         """Add an optional method to an instance: its type has a node to copy from."""
         of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
         pattern = await of.get_child(f"{self._vision}:{method}")
-        arguments = [
-            await (await pattern.get_child(f"0:{name}")).read_value()
-            for name in ("InputArguments", "OutputArguments")
-            if any(
-                (await one.read_browse_name()).Name == name for one in await pattern.get_properties()
-            )
-        ]
-        inputs, outputs = arguments if len(arguments) == 2 else ([], *arguments)
+        found: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
+        for one in await pattern.get_properties():
+            found[(await one.read_browse_name()).Name] = await one.read_value()
+        inputs, outputs = found["InputArguments"], found["OutputArguments"]
         name = ua.QualifiedName(method, self._vision)
         await self._node(path).add_method(
             self.id(f"{path}.{method}"), name, _nothing, inputs, outputs
@@ -252,7 +248,7 @@ class CameraNodes:
         await self._events.emit(kind, self.root, self.name, message, fields)
 
     async def _write(self, path: str, value: ua.Variant, status: int = 0) -> None:
-        told = ua.DataValue(value, StatusCode_=ua.StatusCode(status), SourceTimestamp=_now())
+        told = ua.DataValue(value, StatusCode=ua.StatusCode(status), SourceTimestamp=_now())
         node = self.id(path)
         (await self._server.iserver.aspace.write_attribute_value(
             node, ua.AttributeIds.Value, told
@@ -349,7 +345,7 @@ class CameraNodes:
             made = await node.add_variable(
                 self.id(f"Plain.{folder}.{name}"),
                 ua.QualifiedName(name, self._own),
-                None,
+                plain(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
                 varianttype=type_of(kind),
                 datatype=ua.NodeId(type_of(kind).value),
             )
@@ -360,6 +356,7 @@ class CameraNodes:
         self._columns[folder] = tuple(columns)
 
 
+_ZEROS: Mapping[str, Any] = {"bool": False, "real32": 0.0, "real64": 0.0}
 _CHANGES = ("StateChangedEventType", "ErrorEventType", "ErrorResolvedEventType")
 
 

@@ -43,8 +43,13 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         load("asyncua")
         from smartcam.outlets._opcua.server import VisionServer
 
-        self._server = server = VisionServer(self.name, self.settings, self.folder, self.desk)
-        await server.start()
+        server = VisionServer(self.name, self.settings, self.folder, self.desk)
+        try:
+            await server.start()
+        except BaseException:
+            await server.stop()
+            raise
+        self._server = server
         for camera, state in self._states.items():
             server.state_changed(camera, state)
 

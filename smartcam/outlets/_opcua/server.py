@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import logging
 import secrets
 from typing import TYPE_CHECKING, Any
 
 from asyncua import Server, ua
 
-from smartcam.exceptions import ConfigurationError
+from smartcam._user_code import text_of
+from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.outlets._opcua.book import ResultBook
 from smartcam.outlets._opcua.events import Events
 from smartcam.outlets._opcua.files import TransferFiles
@@ -31,7 +33,9 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.jobs import Job, VisionResult
     from smartcam.outlets._opcua.nodeset import Transition
     from smartcam.outlets._opcua.settings import OpcUaSettings
-    from smartcam.outlets._outlet import OutletDesk
+    from smartcam.outlets._outlet import Column, OutletDesk
+
+logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
 MAX_CAMERAS = 1_000
 """Cameras of one server."""
@@ -61,7 +65,8 @@ class VisionServer:
         self._states: dict[str, Mapping[str, Any]] = {}
         self._making: dict[str, asyncio.Task[None]] = {}
         self._run_id, self._jobs = secrets.token_hex(4), itertools.count(1)
-        self._listens = False
+        self.server: Any = None
+        self.files: TransferFiles | None = None
 
     async def start(self) -> None:
         """Listen.
@@ -85,22 +90,24 @@ class VisionServer:
         self.events = Events(server, vision)
         self.files = TransferFiles(server, own)
         self.outbox.start()
-        for name in itertools.islice(self.desk.cameras(), MAX_CAMERAS):
+        chosen = filter(self.settings.chooses, self.desk.cameras())
+        for name in itertools.islice(chosen, MAX_CAMERAS):
             await self._make(name)
         await server.start()
-        self._listens = True
 
     async def stop(self) -> None:
-        """End jobs, and stop listening."""
-        for task in self._making.values():
+        """End jobs, and stop listening; whatever fails, the port is free afterwards."""
+        for task in [*self._making.values()]:
             task.cancel()
-        for camera in self.cameras.values():
-            await camera.system.close()
-        await self.outbox.stop()
-        self.files.close()
-        if self._listens:
-            self._listens = False
-            await self.server.stop()
+        server, self.server = self.server, None
+        async with contextlib.AsyncExitStack() as stack:
+            if server is not None:
+                stack.push_async_callback(server.stop)
+            if self.files is not None:
+                stack.callback(self.files.close)
+            stack.push_async_callback(self.outbox.stop)
+            for camera in self.cameras.values():
+                stack.push_async_callback(camera.system.close)
 
     async def failed(self) -> None:
         """Wait until nothing can be published any more, and raise the reason."""
@@ -122,7 +129,12 @@ class VisionServer:
         if camera not in self._making and len(self.cameras) < MAX_CAMERAS:
             task = asyncio.get_running_loop().create_task(self._make(camera))
             self._making[camera] = task
-            task.add_done_callback(lambda _: self._making.pop(camera, None))
+            task.add_done_callback(lambda done: self._made(camera, done))
+
+    def _made(self, camera: str, done: asyncio.Task[None]) -> None:
+        self._making.pop(camera, None)
+        if not done.cancelled() and (error := done.exception()) is not None:
+            logger.error("outlet %s: camera %s: %s", self.name, camera, text_of(error))
 
     async def publish(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries, and return when clients can see them."""
@@ -181,7 +193,8 @@ class CameraFace:
         await self.nodes.make(self.system.states)
         for path, method in self._methods.table().items():
             await self._link(path, method)
-        await self._server.files.link(self.nodes, self._server.book)
+        if self._server.files is not None:
+            await self._server.files.link(self.nodes, self._server.book)
 
     async def _link(self, path: str, method: Method) -> None:
         node = self._server.server.get_node(self.nodes.id(path))
@@ -215,11 +228,17 @@ class CameraFace:
     def result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
         recipe = self.system.recipe_name(result.application)
-        application = result.application
-        columns = (
-            () if application is None else self._server.desk.columns(result.camera, application)
-        )
-        self.nodes.result(result, recipe, columns, self._server.book.add)
+        self.nodes.result(result, recipe, self._columns(result), self._server.book.add)
+
+    def _columns(self, result: VisionResult) -> Sequence[Column]:
+        """Return what the layout says of a result's values; nothing where it cannot be read."""
+        if result.application is None:
+            return ()
+        try:
+            return self._server.desk.columns(result.camera, result.application)
+        except SmartCamError as exc:
+            self.message(f"application {result.application}: {exc}", type(exc).__name__, None)
+            return ()
 
     def message(self, text: str, kind: str, job: Job | None) -> None:
         """Raise an event with a text."""

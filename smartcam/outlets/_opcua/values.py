@@ -120,12 +120,16 @@ class Values:
     def __init__(self, server: Any, machine_vision: int, own: int) -> None:
         self._server, self._vision, self._own = server, machine_vision, own
         self._structures: dict[tuple[str, int, tuple[Column, ...]], Structure] = {}
-        base: Any = ua.BinaryIdBaseDataType
+        base: Any = getattr(ua, "BinaryIdBaseDataType")  # noqa: B009 - made from the nodeset
+        self._classes: dict[str, Any] = {
+            name: getattr(ua, name) for name in node_ids() if hasattr(ua, name)
+        }
         for name, encoding in _BINARY_IDS.items():
             made = dataclasses.make_dataclass(name, [], bases=(base,))
-            of = ua.NodeId(node_ids()[name], machine_vision)
-            ua.register_extension_object(name, ua.NodeId(encoding, machine_vision), made, of)
-        self._classes = {name: getattr(ua, name) for name in node_ids() if hasattr(ua, name)}
+            of = ua.NodeId(encoding, machine_vision)
+            ua.extension_objects_by_typeid[of] = made
+            ua.typeid_by_extension_objects[made] = of
+            self._classes[name] = made
 
     def identity(self, kind: str, text: str) -> Any:
         """Return an id of a type such as ``JobIdDataType``."""
