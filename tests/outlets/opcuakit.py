@@ -44,17 +44,20 @@ class Cell(NamedTuple):
 
 @contextlib.asynccontextmanager
 async def cell(
-    folder: Path, emulator: Mapping[str, Any] | None = None, **more: Any
+    folder: Path,
+    emulator: Mapping[str, Any] | None = None,
+    specs: Mapping[int, str] | None = None,
+    **more: Any,
 ) -> AsyncIterator[Cell]:
     """Have an emulated camera, its client and an outlet, as ``smartcam outlet`` has them."""
     url = f"opc.tcp://127.0.0.1:{free_port()}"
     given = {"listen": url, "anonymous": "control", "unencrypted": True, **more}
     given = {name: one for name, one in given.items() if one is not None}
     made = {"running": True, "active": 7, **(emulator or {})}
-    specs = {7: "localizations", 1: LAYOUT}
+    read = dict(specs or {7: "localizations", 1: LAYOUT})
     done: list[tuple[str, Mapping[str, Any]]] = []
     async with EmulatedCamera(**made) as device:
-        camera = smartcam.connect(device.url, interpret_as=specs, name="line1/cam1", reconnect=Backoff())
+        camera = smartcam.connect(device.url, interpret_as=read, name="line1/cam1", reconnect=Backoff())
         results, events = camera.results(max_queue=10_000), camera.events()
 
         async def command(name: str, verb: str, fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -67,7 +70,7 @@ async def cell(
             {"opcua": given},
             folder,
             columns=lambda _camera, number: columns_of(
-                Interpretation(specs, lenient=False, y_down=False).interpreter(number)
+                Interpretation(read, lenient=False, y_down=False).interpreter(number)
             ),
             command=command,
             cameras=lambda: {"line1/cam1": True},
@@ -80,7 +83,7 @@ async def cell(
             try:
                 async with camera:
                     pump = outlets._pumps["opcua"]
-                    await until(lambda: bool(pump.trouble or pump.outlet._server))
+                    await until(lambda: bool(pump.trouble or pump.outlet._open))
                     assert not pump.trouble, pump.trouble
                     yield Cell(url, outlets, camera, device, done)
             finally:

@@ -166,7 +166,7 @@ class Methods:
     # ------------------------------------------------------------------ states and jobs
 
     def _changes(self, name: str, target: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
-        async def change(_cause: int, why: str) -> list[ua.Variant]:
+        async def change(_cause: int = 0, why: str = "") -> list[ua.Variant]:
             self._system.change(name, target, why)
             return []
 

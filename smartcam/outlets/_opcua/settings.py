@@ -31,6 +31,9 @@ def _endpoint(text: str) -> str:
 class OpcUaSettings(OutletSettings):
     """The settings of a server of OPC UA."""
 
+    timeout: float = Field(
+        120.0, gt=0, le=3600, description="seconds within which the server listens"
+    )
     listen: Annotated[str, AfterValidator(_endpoint)] = Field(
         description="opc.tcp://HOST:PORT; 0.0.0.0 for all of this computer's addresses"
     )
