@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import AsyncIterator, Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -93,9 +94,16 @@ async def cell(
 
 
 async def _results(results: Any, outlets: Outlets) -> None:
-    with contextlib.suppress(SmartCamError):
-        async for result in results:
-            outlets.offer_result(result)
+    while True:
+        try:
+            outlets.offer_result(await anext(results))
+        except StopAsyncIteration:
+            return
+        except SmartCamError as exc:
+            at, kind = datetime.now(UTC), type(exc).__name__
+            outlets.offer_error("line1/cam1", at, str(exc), kind)
+            if results.ended:
+                return
 
 
 async def _events(events: Any, outlets: Outlets) -> None:

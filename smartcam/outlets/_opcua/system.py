@@ -275,7 +275,7 @@ class VisionSystem:
             raise UnknownRecipeError(f"{recipe!r:.80} is not ready: prepare it first")
         self.job = job = Job(self._new_job(), single, *ids, self.prepared)
         self._move("SingleExecution" if single else "ContinuousExecution", method, job=job)
-        job.task = self._spawn(self._single(job) if single else self._continuous(job))
+        job.task = self._spawn(lambda: self._single(job) if single else self._continuous(job))
         return job
 
     def end_job(self, method: str, why: str = "") -> None:
@@ -295,15 +295,15 @@ class VisionSystem:
 
     # ------------------------------------------------------------------ jobs
 
-    def _spawn(self, work: Any) -> asyncio.Task[None]:
+    def _spawn(self, work: Callable[[], Awaitable[None]]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(self._guarded(work))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
 
-    async def _guarded(self, work: Awaitable[None]) -> None:
+    async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
         try:
-            await work
+            await work()
         except asyncio.CancelledError:
             raise
         except ENDS_PROGRAM:
@@ -385,7 +385,7 @@ class VisionSystem:
         if not job.single:
             self._last_continuous = job
             self._stopped = True
-            self._spawn(self._stop_camera())
+            self._spawn(self._stop_camera)
         if not job.seen.is_set() and (job.single or state == FAILED):
             job.seen.set()
             at = datetime.now(UTC)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import struct
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from asyncua import ua
-from asyncua.common.structures104 import new_struct, new_struct_field
+from asyncua.common.manage_nodes import create_data_type, create_encoding
+from asyncua.common.structures104 import new_struct_field
 from asyncua.ua.ua_binary import Primitives
 
 from smartcam.outlets._opcua.nodeset import node_ids
@@ -197,16 +199,35 @@ class Values:
         key = result.camera, result.application, tuple(columns[:MAX_FIELDS])
         known = self._structures.get(key)
         if known is None and len(self._structures) < MAX_STRUCTURES:
-            version = sum(one[:2] == key[:2] for one in self._structures)
-            name = f"{result.camera}.App{result.application}" + (f"v{version + 1}" * bool(version))
-            fields = [
-                new_struct_field(name, type_of(kind), description=unit) for name, kind, unit in key[2]
-            ]
-            _, (encoding,) = await new_struct(
-                self._server,
-                ua.NodeId(f"types.{name}", self._own),
-                ua.QualifiedName(name, self._own),
-                fields,
-            )
-            known = self._structures[key] = Structure(encoding.nodeid, key[2])
+            known = self._structures[key] = await self._make_structure(*key)
         return known
+
+    async def _make_structure(
+        self, camera: str, application: int, columns: tuple[Column, ...]
+    ) -> Structure:
+        """Make the nodes of a structure; their ids say which fields it has.
+
+        A client that knows a structure from before never reads another one by it.
+        """
+        versions = sum(one[:2] == (camera, application) for one in self._structures)
+        name = f"{camera}.App{application}" + f"v{versions + 1}" * bool(versions)
+        digest = hashlib.sha256(repr(columns).encode()).hexdigest()[:16]
+        key = f"types.{camera}.App{application}.{digest}"
+        node = await create_data_type(
+            self._server.nodes.base_structure_type,
+            ua.NodeId(key, self._own),
+            ua.QualifiedName(name, self._own),
+        )
+        encoding = await create_encoding(
+            node, ua.NodeId(f"{key}.Binary", self._own), ua.QualifiedName("Default Binary", 0)
+        )
+        definition = ua.StructureDefinition()
+        definition.BaseDataType = self._server.nodes.base_structure_type.nodeid
+        definition.StructureType = ua.StructureType.Structure
+        definition.DefaultEncodingId = encoding.nodeid
+        definition.Fields = [
+            new_struct_field(field, type_of(kind), description=unit)
+            for field, kind, unit in columns
+        ]
+        await node.write_data_type_definition(definition)
+        return Structure(encoding.nodeid, columns)
