@@ -58,7 +58,9 @@ async def cell(
     read = dict(specs or {7: "localizations", 1: LAYOUT})
     done: list[tuple[str, Mapping[str, Any]]] = []
     async with EmulatedCamera(**made) as device:
-        camera = smartcam.connect(device.url, interpret_as=read, name="line1/cam1", reconnect=Backoff())
+        camera = smartcam.connect(
+            device.url, interpret_as=read, name="line1/cam1", reconnect=Backoff()
+        )
         results, events = camera.results(max_queue=10_000), camera.events()
 
         async def command(name: str, verb: str, fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -196,7 +198,7 @@ class Plc:
 @contextlib.asynccontextmanager
 async def plc(url: str) -> AsyncIterator[Plc]:
     """Have a client that is connected."""
-    client = Client(url, timeout=60)
+    client = Client(url, timeout=60, watchdog_intervall=60)
     async with asyncio.timeout(20):
         while True:
             with contextlib.suppress(OSError):

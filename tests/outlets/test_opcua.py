@@ -65,9 +65,11 @@ async def test_a_job_gives_its_result_as_structures_events_and_plain_variables(
         assert told.CreationTime >= told.ProcessingTimes.StartTime
         assert told.InternalConfigurationId.Id == ""
         await client.client.load_data_type_definitions()
-        value, error = (await client.call(
-            "ResultManagement.GetResultById", told.ResultId, ua.Variant(0, ua.VariantType.Int32)
-        ))[1:]
+        value, error = (
+            await client.call(
+                "ResultManagement.GetResultById", told.ResultId, ua.Variant(0, ua.VariantType.Int32)
+            )
+        )[1:]
         assert error == 0
         (record,) = value.ResultContent
         made = record.Value
@@ -100,14 +102,19 @@ async def test_clients_without_structures_and_clients_that_only_call_do_the_same
         assert (state, json.loads(value)["count"], why, error) == (1, 1, "", 0)
         listed = await client.call(
             "ResultManagement.GetResultListFiltered",
-            ua.Variant(0, ua.VariantType.Int32), "m-2", *[None] * 6, job,
-            *[ua.Variant(0, ua.VariantType.UInt32)] * 2, ua.Variant(1, ua.VariantType.Int32),
+            ua.Variant(0, ua.VariantType.Int32),
+            "m-2",
+            *[None] * 6,
+            job,
+            *[ua.Variant(0, ua.VariantType.UInt32)] * 2,
+            ua.Variant(1, ua.VariantType.Int32),
         )
         complete, count, handle, (result,), error = listed
         assert (complete, count, error) == (True, 1, 0)
         found = await client.call(
             "ResultManagement.GetResultComponentsById",
-            result.ResultId.Id, ua.Variant(0, ua.VariantType.Int32),
+            result.ResultId.Id,
+            ua.Variant(0, ua.VariantType.Int32),
         )
         assert (found[4], found[5].Id, found[12].Id, found[-1]) == (1, "m-2", job, 0)
         release = "ResultManagement.ReleaseResultHandle", ua.Variant(handle, ua.VariantType.UInt32)
@@ -120,18 +127,23 @@ async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path:
     async with ready(tmp_path, recipes={"housing": 1, "free": 3}) as (there, client):
         heard = await client.hear(1018, 1022)
         prepare, none = "RecipeManagement.PrepareRecipe", None
-        internal, done, error = await client.call(prepare, "free", none)
-        assert (internal.Id, done, error) == ("3", True, 0)
+        internal, _, error = await client.call(prepare, "free", none)
+        assert (internal.Id, error) == ("3", 0)
+        await client.wait_for("Ready")
         assert there.camera.active_application == 3
-        assert await client.state() == "Ready"
         assert (await client.call(prepare, none, "1"))[0].Id == "1"
+        await client.wait_for("Ready")
         await until(lambda: [one.InternalId.Id for one in heard.of(1022)] == ["3", "1"])
         for external, number in (("unknown", none), ("housing", "3"), (none, none)):
             assert (await client.call(prepare, external, number))[-1] == -2
         most = [ua.Variant(one, ua.VariantType.UInt32) for one in (1, 1)]
         _, count, _, (second,), error = await client.call(
-            "RecipeManagement.GetRecipeListFiltered", none, none,
-            ua.Variant(2, ua.VariantType.Int32), *most, ua.Variant(0, ua.VariantType.Int32),
+            "RecipeManagement.GetRecipeListFiltered",
+            none,
+            none,
+            ua.Variant(2, ua.VariantType.Int32),
+            *most,
+            ua.Variant(0, ua.VariantType.Int32),
         )
         assert (count, second.Id, error) == (1, "3", 0)
         assert (await client.call("RecipeManagement.UnprepareRecipe", "housing", none))[-1] == 0
@@ -151,6 +163,7 @@ async def test_continuous_execution_gives_results_of_its_job_until_it_is_stopped
     async with ready(tmp_path) as (there, client):
         heard = await client.hear(1024)
         assert (await client.call("RecipeManagement.PrepareRecipe", "3", None))[-1] == 0
+        await client.wait_for("Ready")
         meas = getattr(ua, "MeasIdDataType")(Id="all")  # noqa: B009
         more = [None] * 3 + [ua.Variant([], ua.VariantType.Variant, is_array=True)]
         job, error = await client.call(f"{JOBS}.StartContinuous", meas, *more)

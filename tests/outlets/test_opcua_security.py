@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +33,7 @@ URI = "urn:test:plc"
 
 
 @pytest.fixture(scope="module")
-def identity(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def identity(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a client's certificate and key."""
     folder = tmp_path_factory.mktemp("identity")
     key = generate_private_key()
@@ -45,7 +43,7 @@ def identity(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     )
     (folder / "key.pem").write_bytes(dump_private_key_as_pem(key))
     (folder / "plc.der").write_bytes(made.public_bytes(Encoding.DER))
-    yield folder
+    return folder
 
 
 async def come_in(
@@ -63,7 +61,7 @@ async def come_in(
         client.set_password(password)
     try:
         await client.connect()
-    except (ua.UaError, OSError, asyncio.TimeoutError) as exc:
+    except (TimeoutError, ua.UaError, OSError) as exc:
         return client, type(exc).__name__
     return client, ""
 

@@ -7,7 +7,6 @@ import collections
 import contextlib
 import gzip
 import random
-import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,10 +30,21 @@ MACHINE = "VisionStateMachine"
 JOBS = f"{MACHINE}.AutomaticModeStateMachine"
 CALL_SECONDS = 60.0
 APPLICATIONS = [
-    {"id": 1, "layout": "n: int32", "cycle": [{"n": n} for n in range(500)], "load_time": 0.01,
-     "processing_time": 0.005},
-    {"id": 3, "layout": "n: int32", "cycle": [{"n": n} for n in range(500)], "load_time": 0.01,
-     "processing_time": 0.002, "rate": 100},
+    {
+        "id": 1,
+        "layout": "n: int32",
+        "cycle": [{"n": n} for n in range(500)],
+        "load_time": 0.01,
+        "processing_time": 0.005,
+    },
+    {
+        "id": 3,
+        "layout": "n: int32",
+        "cycle": [{"n": n} for n in range(500)],
+        "load_time": 0.01,
+        "processing_time": 0.002,
+        "rate": 100,
+    },
 ]
 
 
@@ -62,7 +72,9 @@ def arrows() -> dict[int, Arrow]:
         ends = [*told(node, "FromState"), *told(node, "ToState")]
         if len(ends) == 2:
             source, target = (int(one.split("=")[-1]) for one in ends)
-            causes = [nodes[one].get("BrowseName", "").split(":")[1] for one in told(node, "HasCause")]
+            causes = [
+                nodes[one].get("BrowseName", "").split(":")[1] for one in told(node, "HasCause")
+            ]
             owner = str(nodes[ends[0]].get("ParentNodeId"))
             found[int(str(key).split("=")[-1])] = Arrow(source, target, owner, "".join(causes))
     return found
@@ -101,7 +113,11 @@ async def one_call(client: Plc, books: Books, chance: random.Random) -> None:
         (3, f"{JOBS}.Stop", [ua.Variant(0, ua.VariantType.Int32), ""]),
         (3, f"{JOBS}.Abort", [ua.Variant(0, ua.VariantType.Int32), ""]),
         (2, f"{MACHINE}.Halt", ["no number"]),
-        (2, "ResultManagement.GetResultById", ["no such result", ua.Variant(0, ua.VariantType.Int32)]),
+        (
+            2,
+            "ResultManagement.GetResultById",
+            ["no such result", ua.Variant(0, ua.VariantType.Int32)],
+        ),
     ]
     _, path, arguments = chance.choices(choices, [one for one, _, _ in choices])[0]
     asked = datetime.now(UTC)
@@ -111,6 +127,8 @@ async def one_call(client: Plc, books: Books, chance: random.Random) -> None:
         error = answer[-1] if isinstance(answer, list) else answer
         if error == 0:
             name = path.rpartition(".")[2]
+            if name == "PrepareRecipe" and not answer[1]:
+                name = "pending"  # it may end later, or be forestalled
             books.done[name] += 1
             if name.startswith("Start"):
                 books.jobs[answer[0].Id] = meas, name == "StartSingleJob", asked
@@ -136,9 +154,7 @@ async def walk(folder: Path, calls: int, clients: int, seed: int) -> tuple[Books
             while books.calls < calls:
                 await one_call(client, books, own)
 
-        start = time.monotonic()
         await asyncio.gather(*(play(one, random.Random(chance.random())) for one in plcs))  # noqa: S311
-        print(f"{books.calls} calls in {time.monotonic() - start:.1f} s: {dict(books.done)}")
         with contextlib.suppress(ua.UaStatusCodeError):
             await listener.call(f"{MACHINE}.Reset", ua.Variant(0, ua.VariantType.Int32), "")
             books.done["Reset"] += 1
@@ -164,7 +180,10 @@ def check_transitions(books: Books, heard: Heard) -> None:
             here["ns=1;i=1021"] = 5056  # Initialized, where the jobs' machine begins
         causes[arrow.cause] += 1
     del causes[""]
-    assert causes == collections.Counter(
+    late = causes["PrepareRecipe"] - books.done["PrepareRecipe"]
+    assert 0 <= late <= books.done["pending"]
+    causes["PrepareRecipe"] -= late
+    assert +causes == collections.Counter(
         {name: count for name, count in books.done.items() if count and name in CAUSES}
     )
 
@@ -201,7 +220,7 @@ async def test_random_calls_of_clients_move_along_the_nodeset_and_mix_up_no_resu
 @pytest.mark.long
 @pytest.mark.widest
 async def test_ten_thousand_random_calls_of_five_clients(tmp_path: Path) -> None:
-    books, heard = await walk(tmp_path, int(__import__('os').environ.get('CALLS','10000')), clients=5, seed=2)
+    books, heard = await walk(tmp_path, 10_000, clients=5, seed=2)
     check_transitions(books, heard)
     check_results(books, heard)
     assert len(books.jobs) > 500

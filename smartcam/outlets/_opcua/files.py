@@ -64,9 +64,7 @@ class TransferFiles:
             ("GenerateFileForWrite", refuse),
             ("CloseAndCommit", refuse),
         ):
-            self._server.link_method(
-                self._server.get_node(nodes.id(f"{_TRANSFER}.{name}")), call
-            )
+            self._server.link_method(self._server.get_node(nodes.id(f"{_TRANSFER}.{name}")), call)
         timeout = self._server.get_node(nodes.id(f"{_TRANSFER}.ClientProcessingTimeout"))
         await timeout.write_value(FILE_SECONDS * 1000, ua.VariantType.Double)
 

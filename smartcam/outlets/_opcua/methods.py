@@ -116,10 +116,8 @@ class Methods:
         state = lambda: [ua.Variant(0, ua.VariantType.Int32)]  # noqa: E731
         return found | {
             "Plain.StartJob": Method(self._start_plain, texts),
-            "Plain.PrepareRecipe": Method(self._prepare_plain),
-            "Plain.GetResult": Method(
-                self._result_plain, lambda: [*state(), *texts(), *texts()]
-            ),
+            "Plain.PrepareRecipe": Method(self._prepare_plain, lambda: [_boolean(False)]),
+            "Plain.GetResult": Method(self._result_plain, lambda: [*state(), *texts(), *texts()]),
         }
 
     async def call(
@@ -155,7 +153,7 @@ class Methods:
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:
-            logger.exception("outlet: camera %s: %s", self._nodes.name, text_of(exc))
+            logger.error("outlet: camera %s: %s", self._nodes.name, text_of(exc), exc_info=True)  # noqa: TRY400
             return ua.StatusCode(ua.StatusCodes.BadInternalError)
         return [*outputs, _error(0)]
 
@@ -214,12 +212,14 @@ class Methods:
 
     async def _prepare_plain(self, recipe: str) -> list[ua.Variant]:
         """Prepare a recipe for a client that knows no structures."""
-        await self._prepare(recipe, None)
-        return []
+        _, completed = await self._prepare(recipe, None)
+        return [completed]
 
     async def _result_plain(self, job: str) -> list[ua.Variant]:
         """Return state, values and error of a job's result to a client that knows no structures."""
-        found = next(self._book.newest(self._nodes.name, lambda one: one.result.job_id == job), None)
+        found = next(
+            self._book.newest(self._nodes.name, lambda one: one.result.job_id == job), None
+        )
         if not job or found is None:
             raise KeyError(f"there is no result of job {job!r:.80}")
         state = ua.Variant(found.result.state, ua.VariantType.Int32)
@@ -230,8 +230,8 @@ class Methods:
 
     async def _prepare(self, external: Any, internal: Any) -> list[ua.Variant]:
         application = self._system.application_of(_text(external), _text(internal))
-        await self._system.prepare(application)
-        return [self._id("RecipeIdInternalDataType", str(application)), _boolean(True)]
+        completed = await self._system.prepare(application)
+        return [self._id("RecipeIdInternalDataType", str(application)), _boolean(completed)]
 
     async def _unprepare(self, external: Any, internal: Any) -> list[ua.Variant]:
         application = self._system.application_of(_text(external), _text(internal))
@@ -283,11 +283,11 @@ class Methods:
             outputs.append(ua.Variant() if one is None else ua.Variant(one, of))
         return outputs
 
-    async def _results(
-        self, state: int, *rest: Any
-    ) -> list[ua.Variant]:
+    async def _results(self, state: int, *rest: Any) -> list[ua.Variant]:
         *ids, most, first, timeout = rest
-        wanted = [(name, text) for name, one in zip(_FILTERS, ids, strict=True) if (text := _text(one))]
+        wanted = [
+            (name, text) for name, one in zip(_FILTERS, ids, strict=True) if (text := _text(one))
+        ]
 
         def fits(kept: KeptResult) -> bool:
             if state and kept.result.state != state:
@@ -384,9 +384,7 @@ def _text(value: Any) -> str:
     return text
 
 
-def _wrong_arguments(
-    arguments: Sequence[ua.Variant], types: Sequence[int]
-) -> ua.CallMethodResult:
+def _wrong_arguments(arguments: Sequence[ua.Variant], types: Sequence[int]) -> ua.CallMethodResult:
     """Return the answer to a call whose arguments are of wrong types: which ones."""
     result = ua.CallMethodResult()
     result.StatusCode = ua.StatusCode(ua.StatusCodes.BadInvalidArgument)

@@ -64,7 +64,7 @@ _PLAIN_METHODS: Mapping[str, tuple[Sequence[tuple[str, ua.VariantType]], ...]] =
         (("MeasId", _TEXT), ("PartId", _TEXT), ("Recipe", _TEXT)),
         (("JobId", _TEXT),),
     ),
-    "PrepareRecipe": ((("Recipe", _TEXT),), ()),
+    "PrepareRecipe": ((("Recipe", _TEXT),), (("IsCompleted", ua.VariantType.Boolean),)),
     "GetResult": (
         (("JobId", _TEXT),),
         (("ResultState", ua.VariantType.Int32), ("Value", _TEXT), ("ErrorText", _TEXT)),
@@ -223,7 +223,12 @@ class CameraNodes:
         if job is not None:
             fields |= {"JobId": self._values.identity("JobIdDataType", job.id)}
             fields |= {"MeasId": job.meas, "PartId": job.part, "ProductId": job.product}
-        self._outbox.put(lambda: self._emit("VisionDiagnosticInfoEventType", text, fields))
+
+        async def publish() -> None:
+            await self._write("Plain.Error", ua.Variant(text, ua.VariantType.String))
+            await self._emit("VisionDiagnosticInfoEventType", text, fields)
+
+        self._outbox.put(publish)
 
     def trouble(self, why: str) -> None:
         """Show why the camera cannot be used, as a condition; "" when it can."""
@@ -250,9 +255,11 @@ class CameraNodes:
     async def _write(self, path: str, value: ua.Variant, status: int = 0) -> None:
         told = ua.DataValue(value, StatusCode=ua.StatusCode(status), SourceTimestamp=_now())
         node = self.id(path)
-        (await self._server.iserver.aspace.write_attribute_value(
-            node, ua.AttributeIds.Value, told
-        )).check()
+        (
+            await self._server.iserver.aspace.write_attribute_value(
+                node, ua.AttributeIds.Value, told
+            )
+        ).check()
 
     async def _show_states(self, vision: str, automatic: str) -> None:
         for path, machine, state in (
@@ -390,5 +397,3 @@ async def _nothing(_parent: ua.NodeId, *_arguments: ua.Variant) -> ua.StatusCode
 
 def _now() -> datetime:
     return datetime.now(UTC)
-
-

@@ -8,8 +8,6 @@ import contextlib
 import logging
 from typing import TYPE_CHECKING
 
-from smartcam._user_code import text_of
-
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
@@ -77,8 +75,8 @@ class Outbox:
                 try:
                     await call()
                     failures = 0
-                except Exception as exc:
-                    logger.exception("outlet: publishing: %s", text_of(exc))
+                except Exception:
+                    logger.exception("outlet: publishing")
                     failures += 1
                     if failures > MAX_FAILURES:
                         raise

@@ -8,7 +8,7 @@ import socket
 from typing import TYPE_CHECKING, Any
 
 from asyncua import ua
-from asyncua.crypto import cert_gen, uacrypto
+from asyncua.crypto import cert_gen
 from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
@@ -133,6 +133,8 @@ async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) 
         await server.load_private_key(key)
         await server.set_application_uri(_application_uri(server.iserver.certificate))
         if settings.clients is not None:
+            if not (folder / settings.clients).is_dir():  # noqa: ASYNC240 - in a thread of its own
+                raise ValueError(f"clients: {folder / settings.clients} is no folder")  # noqa: TRY004
             server.set_certificate_validator(await _validator(folder / settings.clients))
     except (OSError, ValueError, x509.ExtensionNotFound) as exc:
         raise ConfigurationError(f"outlet {name}: certificate: {exc}") from exc
@@ -168,8 +170,6 @@ def _make(certificate: Path, key: Path, uri: str) -> None:
 
 
 async def _validator(folder: Path) -> CertificateValidator:
-    if not folder.is_dir():
-        raise ValueError(f"clients: {folder} is no folder")
     store = TrustStore([folder], [])
     await store.load()
     of = CertificateValidatorOptions

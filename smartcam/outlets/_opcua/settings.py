@@ -51,7 +51,9 @@ class OpcUaSettings(OutletSettings):
         False, description="also without encryption, which passwords are then sent without, too"
     )
     certificate: str | None = Field(
-        None, min_length=1, description="file of the server's own; made beside the spool if not said"
+        None,
+        min_length=1,
+        description="file of the server's own; made beside the spool if not said",
     )
     key: str | None = Field(
         None, min_length=1, description="file of the certificate's private key, in PEM"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import contextlib
 import json
 import logging
 from datetime import UTC, datetime
@@ -43,6 +44,9 @@ RESULT_WAIT = 5.0
 
 COMMAND_GRACE = 30.0
 """Seconds that a command may have beyond its own timeout, to reach the camera."""
+
+PREPARE_WAIT = 0.3
+"""Seconds that PrepareRecipe waits before it tells that it is not completed yet."""
 
 CONTINUOUS_GRACE = 5.0
 """Seconds behind continuous execution in which its last results may come from the spool."""
@@ -219,8 +223,10 @@ class VisionSystem:
         names = (name for name, number in self.settings.recipes.items() if number == application)
         return next(names, "" if application is None else str(application))
 
-    async def prepare(self, application: int) -> None:
-        """Have an application ready, and return then.
+    async def prepare(self, application: int) -> bool:
+        """Begin to have an application ready, and return whether it is, after a moment.
+
+        A camera may take seconds, and a client's other requests wait while this one does.
 
         Raises:
             WrongStateError: it is not allowed in this state, or the state changed meanwhile.
@@ -232,11 +238,32 @@ class VisionSystem:
         if self.states.automatic not in ("Initialized", "Ready"):
             raise WrongStateError(f"PrepareRecipe is not allowed in {self.states.both}")
         self._by_client, self._wanted, self._preparing = True, None, True
+        told: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._spawn(lambda: self._prepare(application, told))
+        try:
+            async with asyncio.timeout(PREPARE_WAIT):
+                await asyncio.shield(told)
+        except TimeoutError:
+            if not told.done():
+                told.add_done_callback(lambda done: self._prepared_later(application, done))
+                return False
+            told.result()
+        return True
+
+    def _prepared_later(self, application: int, done: asyncio.Future[None]) -> None:
+        """Tell clients that a recipe was not prepared, whose caller was told that it will be."""
+        error = None if done.cancelled() else done.exception()
+        if error is not None:
+            text = f"recipe {application} is not prepared: {str(error) or type(error).__name__}"
+            self.face.message(text, type(error).__name__, None)
+
+    async def _prepare(self, application: int, told: asyncio.Future[None]) -> None:
+        """Have an application ready, and tell how it ended."""
         try:
             if self.states.automatic == "Ready":
                 self._move("Initialized", why="another recipe is prepared")
-            timeout = self.settings.switch_timeout
             if application != self.application:
+                timeout = self.settings.switch_timeout
                 await self._do("switch", application=application, timeout=timeout)
             await self._start()
             self.application = application
@@ -244,8 +271,15 @@ class VisionSystem:
                 raise WrongStateError(f"the state became {self.states.both} meanwhile")
             self._wanted = application
             self._become_ready("PrepareRecipe")
+        except (SmartCamError, TimeoutError) as exc:
+            told.set_exception(exc)
+            told.exception()  # a caller may have gone
+        else:
+            told.set_result(None)
         finally:
             self._preparing = False
+            if not told.done():
+                told.cancel()
 
     def unprepare(self) -> None:
         """Have no recipe ready.
@@ -319,10 +353,8 @@ class VisionSystem:
 
     async def _start(self) -> None:
         """Have the camera run; one that always runs cannot be told to."""
-        try:
+        with contextlib.suppress(UnsupportedError):
             await self._do("start", timeout=self.settings.switch_timeout)
-        except UnsupportedError:
-            pass
         self._stopped = False
 
     async def _single(self, job: Job) -> None:

@@ -177,7 +177,7 @@ class Values:
     async def content(
         self, result: VisionResult, columns: Sequence[Column]
     ) -> list[ua.Variant] | None:
-        """Return a result's values: a structure for each record, or JSON where there is no layout."""
+        """Return a result's values: a structure for each record; JSON without a layout."""
         value = result.said.get("value")
         if value is None:
             return None
@@ -190,9 +190,7 @@ class Values:
         text = json.dumps(value, separators=(",", ":"))
         return [ua.Variant(text, ua.VariantType.String)]
 
-    async def _structure(
-        self, result: VisionResult, columns: Sequence[Column]
-    ) -> Structure | None:
+    async def _structure(self, result: VisionResult, columns: Sequence[Column]) -> Structure | None:
         """Return the structure of an application's layout, made if it is new."""
         if not columns or result.application is None:
             return None
