@@ -137,13 +137,17 @@ class TransferFiles:
         def write(_file: _OpenFile, _data: object) -> ua.StatusCode:
             return _status(ua.StatusCodes.BadNotWritable)
 
+        def close(_file: _OpenFile) -> list[ua.Variant]:
+            self._forget(number)
+            return []
+
         return {
             "Open": open_again,
             "Write": guarded(write),
             "Read": guarded(_read_some),
             "GetPosition": guarded(_position),
             "SetPosition": guarded(_set_position),
-            "Close": guarded(lambda _file: self._forget(number) or []),
+            "Close": guarded(close),
         }
 
     def _forget(self, number: int) -> None:

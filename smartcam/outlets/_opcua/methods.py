@@ -153,7 +153,8 @@ class Methods:
         except ENDS_PROGRAM:
             raise
         except BaseException as exc:
-            logger.error("outlet: camera %s: %s", self._nodes.name, text_of(exc), exc_info=True)  # noqa: TRY400
+            logger.exception("outlet: camera %s", self._nodes.name)
+            self._nodes.message(text_of(exc), type(exc).__name__, None)
             return ua.StatusCode(ua.StatusCodes.BadInternalError)
         return [*outputs, _error(0)]
 

@@ -133,8 +133,8 @@ async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) 
         await server.load_private_key(key)
         await server.set_application_uri(_application_uri(server.iserver.certificate))
         if settings.clients is not None:
-            if not (folder / settings.clients).is_dir():  # noqa: ASYNC240 - in a thread of its own
-                raise ValueError(f"clients: {folder / settings.clients} is no folder")  # noqa: TRY004
+            if not (folder / settings.clients).is_dir():
+                raise ValueError(f"clients: {folder / settings.clients} is no folder")
             server.set_certificate_validator(await _validator(folder / settings.clients))
     except (OSError, ValueError, x509.ExtensionNotFound) as exc:
         raise ConfigurationError(f"outlet {name}: certificate: {exc}") from exc
