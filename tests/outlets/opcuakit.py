@@ -85,7 +85,7 @@ async def cell(
             ]
             try:
                 async with camera:
-                    pump = outlets._pumps["opcua"]
+                    pump: Any = outlets._pumps["opcua"]
                     await until(lambda: bool(pump.trouble or pump.outlet._open))
                     assert not pump.trouble, pump.trouble
                     yield Cell(url, outlets, camera, device, done)

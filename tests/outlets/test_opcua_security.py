@@ -71,7 +71,7 @@ async def test_users_come_in_encrypted_and_nobody_else(tmp_path: Path, identity:
     (tmp_path / "trusted").mkdir()
     certificate = tmp_path / "trusted" / "plc.der"
     certificate.write_bytes((identity / "plc.der").read_bytes())
-    rules = {"anonymous": "no", "unencrypted": False, "clients": "trusted"}
+    rules: dict[str, Any] = {"anonymous": "no", "unencrypted": False, "clients": "trusted"}
     async with cell(tmp_path, **rules, users={"plc": {"file": "word"}}) as there:
         client, error = await come_in(there.url, identity, "plc", "geheim")
         assert error == ""

@@ -51,11 +51,11 @@ class Method(NamedTuple):
 
     Attributes:
         do: does it with plain arguments, and returns its outputs but the error.
-        empty: returns these outputs where it failed.
+        empty: these outputs where it failed.
     """
 
     do: Callable[..., Awaitable[list[ua.Variant]]]
-    empty: Callable[[], list[ua.Variant]] = list
+    empty: tuple[ua.Variant, ...] = ()
 
 
 class Methods:
@@ -82,42 +82,43 @@ class Methods:
 
     def table(self) -> dict[str, Method]:
         """Return the methods by the paths of their nodes below the camera's."""
-        job = lambda: [self._id("JobIdDataType", "")]  # noqa: E731
-        recipe = lambda: [self._id("RecipeIdInternalDataType", "")]  # noqa: E731
-        found = {
-            f"{STATE_MACHINE}.{name}": Method(self._changes(name, target))
-            for name, target in (
-                ("Halt", "Halted"),
-                ("Reset", "Preoperational"),
-                ("SelectModeAutomatic", "Operational"),
-            )
-        }
-        found |= {
+        return {**self._states_table(), **self._results_table(), **self._plain_table()}
+
+    def _states_table(self) -> dict[str, Method]:
+        job = (self._id("JobIdDataType", ""),)
+        recipe = (self._id("RecipeIdInternalDataType", ""),)
+        return {
+            f"{STATE_MACHINE}.Halt": Method(self._changes("Halt", "Halted")),
+            f"{STATE_MACHINE}.Reset": Method(self._changes("Reset", "Preoperational")),
+            f"{STATE_MACHINE}.SelectModeAutomatic": Method(
+                self._changes("SelectModeAutomatic", "Operational")
+            ),
             f"{STATE_MACHINE}.ConfirmAll": Method(self._confirm),
             f"{AUTOMATIC_MACHINE}.Stop": Method(self._ends("Stop")),
             f"{AUTOMATIC_MACHINE}.Abort": Method(self._ends("Abort")),
             f"{AUTOMATIC_MACHINE}.StartSingleJob": Method(self._starts(single=True), job),
             f"{AUTOMATIC_MACHINE}.StartContinuous": Method(self._starts(single=False), job),
-            "RecipeManagement.PrepareRecipe": Method(
-                self._prepare, lambda: [*recipe(), _boolean(False)]
-            ),
+            "RecipeManagement.PrepareRecipe": Method(self._prepare, (*recipe, _boolean(False))),
             "RecipeManagement.UnprepareRecipe": Method(self._unprepare, recipe),
-            "RecipeManagement.GetRecipeListFiltered": Method(self._recipes, _no_list),
-            "ResultManagement.GetResultById": Method(
-                self._result, lambda: [_number(0), ua.Variant()]
-            ),
-            "ResultManagement.GetResultComponentsById": Method(
-                self._components, lambda: [_boolean(False), _number(0), *[ua.Variant()] * 14]
-            ),
-            "ResultManagement.GetResultListFiltered": Method(self._results, _no_list),
+            "RecipeManagement.GetRecipeListFiltered": Method(self._recipes, _no_list()),
+        }
+
+    def _results_table(self) -> dict[str, Method]:
+        nothing = ua.Variant()
+        components = (_boolean(False), _number(0), *[nothing] * len(_COMPONENTS))
+        return {
+            "ResultManagement.GetResultById": Method(self._result, (_number(0), nothing)),
+            "ResultManagement.GetResultComponentsById": Method(self._components, components),
+            "ResultManagement.GetResultListFiltered": Method(self._results, _no_list()),
             "ResultManagement.ReleaseResultHandle": Method(self._release),
         }
-        texts = lambda: [ua.Variant("", ua.VariantType.String)]  # noqa: E731
-        state = lambda: [ua.Variant(0, ua.VariantType.Int32)]  # noqa: E731
-        return found | {
-            "Plain.StartJob": Method(self._start_plain, texts),
-            "Plain.PrepareRecipe": Method(self._prepare_plain, lambda: [_boolean(False)]),
-            "Plain.GetResult": Method(self._result_plain, lambda: [*state(), *texts(), *texts()]),
+
+    def _plain_table(self) -> dict[str, Method]:
+        text = ua.Variant("", ua.VariantType.String)
+        return {
+            "Plain.StartJob": Method(self._start_plain, (text,)),
+            "Plain.PrepareRecipe": Method(self._prepare_plain, (_boolean(False),)),
+            "Plain.GetResult": Method(self._result_plain, (_error(0), text, text)),
         }
 
     async def call(
@@ -147,7 +148,7 @@ class Methods:
         except (SmartCamError, TimeoutError, LookupError) as exc:
             self._nodes.message(str(exc), type(exc).__name__, None)
             code = NOT_FOUND if isinstance(exc, LookupError) else code_of(exc)
-            return [*method.empty(), _error(code)]
+            return [*method.empty, _error(code)]
         except asyncio.CancelledError:
             raise
         except ENDS_PROGRAM:
@@ -419,5 +420,5 @@ def _list(values: list[Any]) -> ua.Variant:
     return ua.Variant(values, ua.VariantType.ExtensionObject, is_array=True)
 
 
-def _no_list() -> list[ua.Variant]:
-    return [_boolean(True), _number(0), _number(0), _list([])]
+def _no_list() -> tuple[ua.Variant, ...]:
+    return _boolean(True), _number(0), _number(0), _list([])

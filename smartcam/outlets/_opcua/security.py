@@ -90,7 +90,7 @@ class Users:
         return None if role is None else User(role, "anonymous")
 
 
-class Rights(SimpleRoleRuleset):
+class Rights(SimpleRoleRuleset):  # type: ignore[misc] # asyncua's types are not followed
     """The rights of users: anonymous ones may read."""
 
     def __init__(self) -> None:
