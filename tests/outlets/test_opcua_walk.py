@@ -103,15 +103,15 @@ async def one_call(client: Plc, books: Books, chance: random.Random) -> None:
     ]
     recipe = chance.choice(["counted", "1", "3", "unknown"])
     choices: list[tuple[float, str, list[Any]]] = [
-        (0.3, f"{MACHINE}.Halt", [ua.Variant(0, ua.VariantType.Int32), "test"]),
-        (0.7, f"{MACHINE}.Reset", [ua.Variant(0, ua.VariantType.Int32), "test"]),
+        (0.1, f"{MACHINE}.Halt", [ua.Variant(0, ua.VariantType.Int32), "test"]),
+        (0.4, f"{MACHINE}.Reset", [ua.Variant(0, ua.VariantType.Int32), "test"]),
         (8, f"{MACHINE}.SelectModeAutomatic", []),
         (5, "RecipeManagement.PrepareRecipe", [recipe, None]),
         (0.5, "RecipeManagement.UnprepareRecipe", [recipe, None]),
         (30, f"{JOBS}.StartSingleJob", ids),
-        (2, f"{JOBS}.StartContinuous", ids),
-        (3, f"{JOBS}.Stop", [ua.Variant(0, ua.VariantType.Int32), ""]),
-        (3, f"{JOBS}.Abort", [ua.Variant(0, ua.VariantType.Int32), ""]),
+        (1, f"{JOBS}.StartContinuous", ids),
+        (1, f"{JOBS}.Stop", [ua.Variant(0, ua.VariantType.Int32), ""]),
+        (1, f"{JOBS}.Abort", [ua.Variant(0, ua.VariantType.Int32), ""]),
         (2, f"{MACHINE}.Halt", ["no number"]),
         (
             2,
@@ -223,4 +223,4 @@ async def test_ten_thousand_random_calls_of_five_clients(tmp_path: Path) -> None
     books, heard = await walk(tmp_path, 10_000, clients=5, seed=2)
     check_transitions(books, heard)
     check_results(books, heard)
-    assert len(books.jobs) > 500
+    assert len(books.jobs) > 200
