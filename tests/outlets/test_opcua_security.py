@@ -66,7 +66,11 @@ async def come_in(
     return client, ""
 
 
-async def test_users_come_in_encrypted_and_nobody_else(tmp_path: Path, identity: Path) -> None:
+async def test_users_come_in_encrypted_and_nobody_else(
+    tmp_path: Path, identity: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("DEBUG", "smartcam")
+    caplog.set_level("DEBUG", "asyncua.server")
     (tmp_path / "word").write_text("geheim\n")
     (tmp_path / "trusted").mkdir()
     certificate = tmp_path / "trusted" / "plc.der"
@@ -83,6 +87,7 @@ async def test_users_come_in_encrypted_and_nobody_else(tmp_path: Path, identity:
         for user, password in (("plc", "wrong"), ("other", "geheim"), ("", "")):
             assert (await come_in(there.url, identity, user, password))[1]
         assert (await come_in(there.url, None, "plc", "geheim"))[1]
+        assert "geheim" not in caplog.text
         key = tmp_path / "outlets" / "opcua.opcua.pem"
         assert key.stat().st_mode & 0o077 == 0
 

@@ -24,7 +24,7 @@ class KeptResult(NamedTuple):
         result: the result.
         value: the nodeset's structure of it.
         recipe: name of its recipe.
-        text: its values as JSON; "" without.
+        text: values of the result as JSON; "" without.
     """
 
     result: VisionResult

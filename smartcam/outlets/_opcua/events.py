@@ -68,7 +68,7 @@ class Events:
             source: node of the camera.
             name: name of the camera.
             message: text for people.
-            fields: its other fields; those that are not given stay null.
+            fields: other fields of the event; those that are not given stay null.
 
         Raises:
             KeyError: its type has no such field.

@@ -1,4 +1,4 @@
-"""Who may come in: users, certificates, and what anonymous clients may do."""
+"""Access to the server: users, certificates, and what anonymous clients may do."""
 
 from __future__ import annotations
 

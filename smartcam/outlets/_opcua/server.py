@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import itertools
 import logging
 import secrets
@@ -18,7 +19,7 @@ from smartcam.outlets._opcua.events import Events
 from smartcam.outlets._opcua.files import TransferFiles
 from smartcam.outlets._opcua.methods import Method, Methods, kind_of
 from smartcam.outlets._opcua.nodes import CameraNodes
-from smartcam.outlets._opcua.nodeset import URI, nodeset_text
+from smartcam.outlets._opcua.nodeset import AUTOMATIC, URI, VISION, node_ids, nodeset_text
 from smartcam.outlets._opcua.outbox import Outbox
 from smartcam.outlets._opcua.security import Users, secure
 from smartcam.outlets._opcua.system import VisionSystem
@@ -26,7 +27,7 @@ from smartcam.outlets._opcua.values import Values
 from smartcam.outlets._records import picture_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
     from pathlib import Path
 
     from smartcam.outlets._entry import OutletEntry
@@ -42,6 +43,9 @@ MAX_CAMERAS = 1_000
 
 MAX_CONNECTIONS = 100
 """Clients of one server at a time."""
+
+METHOD_TYPES = (VISION, AUTOMATIC, "RecipeManagementType", "ResultManagementType")
+"""Types whose methods a camera has."""
 
 OWN_URI = "urn:smartcam:outlets:opcua"
 """Namespace of cameras and of the structures made from their layouts."""
@@ -64,6 +68,7 @@ class VisionServer:
         self.cameras: dict[str, CameraFace] = {}
         self._states: dict[str, Mapping[str, Any]] = {}
         self._making: dict[str, asyncio.Task[None]] = {}
+        self.calls: dict[tuple[ua.NodeId, str], Callable[..., Awaitable[Any]]] = {}
         self._run_id, self._jobs = secrets.token_hex(4), itertools.count(1)
         self.server: Any = None
         self.files: TransferFiles | None = None
@@ -89,11 +94,26 @@ class VisionServer:
         self.values = Values(server, vision, own)
         self.events = Events(server, vision)
         self.files = TransferFiles(server, own)
+        await self._link_types()
         self.outbox.start()
         chosen = filter(self.settings.chooses, self.desk.cameras())
         for name in itertools.islice(chosen, MAX_CAMERAS):
             await self._make(name)
         await server.start()
+
+    async def _link_types(self) -> None:
+        """Let clients call a camera's methods by the nodes of their types, too."""
+        for kind in METHOD_TYPES:
+            of = self.server.get_node(ua.NodeId(node_ids()[kind], self.spaces[0]))
+            for method in await of.get_methods():
+                name = (await method.read_browse_name()).Name
+                self.server.link_method(method, functools.partial(self._call, name))
+
+    async def _call(self, name: str, parent: ua.NodeId, *arguments: ua.Variant) -> Any:
+        call = self.calls.get((parent, name))
+        if call is None:
+            return ua.StatusCode(ua.StatusCodes.BadMethodInvalid)
+        return await call(parent, *arguments)
 
     async def stop(self) -> None:
         """End jobs, and stop listening; whatever fails, the port is free afterwards."""
@@ -207,6 +227,8 @@ class CameraFace:
             return await self._methods.call(method, types, arguments)
 
         self._server.server.link_method(node, call)
+        parent, _, name = path.rpartition(".")
+        self._server.calls[self.nodes.id(parent), name] = call
 
     async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
         if self._server.desk.command is None:
@@ -231,7 +253,7 @@ class CameraFace:
         self.nodes.result(result, recipe, self._columns(result), self._server.book.add)
 
     def _columns(self, result: VisionResult) -> Sequence[Column]:
-        """Return what the layout says of a result's values; nothing where it cannot be read."""
+        """Return the columns of a result's layout; none where it cannot be read."""
         if result.application is None:
             return ()
         try:

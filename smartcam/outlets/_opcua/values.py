@@ -143,7 +143,7 @@ class Values:
         Args:
             result: the result.
             recipe: name of its recipe.
-            content: its values; None for none.
+            content: values of the result; None for none.
         """
         job = result.job
         application = "" if result.application is None else str(result.application)
