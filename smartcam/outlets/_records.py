@@ -13,7 +13,8 @@ def picture_of(pattern: str, folder: Path, said: Mapping[str, Any]) -> Path | No
     """Return the file of a result's picture; None where there is none below the folder.
 
     Args:
-        pattern: place of the file, with ``{camera}``, ``{application}``, ``{number}`` and ``{sequence}``.
+        pattern: place of the file, with ``{camera}``, ``{application}``, ``{number}`` and
+            ``{sequence}``.
         folder: folder of relative places.
         said: fields of the result.
     """

@@ -152,7 +152,7 @@ async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path:
         assert await refused(client, f"{JOBS}.StartSingleJob", *ids) == "BadInvalidState"
         assert await refused(client, f"{JOBS}.Stop", *NO_CAUSE) == "BadInvalidState"
         of = client.client.get_node(ua.NodeId(7096, client.vision))  # the type's Stop
-        with pytest.raises(ua.UaStatusCodeError, match="BadInvalidState|state"):
+        with pytest.raises(ua.UaStatusCodeError, match="BadInvalidState"):
             await client.node(JOBS).call_method(of, *NO_CAUSE)
         assert await refused(client, f"{JOBS}.Stop") == "BadArgumentsMissing"
         assert await refused(client, f"{JOBS}.Stop", *NO_CAUSE, "x") == "BadTooManyArguments"
