@@ -25,8 +25,8 @@ pytestmark = [
     pytest.mark.widest,
     pytest.mark.skipif(
         NODE is None or not (FOLDER / "node-opcua-client").is_dir(),
-        reason="node-opcua-client is not installed: npm install --global node-opcua-client, or "
-        "another folder and SMARTCAM_NODE_OPCUA",
+        reason="needs npm's node-opcua-client: npm install --global node-opcua-client, or in "
+        "another folder, its node_modules in SMARTCAM_NODE_OPCUA",
     ),
 ]
 
