@@ -196,10 +196,10 @@ class Plc:
 
 
 @contextlib.asynccontextmanager
-async def plc(url: str) -> AsyncIterator[Plc]:
+async def plc(url: str, seconds: float = 20.0) -> AsyncIterator[Plc]:
     """Have a client that is connected."""
     client = Client(url, timeout=60, watchdog_intervall=60)
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(seconds):
         while True:
             with contextlib.suppress(OSError):
                 await client.connect()

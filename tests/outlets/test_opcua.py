@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
+import signal
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +17,10 @@ pytest.importorskip("asyncua")
 
 from asyncua import ua
 
-from smartcam.emulator import faults
+from smartcam.emulator import EmulatedCamera, faults
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets import Outlets
-from tests.outlets.opcuakit import LAYOUT, Cell, Plc, cell, plc
+from tests.outlets.opcuakit import LAYOUT, Cell, Plc, cell, free_port, plc
 from tests.outlets.outletkit import until
 
 pytestmark = pytest.mark.real_time
@@ -244,6 +247,31 @@ async def test_pictures_are_read_from_temporary_files(tmp_path: Path) -> None:
         asked.Id.Id = "another"
         with pytest.raises(ua.UaStatusCodeError):
             await transfer.call_method("0:GenerateFileForRead", asked)
+
+
+@pytest.mark.long
+async def test_the_command_serves_one_camera_without_a_fleet(tmp_path: Path) -> None:
+    url = f"opc.tcp://127.0.0.1:{free_port()}"
+    (tmp_path / "outlets.yaml").write_text(
+        f"outlets: {{opcua: {{listen: '{url}', anonymous: control, unencrypted: true}}}}\n"
+    )
+    async with EmulatedCamera(active=7) as emulator:
+        arguments = ("outlet", emulator.url, str(tmp_path / "outlets.yaml"), "--name", "line1/cam1")
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "smartcam", *arguments, "--application", "7"),
+            stdout=asyncio.subprocess.DEVNULL,
+        )
+        try:
+            async with plc(url, 60.0) as client:
+                await client.wait_for("Ready", 60.0)
+                job = await client.start_job("alone")
+                await client.wait_for("Ready", 60.0)
+                state, value, _, error = await client.call("Plain.GetResult", job)
+        finally:
+            process.send_signal(signal.SIGINT)
+            assert await process.wait() == 0
+    assert (state, error) == (1, 0)
+    assert value
 
 
 @pytest.mark.parametrize(

@@ -444,9 +444,8 @@ class VisionSystem:
         job = self.job
         if self._pending or (job is not None and job.single and job.trigger is None):
             said = json.loads(entry.body) if entry.body else {}
-            at = _time(said.get("triggered_at"))
-            open_ = self._pending or (at is not None and job is not None and at >= job.started)
-            if open_ and len(self._pending) < MAX_PENDING:
+            maybe = self._pending or said.get("triggered_at") is not None
+            if maybe and len(self._pending) < MAX_PENDING:
                 self._pending.append(entry)
                 return
         self._publish(entry)
