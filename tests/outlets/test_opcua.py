@@ -94,6 +94,7 @@ async def test_a_job_gives_its_result_as_structures_events_and_plain_variables(
             assert all(vars(told)[f"{one}/Id"] for one in ("FromState", "ToState", "Transition"))
 
 
+@pytest.mark.long
 async def test_clients_without_structures_and_clients_that_only_call_do_the_same(
     tmp_path: Path,
 ) -> None:
@@ -163,6 +164,7 @@ async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path:
         assert await refused(client, prepare, "x" * 5000, none) == "BadInvalidArgument"
 
 
+@pytest.mark.long
 async def test_continuous_execution_gives_results_of_its_job_until_it_is_stopped(
     tmp_path: Path,
 ) -> None:
@@ -187,6 +189,7 @@ async def test_continuous_execution_gives_results_of_its_job_until_it_is_stopped
         assert await client.state() == "Initialized"
 
 
+@pytest.mark.long
 async def test_a_job_without_a_result_fails_under_its_id_and_the_late_result_has_none(
     tmp_path: Path,
 ) -> None:
@@ -206,6 +209,7 @@ async def test_a_job_without_a_result_fails_under_its_id_and_the_late_result_has
         assert heard.of(1024)[-1].JobId.Id == again
 
 
+@pytest.mark.long
 async def test_a_camera_that_is_lost_is_an_error_until_it_is_back(tmp_path: Path) -> None:
     async with ready(tmp_path) as (there, client):
         heard = await client.hear(1018, 1019, 1020, 1036)
@@ -221,6 +225,7 @@ async def test_a_camera_that_is_lost_is_an_error_until_it_is_back(tmp_path: Path
         assert [one.ToState.Text for one in heard.of(1018)] == ["Error", "Operational", "Ready"]
 
 
+@pytest.mark.long
 async def test_pictures_are_read_from_temporary_files(tmp_path: Path) -> None:
     picture = tmp_path / "pictures" / "1.png"
     picture.parent.mkdir()

@@ -92,6 +92,7 @@ async def test_users_come_in_encrypted_and_nobody_else(
         assert key.stat().st_mode & 0o077 == 0
 
 
+@pytest.mark.long
 async def test_a_client_with_a_certificate_that_is_not_trusted_is_refused(
     tmp_path: Path, identity: Path
 ) -> None:
@@ -106,6 +107,7 @@ async def test_a_client_with_a_certificate_that_is_not_trusted_is_refused(
         assert (await come_in(there.url, identity))[1]
 
 
+@pytest.mark.long
 async def test_anonymous_clients_that_may_read_call_nothing_and_write_nothing(
     tmp_path: Path,
 ) -> None:
@@ -130,6 +132,7 @@ outlets:
 """
 
 
+@pytest.mark.long
 async def test_two_cameras_of_a_fleet_in_one_server_are_driven_apart(tmp_path: Path) -> None:
     pytest.importorskip("zenoh")
     url = f"opc.tcp://127.0.0.1:{free_port()}"
