@@ -3,9 +3,3 @@
 The nodeset beside these modules, ``MachineVision.NodeSet2.xml.gz``, is the OPC Foundation's,
 version 1.0.0 of 2019-07-11, under its MIT licence, which stands in the file.
 """
-
-from __future__ import annotations
-
-from smartcam.outlets._opcua.outlet import OpcUaOutlet
-
-__all__ = ["OpcUaOutlet"]

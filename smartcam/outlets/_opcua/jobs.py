@@ -60,7 +60,7 @@ def code_of(error: BaseException) -> int:
 
 
 @dataclass(slots=True, eq=False)
-class Job:
+class VisionJob:
     """A job that a client has started.
 
     Attributes:
@@ -111,7 +111,7 @@ class VisionResult:
     camera: str
     state: int
     application: int | None
-    job: Job | None
+    job: VisionJob | None
     created: datetime
     said: Mapping[str, Any]
     error: str = ""

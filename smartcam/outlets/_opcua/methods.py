@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.outlets._opcua.book import KeptResult, ResultBook
     from smartcam.outlets._opcua.nodes import CameraNodes
     from smartcam.outlets._opcua.system import VisionSystem
-    from smartcam.outlets._opcua.values import Values
+    from smartcam.outlets._opcua.values import VisionValues
 
 logger: logging.Logger = logging.getLogger("smartcam.outlets")
 
@@ -73,7 +73,7 @@ class Methods:
         self,
         system: VisionSystem,
         nodes: CameraNodes,
-        values: Values,
+        values: VisionValues,
         book: ResultBook,
         settled: Callable[[], Awaitable[None]],
     ) -> None:

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from smartcam.outlets._opcua.events import Events
-    from smartcam.outlets._opcua.jobs import Job, VisionResult
+    from smartcam.outlets._opcua.jobs import VisionJob, VisionResult
     from smartcam.outlets._opcua.machine import VisionStates
-    from smartcam.outlets._opcua.outbox import Outbox
-    from smartcam.outlets._opcua.values import Values
+    from smartcam.outlets._opcua.publishing import PublishQueue
+    from smartcam.outlets._opcua.values import VisionValues
     from smartcam.outlets._outlet import Column
 
 STATE_MACHINE = "VisionStateMachine"
@@ -88,7 +88,7 @@ class CameraNodes:
         server: Any,
         spaces: tuple[int, int],
         name: str,
-        parts: tuple[Events, Values, Outbox],
+        parts: tuple[Events, VisionValues, PublishQueue],
     ) -> None:
         self._server, self.name = server, name
         self._vision, self._own = spaces
@@ -162,7 +162,7 @@ class CameraNodes:
 
     # ------------------------------------------------------------------ what happens
 
-    def moved(self, transition: Transition, job: Job | None, why: str) -> None:
+    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
         prepared = self.prepared
         vision = transition.target if transition.machine == VISION else "Operational"
@@ -217,7 +217,7 @@ class CameraNodes:
 
         self._outbox.put(publish)
 
-    def message(self, text: str, kind: str, job: Job | None) -> None:
+    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
         fields: dict[str, Any] = {"CausePath": kind}
         if job is not None:
@@ -288,7 +288,9 @@ class CameraNodes:
             "Transition/Id": ua.NodeId(transition.node, self._vision),
         }
 
-    def _job_fields(self, kind: str, job: Job | None, prepared: tuple[str, int]) -> dict[str, Any]:
+    def _job_fields(
+        self, kind: str, job: VisionJob | None, prepared: tuple[str, int]
+    ) -> dict[str, Any]:
         """Return the fields of an event beside a change of state: of a job, or of a recipe."""
         identity = self._values.identity
         if kind != "RecipePreparedEventType":

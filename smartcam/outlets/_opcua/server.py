@@ -20,10 +20,10 @@ from smartcam.outlets._opcua.files import TransferFiles
 from smartcam.outlets._opcua.methods import Method, Methods, kind_of
 from smartcam.outlets._opcua.nodes import CameraNodes
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, URI, VISION, node_ids, nodeset_text
-from smartcam.outlets._opcua.outbox import Outbox
+from smartcam.outlets._opcua.publishing import PublishQueue
 from smartcam.outlets._opcua.security import Users, secure
 from smartcam.outlets._opcua.system import VisionSystem
-from smartcam.outlets._opcua.values import Values
+from smartcam.outlets._opcua.values import VisionValues
 from smartcam.outlets._records import picture_of
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from smartcam.outlets._entry import OutletEntry
-    from smartcam.outlets._opcua.jobs import Job, VisionResult
+    from smartcam.outlets._opcua.jobs import VisionJob, VisionResult
     from smartcam.outlets._opcua.nodeset import Transition
     from smartcam.outlets._opcua.settings import OpcUaSettings
     from smartcam.outlets._outlet import Column, OutletDesk
@@ -63,7 +63,7 @@ class VisionServer:
 
     def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
         self.name, self.settings, self.folder, self.desk = name, settings, folder, desk
-        self.outbox = Outbox()
+        self.outbox = PublishQueue()
         self.book = ResultBook(settings.kept_results)
         self.cameras: dict[str, CameraFace] = {}
         self._states: dict[str, Mapping[str, Any]] = {}
@@ -91,7 +91,7 @@ class VisionServer:
         vision = await server.get_namespace_index(URI)
         own = await server.register_namespace(OWN_URI)
         self.spaces = vision, own
-        self.values = Values(server, vision, own)
+        self.values = VisionValues(server, vision, own)
         self.events = Events(server, vision)
         self.files = TransferFiles(server, own)
         await self._link_types()
@@ -241,7 +241,7 @@ class CameraFace:
 
     # ------------------------------------------------------------------ what clients see
 
-    def moved(self, transition: Transition, job: Job | None, why: str) -> None:
+    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
         application = self.system.prepared or 0
         self.nodes.prepared = self.system.recipe_name(application), application
@@ -262,7 +262,7 @@ class CameraFace:
             self.message(f"application {result.application}: {exc}", type(exc).__name__, None)
             return ()
 
-    def message(self, text: str, kind: str, job: Job | None) -> None:
+    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
         self.nodes.message(text, kind, job)
 

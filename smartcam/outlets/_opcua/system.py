@@ -17,7 +17,7 @@ from smartcam.outlets._opcua.jobs import (
     COMPLETED,
     FAILED,
     BusyError,
-    Job,
+    VisionJob,
     UnknownRecipeError,
     VisionResult,
 )
@@ -58,13 +58,13 @@ OWED_SECONDS = 60.0
 class Face(Protocol):
     """The side of a vision system that clients see; each call returns at once."""
 
-    def moved(self, transition: Transition, job: Job | None, why: str) -> None:
+    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
 
     def result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
 
-    def message(self, text: str, kind: str, job: Job | None) -> None:
+    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
         """Raise an event with a text."""
 
     def trouble(self, why: str) -> None:
@@ -98,7 +98,7 @@ class VisionSystem:
         self.name, self.settings, self.face = name, settings, face
         self.states = VisionStates()
         self.application: int | None = None
-        self.job: Job | None = None
+        self.job: VisionJob | None = None
         self._command, self._picture, self._new_job = command, picture, new_job
         self._simulated = simulated
         self._connected: bool | None = None  # None: not known yet
@@ -108,8 +108,8 @@ class VisionSystem:
         self._preparing = False
         self._stopped = False  # by this server: the camera has to run before the next trigger
         self._owed_until = -1.0  # until then a result may be one of a job that was given up
-        self._by_trigger: collections.OrderedDict[datetime, Job] = collections.OrderedDict()
-        self._last_continuous: Job | None = None
+        self._by_trigger: collections.OrderedDict[datetime, VisionJob] = collections.OrderedDict()
+        self._last_continuous: VisionJob | None = None
         self._pending: collections.deque[OutletEntry] = collections.deque()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -163,7 +163,9 @@ class VisionSystem:
         self._ready_application = self.application
         self._move("Ready", cause)
 
-    def _move(self, target: str, cause: str = "", *, job: Job | None = None, why: str = "") -> None:
+    def _move(
+        self, target: str, cause: str = "", *, job: VisionJob | None = None, why: str = ""
+    ) -> None:
         self.face.moved(self.states.move(target, cause), job, why)
 
     # ------------------------------------------------------------------ methods
@@ -291,7 +293,7 @@ class VisionSystem:
         self._by_client, self._wanted = True, None
         self._move("Initialized", "UnprepareRecipe")
 
-    def start_job(self, ids: tuple[Any, Any, Any], recipe: str, *, single: bool) -> Job:
+    def start_job(self, ids: tuple[Any, Any, Any], recipe: str, *, single: bool) -> VisionJob:
         """Start a job, and return it at once.
 
         Args:
@@ -307,7 +309,7 @@ class VisionSystem:
         self._check(method)
         if recipe and self.application_of(recipe) != self.prepared:
             raise UnknownRecipeError(f"{recipe!r:.80} is not ready: prepare it first")
-        self.job = job = Job(self._new_job(), single, *ids, self.prepared)
+        self.job = job = VisionJob(self._new_job(), single, *ids, self.prepared)
         self._move("SingleExecution" if single else "ContinuousExecution", method, job=job)
         job.task = self._spawn(lambda: self._single(job) if single else self._continuous(job))
         return job
@@ -357,7 +359,7 @@ class VisionSystem:
             await self._do("start", timeout=self.settings.switch_timeout)
         self._stopped = False
 
-    async def _single(self, job: Job) -> None:
+    async def _single(self, job: VisionJob) -> None:
         try:
             if self._stopped:
                 await self._start()
@@ -385,13 +387,13 @@ class VisionSystem:
             self._move("Ready", job=job)
             self._follow()
 
-    async def _continuous(self, job: Job) -> None:
+    async def _continuous(self, job: VisionJob) -> None:
         try:
             await self._start()
         except (SmartCamError, TimeoutError) as exc:
             self._job_failed(job, str(exc) or type(exc).__name__, type(exc).__name__)
 
-    def _job_failed(self, job: Job | None, why: str, kind: str = "Error") -> None:
+    def _job_failed(self, job: VisionJob | None, why: str, kind: str = "Error") -> None:
         if job is None or self.job is not job:
             return
         self._end_job(FAILED, why, kind=kind)
@@ -401,7 +403,7 @@ class VisionSystem:
 
     def _end_job(
         self, state: int, why: str, *, kind: str = "Aborted", owed: bool = True
-    ) -> Job | None:
+    ) -> VisionJob | None:
         """End the job under way, if there is one, and publish how it ended."""
         job, self.job = self.job, None
         if job is None:
@@ -479,7 +481,7 @@ class VisionSystem:
         if job is not None:
             job.seen.set()
 
-    def _job_of(self, said: Mapping[str, Any], at: datetime) -> Job | None:
+    def _job_of(self, said: Mapping[str, Any], at: datetime) -> VisionJob | None:
         """Return the job of a result; None where it is not sure."""
         trigger = _time(said.get("triggered_at"))
         if trigger is not None:

@@ -110,7 +110,7 @@ class Structure(NamedTuple):
         return b"".join(parts)
 
 
-class Values:
+class VisionValues:
     """The values of one server.
 
     Args:

@@ -17,7 +17,7 @@ MAX_FAILURES = 100
 """Failures to publish in a row behind which the server is opened again."""
 
 
-class Outbox:
+class PublishQueue:
     """A queue of calls that publish something; nothing that is cancelled leaves one half done.
 
     It is bounded by its users: methods and batches wait in :meth:`settled` for what they have put.
