@@ -26,6 +26,13 @@ from tests.outlets.outletkit import until
 pytestmark = pytest.mark.real_time
 
 JOBS = "VisionStateMachine.AutomaticModeStateMachine"
+RESULT_READY = (
+    "CreationTime, ExternalConfigurationId, ExternalRecipeId, InternalConfigurationId, "
+    "InternalRecipeId, IsPartial, IsSimulated, JobId, MeasId, PartId, ProcessingTimes, ProductId, "
+    "ResultContent, ResultId, ResultState, EventId, EventType, SourceNode, SourceName, Time, "
+    "ReceiveTime, LocalTime, Message, Severity"
+)
+"""Fields of the event, by the nodeset and Part 5 of OPC UA."""
 NO_CAUSE = (ua.Variant(0, ua.VariantType.Int32), "test")
 PARTS = {
     "id": 1,
@@ -65,6 +72,9 @@ async def test_a_job_gives_its_result_as_structures_events_and_plain_variables(
         ids = told.JobId, told.MeasId, told.PartId, told.ExternalRecipeId, told.InternalRecipeId
         assert [one.Id for one in ids] == [job, "m-1", "p-1", "housing", "1"]
         assert (told.IsPartial, told.IsSimulated, told.ResultState) == (False, True, 1)
+        fields = RESULT_READY.split(", ")
+        missing = {one for one in fields if vars(told)[one] is None}
+        assert missing == {"ExternalConfigurationId", "ProductId"}  # nobody gave these
         assert told.CreationTime >= told.ProcessingTimes.StartTime
         assert told.InternalConfigurationId.Id == ""
         await client.client.load_data_type_definitions()

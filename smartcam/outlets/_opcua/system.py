@@ -17,8 +17,8 @@ from smartcam.outlets._opcua.jobs import (
     COMPLETED,
     FAILED,
     BusyError,
-    VisionJob,
     UnknownRecipeError,
+    VisionJob,
     VisionResult,
 )
 from smartcam.outlets._opcua.machine import VisionStates, WrongStateError
