@@ -86,7 +86,7 @@ async def cell(
             try:
                 async with camera:
                     pump: Any = outlets._pumps["opcua"]
-                    await until(lambda: bool(pump.trouble or pump.outlet._open))
+                    await until(lambda: bool(pump.trouble or pump.outlet._open), 300)
                     assert not pump.trouble, pump.trouble
                     yield Cell(url, outlets, camera, device, done)
             finally:
@@ -167,7 +167,7 @@ class Plc:
         """Return the state, as simple clients read it."""
         return str(await self.node("Plain.State").read_value())
 
-    async def wait_for(self, state: str, seconds: float = 20.0) -> None:
+    async def wait_for(self, state: str, seconds: float = 300.0) -> None:
         """Wait until the camera is in a state."""
         async with asyncio.timeout(seconds):
             while await self.state() != state:  # noqa: ASYNC110
@@ -196,7 +196,7 @@ class Plc:
 
 
 @contextlib.asynccontextmanager
-async def plc(url: str, seconds: float = 20.0) -> AsyncIterator[Plc]:
+async def plc(url: str, seconds: float = 300.0) -> AsyncIterator[Plc]:
     """Have a client that is connected."""
     client = Client(url, timeout=60, watchdog_intervall=60)
     async with asyncio.timeout(seconds):

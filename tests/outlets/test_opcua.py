@@ -277,10 +277,10 @@ async def test_the_command_serves_one_camera_without_a_fleet(tmp_path: Path) -> 
             stdout=asyncio.subprocess.DEVNULL,
         )
         try:
-            async with plc(url, 60.0) as client:
-                await client.wait_for("Ready", 60.0)
+            async with plc(url) as client:
+                await client.wait_for("Ready")
                 job = await client.start_job("alone")
-                await client.wait_for("Ready", 60.0)
+                await client.wait_for("Ready")
                 state, value, _, error = await client.call("Plain.GetResult", job)
         finally:
             process.send_signal(signal.SIGINT)

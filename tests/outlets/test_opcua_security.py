@@ -143,7 +143,7 @@ async def test_two_cameras_of_a_fleet_in_one_server_are_driven_apart(tmp_path: P
         second = Plc(first.client, "line1/cam2")
         await second.learn()
         for one in (first, second):
-            await one.wait_for("Ready", 60)
+            await one.wait_for("Ready")
         heard, other = await first.hear(1024), await second.hear(1024)
         jobs = [await one.start_job(one.camera) for one in (first, second)]
         await until(lambda: bool(heard.of(1024) and other.of(1024)))

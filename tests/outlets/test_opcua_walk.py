@@ -28,7 +28,7 @@ pytestmark = pytest.mark.real_time
 XML = Path(smartcam.outlets.__file__).parent / "_opcua" / "MachineVision.NodeSet2.xml.gz"
 MACHINE = "VisionStateMachine"
 JOBS = f"{MACHINE}.AutomaticModeStateMachine"
-CALL_SECONDS = 60.0
+CALL_SECONDS = 300.0
 APPLICATIONS = [
     {
         "id": 1,
