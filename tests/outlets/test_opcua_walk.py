@@ -159,8 +159,8 @@ async def walk(folder: Path, calls: int, clients: int, seed: int) -> tuple[Books
             await listener.call(f"{MACHINE}.Reset", ua.Variant(0, ua.VariantType.Int32), "")
             books.done["Reset"] += 1
         singles = {job for job, (_, single, _) in books.jobs.items() if single}
-        await until(lambda: singles <= {one.JobId.Id for one in heard.of(1024)})
-        await until(lambda: heard.of(1018)[-1].ToState.Text == "Preoperational")
+        await until(lambda: singles <= {one.JobId.Id for one in heard.of(1024)}, 300)
+        await until(lambda: heard.of(1018)[-1].ToState.Text == "Preoperational", 300)
     return books, heard
 
 
