@@ -27,6 +27,7 @@ class Package(NamedTuple):
 PACKAGES: Final = {
     "aiohttp": Package("aiohttp", "web", "the web page needs"),
     "aiomqtt": Package("aiomqtt", "mqtt", "outlets over MQTT need"),
+    "asyncua": Package("asyncua", "opcua", "outlets over OPC UA need"),
     "av": Package("PyAV", "video", "video needs"),
     "cryptography": Package("cryptography", "fleet", "certificates need"),
     "cv2": Package("OpenCV", "calibration", "calibration needs"),

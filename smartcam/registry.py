@@ -265,6 +265,7 @@ OUTLETS = Registry(
     "smartcam.outlets",
     {
         "mqtt": "smartcam.outlets._mqtt:MqttOutlet",
+        "opcua": "smartcam.outlets._opcua.outlet:OpcUaOutlet",
         "sqlite": "smartcam.outlets._store:ResultStore",
     },
 )

@@ -49,6 +49,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
         columns=source.columns,
         command=source.command,
         tell=source.tell,
+        cameras=source.cameras,
     )
     url = await options.located(url)
     with options.cameras(url, reconnect=Backoff()) as make:
@@ -120,6 +121,9 @@ class _OutletSource:
         if self.camera is None or name != self.camera.name:
             raise ConfigurationError(f"there is no camera {name!r:.120} here")
         return await do_command(self.camera, verb, given)
+
+    def cameras(self) -> dict[str, bool | None]:
+        return {} if self.camera is None else {self.camera.name: None}
 
     def tell(self, name: str, why: str) -> None:
         text = why or "delivers again"

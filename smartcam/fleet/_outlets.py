@@ -64,6 +64,7 @@ class FleetOutlets(Server):
             columns=self._columns,
             command=self._command,
             tell=tell,
+            cameras=self._cameras,
         )
         self._observer = _OutletObserver(self)
         self._readings: dict[str, tuple[CameraEntry, Interpretation]] = {}
@@ -125,6 +126,10 @@ class FleetOutlets(Server):
         """Return the byte order that a camera's last status told."""
         host = self._server.hosts.get(camera)
         return 0 if host is None else host.camera.endian
+
+    def _cameras(self) -> dict[str, bool | None]:
+        plan = self._server.reloads.now.plan
+        return {name: one.entry.emulated is not None for name, one in plan.items()}
 
     def _columns(self, camera: str, application: int) -> Any:
         read = self.reading(camera)

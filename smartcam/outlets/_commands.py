@@ -16,8 +16,13 @@ if TYPE_CHECKING:
 MAX_TIMEOUT = 300.0
 """Seconds that a command may be given."""
 
-_FIELDS = {"trigger": ("timeout",), "switch": ("application", "timeout")}
-_TIMEOUTS = {"trigger": 5.0, "switch": 10.0}
+_FIELDS = {
+    "trigger": ("timeout",),
+    "switch": ("application", "timeout"),
+    "start": ("timeout",),
+    "stop": ("timeout",),
+}
+_TIMEOUTS = {"trigger": 5.0, "switch": 10.0, "start": 10.0, "stop": 10.0}
 
 
 async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -25,7 +30,7 @@ async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -
 
     Args:
         camera: camera that is open.
-        verb: ``trigger`` or ``switch``.
+        verb: ``trigger``, ``switch``, ``start`` or ``stop``.
         given: ``timeout`` in seconds; for a switch ``application``.
 
     Raises:
@@ -47,6 +52,9 @@ async def do_command(camera: Camera[Any], verb: str, given: Mapping[str, Any]) -
         fields = result._asdict()
         del fields["raw"]
         return {"result": fields}
+    if verb in ("start", "stop"):
+        await (camera.start if verb == "start" else camera.stop)(timeout=timeout)
+        return {}
     application = check_application(given.get("application"), "application", verb)
     await camera.switch_application(application, timeout=timeout)
     return {"application": application}

@@ -24,15 +24,19 @@ class OutletDesk:
         columns: returns names, types and units of the values of a camera's application, by its
             layout; empty where they are not known.
         command: does a command and returns what is answered; None where commands are not allowed.
+        cameras: returns the names of the cameras, and whether each is emulated; None where that is
+            not known.
     """
 
     def __init__(
         self,
         columns: Callable[[str, int], Sequence[Column]],
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
+        cameras: Callable[[], Mapping[str, bool | None]] = dict,
     ) -> None:
         self.columns = columns
         self.command = command
+        self.cameras = cameras
 
 
 Column = tuple[str, str, str]

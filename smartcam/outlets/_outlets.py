@@ -59,6 +59,7 @@ class Outlets(Server):
         columns: returns names, types and units of an application's values, by its layout.
         command: does a command for an outlet that takes them.
         tell: called with an outlet's name and its trouble, and with "" when that is over.
+        cameras: returns the cameras' names, and whether each is emulated; None: not known.
 
     Raises:
         ConfigurationError: the section is wrong.
@@ -72,6 +73,7 @@ class Outlets(Server):
         columns: Callable[[str, int], Sequence[Column]] = lambda _camera, _application: (),
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         tell: Callable[[str, str], None] = lambda _name, _why: None,
+        cameras: Callable[[], Mapping[str, bool | None]] = dict,
     ) -> None:
         check_kind(
             section, dict, "section", "a mapping of settings by the outlet's name", "Outlets"
@@ -83,7 +85,7 @@ class Outlets(Server):
             check_callable(command, "command", "Outlets")
         for place, text in mistakes_of(section):
             raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
-        desk = OutletDesk(columns, command)
+        desk = OutletDesk(columns, command, cameras)
         self._pumps: dict[str, Pump] = {}
         for name, given in section.items():
             kind = outlet_class(name, given)

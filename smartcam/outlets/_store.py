@@ -9,13 +9,14 @@ import re
 import sqlite3
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
 from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
 from smartcam.exceptions import ConfigurationError
 from smartcam.outlets._outlet import Outlet
+from smartcam.outlets._records import picture_of, records_of
 from smartcam.outlets._settings import OutletSettings
 from smartcam.outlets._stored import read_store
 
@@ -167,7 +168,7 @@ class ResultStore(Outlet[StoreSettings]):
     def _write_one(self, database: sqlite3.Connection, entry: OutletEntry) -> None:
         said: dict[str, Any] = json.loads(entry.body)
         value = said.get("value")
-        records = _records(value)
+        records = records_of(value)
         row = (
             entry.id,
             *entry[:4],
@@ -261,13 +262,11 @@ class ResultStore(Outlet[StoreSettings]):
         known[name] = column
 
     def _picture(self, entry: OutletEntry, said: Mapping[str, Any]) -> str | None:
-        pattern = self.settings.pictures
+        pattern, folder = self.settings.pictures, self.path.parent
         if pattern is None or entry.kind == "gap":
             return None
-        for name in ("camera", "application", "number", "sequence"):
-            pattern = pattern.replace(f"{{{name}}}", str(said.get(name, "")))
-        path = self.path.parent / pattern
-        return pattern if path.is_file() and path.is_relative_to(self.path.parent) else None
+        found = picture_of(pattern, folder, said)
+        return None if found is None else str(found.relative_to(folder))
 
     def _expire(self, database: sqlite3.Connection) -> None:
         """Delete what is too old, or too much; a part at a time."""
@@ -299,31 +298,6 @@ def _used_bytes(database: sqlite3.Connection) -> int:
         for name in ("page_count", "freelist_count", "page_size")
     )
     return int((pages - free) * size)
-
-
-def _records(value: Any) -> list[dict[str, Any]] | None:
-    """Return the records of a value, a mapping of plain values each; None where it has none."""
-    if isinstance(value, dict):
-        fields = cast("dict[str, Any]", value)
-        lists = [name for name, one in fields.items() if isinstance(one, list)]
-        if len(lists) == 1 and all(isinstance(one, dict) for one in fields[lists[0]]):
-            head = {name: one for name, one in fields.items() if name != lists[0]}
-            return [_flat({**head, **one}) for one in fields[lists[0]]] or [_flat(head)]
-        return [_flat(fields)]
-    if isinstance(value, list) and all(isinstance(one, dict) for one in value):
-        return [_flat(one) for one in cast("list[dict[str, Any]]", value)]
-    return None
-
-
-def _flat(record: dict[str, Any]) -> dict[str, Any]:
-    """Return a record with the pose of a localization as plain values."""
-    pose = record.get("pose")
-    if not isinstance(pose, dict) or "orientation" not in pose:
-        return record
-    told = cast("dict[str, dict[str, Any]]", pose)
-    turned = {f"q{axis}": value for axis, value in told["orientation"].items()}
-    rest = {name: one for name, one in record.items() if name != "pose"}
-    return {**rest, **told["position"], **turned}
 
 
 def _kind(value: Any) -> str:

@@ -1,0 +1,86 @@
+"""The last results of all cameras, which clients may ask for."""
+
+from __future__ import annotations
+
+import collections
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from smartcam.outlets._opcua.jobs import VisionResult
+
+MAX_BOOK_CHARACTERS = 1 << 28
+"""Characters of the values that the results of a server keep, as JSON."""
+
+MAX_HANDLES = 10_000
+"""Handles that clients have not released; beyond it the oldest are forgotten."""
+
+
+class KeptResult(NamedTuple):
+    """A result that is kept.
+
+    Attributes:
+        result: the result.
+        value: the nodeset's structure of it.
+        recipe: name of its recipe.
+        text: values of the result as JSON; "" without.
+    """
+
+    result: VisionResult
+    value: Any
+    recipe: str
+    text: str
+
+
+class ResultBook:
+    """The last results, by their ids, and the handles that clients have on them.
+
+    Args:
+        most: results at most; beyond it the oldest go.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most, self._characters = most, 0
+        self._kept: collections.OrderedDict[str, KeptResult] = collections.OrderedDict()
+        self._handles: collections.OrderedDict[int, None] = collections.OrderedDict()
+        self._last_handle = 0
+
+    def add(self, kept: KeptResult) -> None:
+        """Keep a result; one that came before, with the same id, is replaced."""
+        before = self._kept.pop(kept.result.id, None)
+        self._characters += len(kept.text) - (0 if before is None else len(before.text))
+        self._kept[kept.result.id] = kept
+        while len(self._kept) > self._most or (
+            self._characters > MAX_BOOK_CHARACTERS and len(self._kept) > 1
+        ):
+            _, gone = self._kept.popitem(last=False)
+            self._characters -= len(gone.text)
+
+    def get(self, key: str, camera: str) -> KeptResult | None:
+        """Return a camera's result by its id; None where it is not there, or not any more."""
+        found = self._kept.get(key)
+        return found if found is not None and found.result.camera == camera else None
+
+    def newest(self, camera: str, fits: Callable[[KeptResult], bool]) -> Iterator[KeptResult]:
+        """Yield a camera's results that fit, the newest first."""
+        for kept in reversed(self._kept.values()):
+            if kept.result.camera == camera and fits(kept):
+                yield kept
+
+    def handle(self, timeout: int) -> int:
+        """Return a new handle; 0 for a client that needs none, since its ``timeout`` is 0."""
+        if timeout == 0:
+            return 0
+        self._last_handle = self._last_handle % 0xFFFFFFFF + 1
+        self._handles[self._last_handle] = None
+        while len(self._handles) > MAX_HANDLES:
+            self._handles.popitem(last=False)
+        return self._last_handle
+
+    def release(self, handle: int) -> bool:
+        """Forget a handle; return False if there was none."""
+        if handle not in self._handles:
+            return False
+        del self._handles[handle]
+        return True

@@ -1,0 +1,203 @@
+"""Pictures of results, which clients read from temporary files."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from typing import TYPE_CHECKING, Any
+
+from asyncua import ua
+from asyncua.common.instantiate_util import instantiate
+
+if TYPE_CHECKING:
+    from smartcam.outlets._opcua.book import ResultBook
+    from smartcam.outlets._opcua.nodes import CameraNodes
+
+MAX_FILES = 32
+"""Files that are open at a time; a client that wants another one is refused."""
+
+MAX_FILE_BYTES = 1 << 26
+"""Bytes of a picture; a larger one is not transferred."""
+
+MAX_READ_BYTES = 1 << 20
+"""Bytes of one answer to ``Read``."""
+
+FILE_SECONDS = 60.0
+"""Seconds after a client's last call after which its file is gone."""
+
+_TRANSFER = "ResultManagement.ResultTransfer"
+
+
+class _OpenFile:
+    """A picture that a client reads."""
+
+    def __init__(self, node: Any, data: bytes, timer: asyncio.TimerHandle) -> None:
+        self.node, self.data, self.timer = node, data, timer
+        self.position = 0
+
+
+class TransferFiles:
+    """The temporary files of a server.
+
+    Args:
+        server: server of asyncua.
+        own: index of the namespace of cameras.
+    """
+
+    def __init__(self, server: Any, own: int) -> None:
+        self._server, self._own = server, own
+        self._files: dict[int, _OpenFile] = {}
+        self._numbers = itertools.count(1)
+        self._closing: set[asyncio.Task[None]] = set()
+
+    async def link(self, nodes: CameraNodes, book: ResultBook) -> None:
+        """Link the methods of a camera's ``ResultTransfer``."""
+
+        async def generate(_parent: ua.NodeId, options: Any = None, *_more: Any) -> Any:
+            return await self._generate(nodes, book, options)
+
+        async def refuse(_parent: ua.NodeId, *_arguments: Any) -> ua.StatusCode:
+            return _status(ua.StatusCodes.BadNotWritable)
+
+        for name, call in (
+            ("GenerateFileForRead", generate),
+            ("GenerateFileForWrite", refuse),
+            ("CloseAndCommit", refuse),
+        ):
+            self._server.link_method(self._server.get_node(nodes.id(f"{_TRANSFER}.{name}")), call)
+        timeout = self._server.get_node(nodes.id(f"{_TRANSFER}.ClientProcessingTimeout"))
+        await timeout.write_value(FILE_SECONDS * 1000, ua.VariantType.Double)
+
+    async def _generate(self, nodes: CameraNodes, book: ResultBook, options: Any) -> Any:
+        asked = getattr(getattr(options, "Value", None), "Id", None)
+        key = getattr(asked, "Id", asked)
+        kept = book.get(key, nodes.name) if isinstance(key, str) else None
+        path = None if kept is None else kept.result.picture
+        if path is None:
+            return _status(ua.StatusCodes.BadNotFound)
+        if len(self._files) >= MAX_FILES:
+            return _status(ua.StatusCodes.BadTooManyOperations)
+        number = next(self._numbers)
+        self._files[number] = file = _OpenFile(None, b"", self._timer(number))
+        try:
+            file.data = await asyncio.to_thread(_read, path)
+            file.node = await self._make(nodes, number, len(file.data))
+        except OSError:
+            self._forget(number)
+            return _status(ua.StatusCodes.BadNotFound)
+        handle = ua.Variant(number, ua.VariantType.UInt32)
+        return [ua.Variant(file.node.nodeid), handle, ua.Variant(ua.NodeId())]
+
+    def _timer(self, number: int) -> asyncio.TimerHandle:
+        return asyncio.get_running_loop().call_later(FILE_SECONDS, self._forget, number)
+
+    async def _make(self, nodes: CameraNodes, number: int, size: int) -> Any:
+        root = nodes.id(f"{_TRANSFER}.File{number}")
+        await instantiate(
+            self._server.get_node(nodes.id(_TRANSFER)),
+            self._server.get_node(ua.NodeId(ua.ObjectIds.FileType)),
+            nodeid=root,
+            bname=ua.QualifiedName(f"File{number}", self._own),
+            instantiate_optional=False,
+        )
+        for name, value, of in (
+            ("Size", size, ua.VariantType.UInt64),
+            ("OpenCount", 1, ua.VariantType.UInt16),
+            ("Writable", False, ua.VariantType.Boolean),
+            ("UserWritable", False, ua.VariantType.Boolean),
+        ):
+            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own))
+            await node.write_value(value, of)
+        for name, call in self._calls(number).items():
+            node = self._server.get_node(ua.NodeId(f"{root.Identifier}.{name}", self._own))
+            self._server.link_method(node, call)
+        return self._server.get_node(root)
+
+    def _calls(self, number: int) -> dict[str, Any]:
+        """Return the methods of a file by their names."""
+
+        def guarded(do: Any) -> Any:
+            async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
+                file = self._files.get(number)
+                values = [one.Value for one in arguments]
+                if file is None or not values or values[0] != number:
+                    return _status(ua.StatusCodes.BadInvalidArgument)
+                file.timer.cancel()
+                file.timer = self._timer(number)
+                try:
+                    return do(file, *values[1:])
+                except (TypeError, ValueError):
+                    return _status(ua.StatusCodes.BadInvalidArgument)
+
+            return call
+
+        async def open_again(_parent: ua.NodeId, *_arguments: ua.Variant) -> ua.StatusCode:
+            return _status(ua.StatusCodes.BadNotSupported)
+
+        def write(_file: _OpenFile, _data: object) -> ua.StatusCode:
+            return _status(ua.StatusCodes.BadNotWritable)
+
+        def close(_file: _OpenFile) -> list[ua.Variant]:
+            self._forget(number)
+            return []
+
+        return {
+            "Open": open_again,
+            "Write": guarded(write),
+            "Read": guarded(_read_some),
+            "GetPosition": guarded(_position),
+            "SetPosition": guarded(_set_position),
+            "Close": guarded(close),
+        }
+
+    def _forget(self, number: int) -> None:
+        file = self._files.pop(number, None)
+        if file is None:
+            return
+        file.timer.cancel()
+        if file.node is not None:
+            task = asyncio.get_running_loop().create_task(self._delete(file.node))
+            self._closing.add(task)
+            task.add_done_callback(self._closing.discard)
+
+    async def _delete(self, node: Any) -> None:
+        await self._server.delete_nodes([node], recursive=True)
+
+    def close(self) -> None:
+        """Forget all files."""
+        for number in [*self._files]:
+            self._forget(number)
+
+
+def _read_some(file: _OpenFile, length: int) -> list[ua.Variant]:
+    if length < 0:
+        raise ValueError("a length below 0")
+    end = file.position + min(length, MAX_READ_BYTES)
+    data, file.position = file.data[file.position : end], min(end, len(file.data))
+    return [ua.Variant(data, ua.VariantType.ByteString)]
+
+
+def _position(file: _OpenFile) -> list[ua.Variant]:
+    return [ua.Variant(file.position, ua.VariantType.UInt64)]
+
+
+def _set_position(file: _OpenFile, position: int) -> list[ua.Variant]:
+    file.position = min(max(0, position), len(file.data))
+    return []
+
+
+def _read(path: Any) -> bytes:
+    """Return the bytes of a picture.
+
+    Raises:
+        OSError: it is not there any more, or too large.
+    """
+    with path.open("rb") as stream:
+        data: bytes = stream.read(MAX_FILE_BYTES + 1)
+    if len(data) > MAX_FILE_BYTES:
+        raise OSError(f"{path} has more than {MAX_FILE_BYTES} bytes")
+    return data
+
+
+def _status(code: int) -> ua.StatusCode:
+    return ua.StatusCode(code)

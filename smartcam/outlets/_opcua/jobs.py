@@ -1,0 +1,124 @@
+"""Jobs, what came of them, and the numbers by which methods tell errors."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from smartcam.exceptions import (
+    CameraBusyError,
+    CommandRejectedError,
+    ConfigurationError,
+    InterpretationError,
+    LinkError,
+    MissingExtraError,
+    NotRunningError,
+    SmartCamError,
+    UnsupportedError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+COMPLETED, ABORTED, FAILED = 1, 3, 4
+"""States of a result, as the nodeset numbers them."""
+
+
+class UnknownRecipeError(ConfigurationError):
+    """A client named a recipe that there is not."""
+
+
+class BusyError(SmartCamError):
+    """Another call to the same camera is under way."""
+
+
+ERRORS: tuple[tuple[type[BaseException], int], ...] = (
+    (UnknownRecipeError, -2),
+    (MissingExtraError, -1),
+    (ConfigurationError, -9),
+    (InterpretationError, -8),
+    (NotRunningError, -10),
+    (CommandRejectedError, -3),
+    (UnsupportedError, -3),
+    (BusyError, -6),
+    (CameraBusyError, -6),
+    (LinkError, -5),
+    (TimeoutError, -4),
+)
+"""Numbers of errors in a method's argument ``Error``; the first class that fits decides."""
+
+NOT_FOUND = -7
+"""Number of the error for a result, handle or picture that is not there, or not any more."""
+
+
+def code_of(error: BaseException) -> int:
+    """Return the number by which a method tells an error; -1 for one without its own."""
+    return next((code for kind, code in ERRORS if isinstance(error, kind)), -1)
+
+
+@dataclass(slots=True, eq=False)
+class VisionJob:
+    """A job that a client has started.
+
+    Attributes:
+        id: id of the job.
+        single: True for one trigger, False for continuous execution.
+        meas: id of the measurement, as the client gave it; None without.
+        part: id of the part, the same way.
+        product: id of the product, the same way.
+        application: application that was ready when the job began.
+        started: time of its start, UTC.
+        trigger: time of its trigger as the camera's client told it, which names its result.
+        seen: event that is set when its result is published.
+        ended_clock: clock of the event loop at its end; None while it is under way.
+        task: task that does it.
+    """
+
+    id: str
+    single: bool
+    meas: Any
+    part: Any
+    product: Any
+    application: int | None
+    started: datetime = field(default_factory=lambda: datetime.now(UTC))
+    trigger: datetime | None = None
+    seen: asyncio.Event = field(default_factory=asyncio.Event)
+    ended_clock: float | None = None
+    task: asyncio.Task[None] | None = None
+
+
+@dataclass(slots=True, frozen=True, eq=False)
+class VisionResult:
+    """A result as clients get it, or how a job ended that has none.
+
+    Attributes:
+        id: id of the result.
+        camera: name of the camera.
+        state: number of its state, as the nodeset numbers them.
+        application: application that made it; None where that is not known.
+        job: job that it is of; None for a result that no job has asked for.
+        created: time at which it came, UTC.
+        said: fields of its JSON object.
+        error: text that says why there are no values; "" where there are.
+        picture: file of its picture; None without.
+        simulated: True for an emulated camera, False for a real one, None where that is not known.
+    """
+
+    id: str
+    camera: str
+    state: int
+    application: int | None
+    job: VisionJob | None
+    created: datetime
+    said: Mapping[str, Any]
+    error: str = ""
+    picture: Path | None = None
+    simulated: bool | None = None
+
+    @property
+    def job_id(self) -> str:
+        """Id of its job; "" without one."""
+        return "" if self.job is None else self.job.id

@@ -1,0 +1,65 @@
+"""The states of a vision system; nothing moves but along a transition of the nodeset."""
+
+from __future__ import annotations
+
+from smartcam.outlets._entry import OutletError
+from smartcam.outlets._opcua.nodeset import AUTOMATIC, VISION, Transition, transitions
+
+
+class WrongStateError(OutletError):
+    """A method was called in a state in which the nodeset has no transition for it."""
+
+
+class VisionStates:
+    """The states of both machines of a vision system.
+
+    Attributes:
+        vision: name of the state of the whole system.
+        automatic: name of the state of the machine of jobs; "" where the system is not operational.
+    """
+
+    def __init__(self) -> None:
+        self.vision = "Preoperational"
+        self.automatic = ""
+
+    @property
+    def both(self) -> str:
+        """The state as a text."""
+        return f"{self.vision} {self.automatic}".rstrip()
+
+    def allows(self, cause: str) -> bool:
+        """Return True if a method causes a transition from the present state."""
+        return self._find("", cause) is not None
+
+    def move(self, target: str, cause: str = "") -> Transition:
+        """Move to a state and return the transition.
+
+        Args:
+            target: name of the state.
+            cause: name of the method that causes it; "" where it moves by itself.
+
+        Raises:
+            WrongStateError: there is no such transition.
+        """
+        found = self._find(target, cause)
+        if found is None:
+            raise WrongStateError(f"{cause or 'nothing'} leads from {self.both} to {target}")
+        if found.machine == AUTOMATIC:
+            self.automatic = target
+        else:
+            self.vision = target
+            self.automatic = "Initialized" if target == "Operational" else ""
+        return found
+
+    def _find(self, target: str, cause: str) -> Transition | None:
+        """Return the transition from here; of two with the same ends the one in its own machine."""
+        here = {VISION: self.vision, AUTOMATIC: self.automatic}
+        own = {(one.machine, one.source) for one in transitions()}
+        for one in transitions():
+            if here[one.machine] != one.source or one.cause != cause:
+                continue
+            if (one.machine, one.target) not in own:
+                continue  # Preoperational to Initialized, into the other machine: by way of its own
+            if target in ("", one.target):
+                return one
+        return None

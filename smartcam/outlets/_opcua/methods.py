@@ -1,0 +1,424 @@
+"""The methods of a camera: their arguments are checked, and each call ends."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from asyncua import ua
+
+from smartcam._user_code import ENDS_PROGRAM, text_of
+from smartcam.exceptions import SmartCamError
+from smartcam.outlets._opcua.jobs import NOT_FOUND, UnknownRecipeError, code_of
+from smartcam.outlets._opcua.machine import WrongStateError
+from smartcam.outlets._opcua.nodes import AUTOMATIC_MACHINE, STATE_MACHINE
+from smartcam.outlets._opcua.nodeset import node_ids
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+
+    from smartcam.outlets._opcua.book import KeptResult, ResultBook
+    from smartcam.outlets._opcua.nodes import CameraNodes
+    from smartcam.outlets._opcua.system import VisionSystem
+    from smartcam.outlets._opcua.values import VisionValues
+
+logger: logging.Logger = logging.getLogger("smartcam.outlets")
+
+MAX_TEXT = 1000
+"""Characters of an id or a text that a client gives."""
+
+MAX_LISTED = 100
+"""Results or recipes of one answer; a client asks for the rest by ``StartIndex``."""
+
+CALL_SECONDS = 700.0
+"""Seconds within which every call ends: beyond all that its camera may take."""
+
+_NUMBERS = {1: bool, 6: int, 7: int}
+"""Types of Python for the types of OPC UA, by their numbers."""
+
+_DERIVED = {"Handle": 7, "ResultStateDataType": 6, "TriStateBooleanDataType": 6}
+"""Numbers of the types that the nodeset derives from plain ones."""
+
+
+class MethodArgumentError(Exception):
+    """A client's argument is not of its type."""
+
+
+class Method(NamedTuple):
+    """A method that a client may call.
+
+    Attributes:
+        do: does it with plain arguments, and returns its outputs but the error.
+        empty: these outputs where it failed.
+    """
+
+    do: Callable[..., Awaitable[list[ua.Variant]]]
+    empty: tuple[ua.Variant, ...] = ()
+
+
+class Methods:
+    """The methods of a camera.
+
+    Args:
+        system: states and jobs of the camera.
+        nodes: nodes of the camera.
+        values: values of the server.
+        book: results that clients may ask for.
+        settled: returns when what was put before is published.
+    """
+
+    def __init__(
+        self,
+        system: VisionSystem,
+        nodes: CameraNodes,
+        values: VisionValues,
+        book: ResultBook,
+        settled: Callable[[], Awaitable[None]],
+    ) -> None:
+        self._system, self._nodes, self._values, self._book = system, nodes, values, book
+        self._settled = settled
+
+    def table(self) -> dict[str, Method]:
+        """Return the methods by the paths of their nodes below the camera's."""
+        return {**self._states_table(), **self._results_table(), **self._plain_table()}
+
+    def _states_table(self) -> dict[str, Method]:
+        job = (self._id("JobIdDataType", ""),)
+        recipe = (self._id("RecipeIdInternalDataType", ""),)
+        return {
+            f"{STATE_MACHINE}.Halt": Method(self._changes("Halt", "Halted")),
+            f"{STATE_MACHINE}.Reset": Method(self._changes("Reset", "Preoperational")),
+            f"{STATE_MACHINE}.SelectModeAutomatic": Method(
+                self._changes("SelectModeAutomatic", "Operational")
+            ),
+            f"{STATE_MACHINE}.ConfirmAll": Method(self._confirm),
+            f"{AUTOMATIC_MACHINE}.Stop": Method(self._ends("Stop")),
+            f"{AUTOMATIC_MACHINE}.Abort": Method(self._ends("Abort")),
+            f"{AUTOMATIC_MACHINE}.StartSingleJob": Method(self._starts(single=True), job),
+            f"{AUTOMATIC_MACHINE}.StartContinuous": Method(self._starts(single=False), job),
+            "RecipeManagement.PrepareRecipe": Method(self._prepare, (*recipe, _boolean(False))),
+            "RecipeManagement.UnprepareRecipe": Method(self._unprepare, recipe),
+            "RecipeManagement.GetRecipeListFiltered": Method(self._recipes, _no_list()),
+        }
+
+    def _results_table(self) -> dict[str, Method]:
+        nothing = ua.Variant()
+        components = (_boolean(False), _number(0), *[nothing] * len(_COMPONENTS))
+        return {
+            "ResultManagement.GetResultById": Method(self._result, (_number(0), nothing)),
+            "ResultManagement.GetResultComponentsById": Method(self._components, components),
+            "ResultManagement.GetResultListFiltered": Method(self._results, _no_list()),
+            "ResultManagement.ReleaseResultHandle": Method(self._release),
+        }
+
+    def _plain_table(self) -> dict[str, Method]:
+        text = ua.Variant("", ua.VariantType.String)
+        return {
+            "Plain.StartJob": Method(self._start_plain, (text,)),
+            "Plain.PrepareRecipe": Method(self._prepare_plain, (_boolean(False),)),
+            "Plain.GetResult": Method(self._result_plain, (_error(0), text, text)),
+        }
+
+    async def call(
+        self, method: Method, types: Sequence[int], arguments: Sequence[ua.Variant]
+    ) -> ua.CallMethodResult | ua.StatusCode | list[ua.Variant]:
+        """Do a method, and return its outputs, with the error's number last.
+
+        Args:
+            method: the method.
+            types: numbers of its arguments' types; 0 for those that are ids or lists.
+            arguments: the client's arguments.
+        """
+        if len(arguments) != len(types):
+            few = len(arguments) < len(types)
+            codes = ua.StatusCodes
+            return ua.StatusCode(codes.BadArgumentsMissing if few else codes.BadTooManyArguments)
+        try:
+            given = [_argument(one, of) for one, of in zip(arguments, types, strict=True)]
+        except MethodArgumentError:
+            return _wrong_arguments(arguments, types)
+        try:
+            async with asyncio.timeout(CALL_SECONDS):
+                outputs = await method.do(*given)
+                await self._settled()
+        except WrongStateError:
+            return ua.StatusCode(ua.StatusCodes.BadInvalidState)
+        except (SmartCamError, TimeoutError, LookupError) as exc:
+            self._nodes.message(str(exc), type(exc).__name__, None)
+            code = NOT_FOUND if isinstance(exc, LookupError) else code_of(exc)
+            return [*method.empty, _error(code)]
+        except asyncio.CancelledError:
+            raise
+        except ENDS_PROGRAM:
+            raise
+        except BaseException as exc:
+            logger.exception("outlet: camera %s", self._nodes.name)
+            self._nodes.message(text_of(exc), type(exc).__name__, None)
+            return ua.StatusCode(ua.StatusCodes.BadInternalError)
+        return [*outputs, _error(0)]
+
+    def _id(self, kind: str, text: str) -> ua.Variant:
+        identity = self._values.identity(kind, text)
+        return ua.Variant(identity, ua.VariantType.ExtensionObject)
+
+    # ------------------------------------------------------------------ states and jobs
+
+    def _changes(self, name: str, target: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
+        async def change(_cause: int = 0, why: str = "") -> list[ua.Variant]:
+            self._system.change(name, target, why)
+            return []
+
+        return change
+
+    async def _confirm(self, _comment: Any) -> list[ua.Variant]:
+        self._nodes.confirmed()
+        return []
+
+    def _ends(self, name: str) -> Callable[..., Awaitable[list[ua.Variant]]]:
+        async def end(_cause: int, why: str) -> list[ua.Variant]:
+            self._system.end_job(name, why)
+            return []
+
+        return end
+
+    def _starts(self, *, single: bool) -> Callable[..., Awaitable[list[ua.Variant]]]:
+        async def start(
+            meas: Any, part: Any, recipe: Any, product: Any, _more: Any
+        ) -> list[ua.Variant]:
+            ids = (
+                self._given("MeasIdDataType", meas),
+                self._given("PartIdDataType", part),
+                self._given("ProductIdDataType", product),
+            )
+            job = self._system.start_job(ids, _text(recipe), single=single)
+            return [self._id("JobIdDataType", job.id)]
+
+        return start
+
+    def _given(self, kind: str, value: Any) -> Any:
+        """Return an id that a client gave, which comes back with the result; None without."""
+        text, told = _text(value), getattr(value, "Description", None)
+        if not text and told is None:
+            return None
+        found = self._values.identity(kind, text)
+        if told is not None and len(told.Text or "") <= MAX_TEXT:
+            found.Description = told
+        return found
+
+    async def _start_plain(self, meas: str, part: str, recipe: str) -> list[ua.Variant]:
+        """Start a single job for a client that knows no structures."""
+        (job,) = await self._starts(single=True)(meas, part, recipe, None, None)
+        return [ua.Variant(job.Value.Id, ua.VariantType.String)]
+
+    async def _prepare_plain(self, recipe: str) -> list[ua.Variant]:
+        """Prepare a recipe for a client that knows no structures."""
+        _, completed = await self._prepare(recipe, None)
+        return [completed]
+
+    async def _result_plain(self, job: str) -> list[ua.Variant]:
+        """Return state, values and error of a job's result to a client that knows no structures."""
+        found = next(
+            self._book.newest(self._nodes.name, lambda one: one.result.job_id == job), None
+        )
+        if not job or found is None:
+            raise KeyError(f"there is no result of job {job!r:.80}")
+        state = ua.Variant(found.result.state, ua.VariantType.Int32)
+        text = ua.Variant(found.text, ua.VariantType.String)
+        return [state, text, ua.Variant(found.result.error, ua.VariantType.String)]
+
+    # ------------------------------------------------------------------ recipes
+
+    async def _prepare(self, external: Any, internal: Any) -> list[ua.Variant]:
+        application = self._system.application_of(_text(external), _text(internal))
+        completed = await self._system.prepare(application)
+        return [self._id("RecipeIdInternalDataType", str(application)), _boolean(completed)]
+
+    async def _unprepare(self, external: Any, internal: Any) -> list[ua.Variant]:
+        application = self._system.application_of(_text(external), _text(internal))
+        if application != self._system.prepared:
+            raise UnknownRecipeError(f"recipe {application} is not prepared")
+        self._system.unprepare()
+        return [self._id("RecipeIdInternalDataType", str(application))]
+
+    async def _recipes(
+        self, external: Any, product: Any, prepared: int, most: int, first: int, timeout: int
+    ) -> list[ua.Variant]:
+        del timeout  # the list is complete in itself
+        ready, name = self._system.prepared, _text(external)
+        known = dict.fromkeys([*self._system.settings.recipes.values()])
+        if self._system.application:
+            known[self._system.application] = None
+        fits = [
+            one
+            for one in known
+            if prepared not in (0, 1) or (one == ready) == bool(prepared)
+            if not name or name in (self._system.recipe_name(one), str(one))
+            if not _text(product)
+        ]
+        page = fits[first : first + _most(most)]
+        listed = [self._values.identity("RecipeIdInternalDataType", str(one)) for one in page]
+        complete = first + len(page) >= len(fits)
+        return [_boolean(complete), _number(len(page)), _number(0), _list(listed)]
+
+    # ------------------------------------------------------------------ results
+
+    def _kept(self, result: Any) -> KeptResult:
+        text = _text(result)
+        found = self._book.get(text, self._nodes.name)
+        if found is None:
+            raise KeyError(f"there is no result {text!r:.120}")
+        return found
+
+    async def _result(self, result: Any, timeout: int) -> list[ua.Variant]:
+        found = self._kept(result)
+        value = ua.Variant(found.value, ua.VariantType.ExtensionObject)
+        return [_number(self._book.handle(timeout)), value]
+
+    async def _components(self, result: Any, timeout: int) -> list[ua.Variant]:
+        value = self._kept(result).value
+        handle = _number(self._book.handle(timeout))
+        outputs = [_boolean(bool(value.HasTransferableDataOnFile)), handle]
+        for name, of in _COMPONENTS:
+            one = getattr(value, name)
+            outputs.append(ua.Variant() if one is None else ua.Variant(one, of))
+        return outputs
+
+    async def _results(self, state: int, *rest: Any) -> list[ua.Variant]:
+        *ids, most, first, timeout = rest
+        wanted = [
+            (name, text) for name, one in zip(_FILTERS, ids, strict=True) if (text := _text(one))
+        ]
+
+        def fits(kept: KeptResult) -> bool:
+            if state and kept.result.state != state:
+                return False
+            found = [getattr(kept.value, name) for name, _ in wanted]
+            texts = [text for _, text in wanted]
+            return all(
+                one is not None and one.Id == text for one, text in zip(found, texts, strict=True)
+            )
+
+        limit = _most(most)
+        found = self._book.newest(self._nodes.name, fits)
+        page = [*itertools.islice(found, first, first + limit + 1)]
+        listed = [one.value for one in page[:limit]]
+        handle = _number(self._book.handle(timeout))
+        return [_boolean(len(page) <= limit), _number(len(listed)), handle, _list(listed)]
+
+    async def _release(self, handle: int) -> list[ua.Variant]:
+        if not self._book.release(handle):
+            raise KeyError(f"there is no handle {handle}")
+        return []
+
+
+_FILTERS = (
+    "MeasId",
+    "PartId",
+    "ExternalRecipeId",
+    "InternalRecipeId",
+    "ExternalConfigurationId",
+    "InternalConfigurationId",
+    "ProductId",
+    "JobId",
+)
+_OBJECT = ua.VariantType.ExtensionObject
+_COMPONENTS = (
+    ("IsPartial", ua.VariantType.Boolean),
+    ("IsSimulated", ua.VariantType.Boolean),
+    ("ResultState", ua.VariantType.Int32),
+    ("MeasId", _OBJECT),
+    ("PartId", _OBJECT),
+    ("ExternalRecipeId", _OBJECT),
+    ("InternalRecipeId", _OBJECT),
+    ("ProductId", _OBJECT),
+    ("ExternalConfigurationId", _OBJECT),
+    ("InternalConfigurationId", _OBJECT),
+    ("JobId", _OBJECT),
+    ("CreationTime", ua.VariantType.DateTime),
+    ("ProcessingTimes", _OBJECT),
+    ("ResultContent", ua.VariantType.Variant),
+)
+
+
+def kind_of(data_type: ua.NodeId, rank: int) -> int:
+    """Return the number of an argument's type; 0 for ids, lists and all that is no plain value."""
+    if rank >= 0:
+        return 0
+    if data_type.NamespaceIndex == 0:
+        number = int(data_type.Identifier)
+        return 0 if number in (ua.ObjectIds.Structure, ua.ObjectIds.BaseDataType) else number
+    derived = {node_ids()[name]: number for name, number in _DERIVED.items()}
+    return derived.get(int(data_type.Identifier), 0)
+
+
+def _argument(given: ua.Variant, kind: int) -> Any:
+    """Return a client's argument as a plain value."""
+    value = given.Value
+    of = _NUMBERS.get(kind)
+    if of is not None:
+        if not isinstance(value, of) or (of is int and isinstance(value, bool)):
+            raise MethodArgumentError
+        return value
+    if kind == ua.ObjectIds.String:
+        return _text(value)
+    if kind == 0 and not isinstance(value, list):
+        _text(value)
+    return value
+
+
+def _text(value: Any) -> str:
+    """Return the text of an id: of a structure, a plain text, or nothing.
+
+    Raises:
+        MethodArgumentError: it is nothing of these, or too long.
+    """
+    text = value if isinstance(value, str) else getattr(value, "Id", None)
+    while text is not None and not isinstance(text, str):  # an id of an id
+        text = getattr(text, "Id", None)
+    empty = value is None or (isinstance(value, ua.ExtensionObject) and not value.Body)
+    if text is None and not empty and not hasattr(value, "Id") and not isinstance(value, int):
+        raise MethodArgumentError
+    text = (text or "").strip()
+    if len(text) > MAX_TEXT:
+        raise MethodArgumentError
+    return text
+
+
+def _wrong_arguments(arguments: Sequence[ua.Variant], types: Sequence[int]) -> ua.CallMethodResult:
+    """Return the answer to a call whose arguments are of wrong types: which ones."""
+    result = ua.CallMethodResult()
+    result.StatusCode = ua.StatusCode(ua.StatusCodes.BadInvalidArgument)
+    for one, of in zip(arguments, types, strict=True):
+        status = ua.StatusCode()
+        try:
+            _argument(one, of)
+        except MethodArgumentError:
+            status = ua.StatusCode(ua.StatusCodes.BadTypeMismatch)
+        result.InputArgumentResults.append(status)
+    return result
+
+
+def _most(wanted: int) -> int:
+    return min(wanted, MAX_LISTED) if wanted else MAX_LISTED
+
+
+def _error(code: int) -> ua.Variant:
+    return ua.Variant(code, ua.VariantType.Int32)
+
+
+def _boolean(value: bool) -> ua.Variant:
+    return ua.Variant(value, ua.VariantType.Boolean)
+
+
+def _number(value: int) -> ua.Variant:
+    return ua.Variant(value, ua.VariantType.UInt32)
+
+
+def _list(values: list[Any]) -> ua.Variant:
+    return ua.Variant(values, ua.VariantType.ExtensionObject, is_array=True)
+
+
+def _no_list() -> tuple[ua.Variant, ...]:
+    return _boolean(True), _number(0), _number(0), _list([])

@@ -1,0 +1,401 @@
+"""The nodes of a camera: what clients browse, read and hear events of."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from asyncua import ua
+from asyncua.common.instantiate_util import instantiate
+
+from smartcam.outlets._opcua.book import KeptResult
+from smartcam.outlets._opcua.nodeset import AUTOMATIC, VISION, Transition, node_ids, state_ids
+from smartcam.outlets._opcua.values import MAX_FIELDS, TYPES, plain, type_of
+from smartcam.outlets._records import records_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from smartcam.outlets._opcua.events import Events
+    from smartcam.outlets._opcua.jobs import VisionJob, VisionResult
+    from smartcam.outlets._opcua.machine import VisionStates
+    from smartcam.outlets._opcua.publishing import PublishQueue
+    from smartcam.outlets._opcua.values import VisionValues
+    from smartcam.outlets._outlet import Column
+
+STATE_MACHINE = "VisionStateMachine"
+AUTOMATIC_MACHINE = f"{STATE_MACHINE}.AutomaticModeStateMachine"
+
+_PARTS: Sequence[tuple[str, str]] = (
+    (AUTOMATIC_MACHINE, AUTOMATIC),
+    ("RecipeManagement", "RecipeManagementType"),
+    ("ResultManagement", "ResultManagementType"),
+    ("ResultManagement.ResultTransfer", "ResultTransferType"),
+)
+"""Optional parts of a vision system that every camera has, with their types."""
+
+_OPTIONAL_METHODS = (
+    (STATE_MACHINE, VISION, ("ConfirmAll", "SelectModeAutomatic")),
+    ("ResultManagement", "ResultManagementType", ("ReleaseResultHandle",)),
+)
+
+_PLAIN: Mapping[str, tuple[ua.VariantType, Any]] = {
+    "State": (ua.VariantType.String, ""),
+    "Error": (ua.VariantType.String, ""),
+    "ResultId": (ua.VariantType.String, ""),
+    "JobId": (ua.VariantType.String, ""),
+    "MeasId": (ua.VariantType.String, ""),
+    "PartId": (ua.VariantType.String, ""),
+    "Recipe": (ua.VariantType.String, ""),
+    "Application": (ua.VariantType.UInt32, 0),
+    "ResultState": (ua.VariantType.Int32, 0),
+    "CreationTime": (ua.VariantType.DateTime, datetime(1970, 1, 1, tzinfo=UTC)),
+    "Records": (ua.VariantType.UInt32, 0),
+    "Value": (ua.VariantType.String, ""),
+    "Count": (ua.VariantType.UInt32, 0),
+}
+"""Plain variables of a camera, with what they are at first; ``Count`` changes last of all."""
+
+
+_TEXT = ua.VariantType.String
+_PLAIN_METHODS: Mapping[str, tuple[Sequence[tuple[str, ua.VariantType]], ...]] = {
+    "StartJob": (
+        (("MeasId", _TEXT), ("PartId", _TEXT), ("Recipe", _TEXT)),
+        (("JobId", _TEXT),),
+    ),
+    "PrepareRecipe": ((("Recipe", _TEXT),), (("IsCompleted", ua.VariantType.Boolean),)),
+    "GetResult": (
+        (("JobId", _TEXT),),
+        (("ResultState", ua.VariantType.Int32), ("Value", _TEXT), ("ErrorText", _TEXT)),
+    ),
+}
+"""Methods for clients that know no structures: arguments and outputs, without the error."""
+
+
+class CameraNodes:
+    """The nodes of one camera; its calls return at once, and what they say is published in order.
+
+    Args:
+        server: server of asyncua, with the nodeset.
+        spaces: indexes of the nodeset's namespace and of that of cameras.
+        name: name of the camera.
+        parts: events, values and the queue of what is published.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        spaces: tuple[int, int],
+        name: str,
+        parts: tuple[Events, VisionValues, PublishQueue],
+    ) -> None:
+        self._server, self.name = server, name
+        self._vision, self._own = spaces
+        self._events, self._values, self._outbox = parts
+        self.root = self.id("")
+        self._count = 0
+        self._trouble, self._confirmed = "", True
+        self.prepared: tuple[str, int] = ("", 0)
+        self._columns: dict[str, tuple[Column, ...]] = {}
+
+    def id(self, path: str) -> ua.NodeId:
+        """Return the id of the node below the camera's that a path of names leads to."""
+        return ua.NodeId(f"{self.name}.{path}" if path else self.name, self._own)
+
+    async def make(self, states: VisionStates) -> None:
+        """Make the nodes."""
+        await self._instance(self._server.nodes.objects, self.root, "VisionSystemType", self._own)
+        for path, kind in _PARTS:
+            parent = self._node(path.rpartition(".")[0])
+            await self._instance(parent, self.id(path), kind, self._vision)
+        for path, kind, methods in _OPTIONAL_METHODS:
+            for method in methods:
+                await self._copy_method(path, kind, method)
+        await self._server.get_node(self.root).set_event_notifier(
+            [ua.EventNotifier.SubscribeToEvents]
+        )
+        await self._server.nodes.server.add_reference(self.root, ua.ObjectIds.HasNotifier)
+        plain_node = await self._node("").add_object(self.id("Plain"), f"{self._own}:Plain")
+        for name, (kind, first) in _PLAIN.items():
+            await plain_node.add_variable(
+                self.id(f"Plain.{name}"), f"{self._own}:{name}", first, varianttype=kind
+            )
+        for name, (inputs, outputs) in _PLAIN_METHODS.items():
+            await plain_node.add_method(
+                self.id(f"Plain.{name}"),
+                ua.QualifiedName(name, self._own),
+                _nothing,
+                [_argument(one, kind) for one, kind in inputs],
+                [_argument(one, kind) for one, kind in (*outputs, ("Error", ua.VariantType.Int32))],
+            )
+        await self._show_states(states.vision, states.automatic)
+
+    def _node(self, path: str) -> Any:
+        return self._server.get_node(self.id(path))
+
+    async def _instance(self, parent: Any, node: ua.NodeId, kind: str, space: int) -> None:
+        of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
+        text = str(node.Identifier)
+        name = text if space == self._own else text.rpartition(".")[2]
+        await instantiate(
+            parent,
+            of,
+            nodeid=node,
+            bname=ua.QualifiedName(name, space),
+            dname=ua.LocalizedText(name),
+            instantiate_optional=False,
+        )
+
+    async def _copy_method(self, path: str, kind: str, method: str) -> None:
+        """Add an optional method to an instance: its type has a node to copy from."""
+        of = self._server.get_node(ua.NodeId(node_ids()[kind], self._vision))
+        pattern = await of.get_child(f"{self._vision}:{method}")
+        found: dict[str, Any] = {"InputArguments": [], "OutputArguments": []}
+        for one in await pattern.get_properties():
+            found[(await one.read_browse_name()).Name] = await one.read_value()
+        inputs, outputs = found["InputArguments"], found["OutputArguments"]
+        name = ua.QualifiedName(method, self._vision)
+        await self._node(path).add_method(
+            self.id(f"{path}.{method}"), name, _nothing, inputs, outputs
+        )
+
+    # ------------------------------------------------------------------ what happens
+
+    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+        """Show a transition, and raise its events."""
+        prepared = self.prepared
+        vision = transition.target if transition.machine == VISION else "Operational"
+        automatic = transition.target if transition.machine == AUTOMATIC else ""
+        if transition.machine == VISION and vision == "Operational":
+            automatic = "Initialized"
+
+        async def publish() -> None:
+            await self._show_states(vision, automatic)
+            fields = self._transition_fields(transition)
+            message = f"{transition.name}{': ' * bool(why)}{why}"
+            kinds = [*transition.effects]
+            if transition.target == "Error" and "ErrorEventType" not in kinds:
+                kinds.append("ErrorEventType")  # as the text of OPC 40100-1 has it
+            for kind in kinds:
+                changes = kind in _CHANGES
+                told = fields if changes else self._job_fields(kind, job, prepared)
+                await self._emit(kind, message, told)
+
+        self._outbox.put(publish)
+
+    def result(
+        self,
+        result: VisionResult,
+        recipe: str,
+        columns: Sequence[Column],
+        keep: Callable[[KeptResult], None],
+    ) -> None:
+        """Show a result, and raise its event.
+
+        Args:
+            result: the result.
+            recipe: name of its recipe.
+            columns: names, types and units of its values.
+            keep: called with what is to be kept of it, before the event.
+        """
+
+        async def publish() -> None:
+            content = await self._values.content(result, columns)
+            value = self._values.result(result, recipe, content)
+            said = result.said.get("value")
+            text = "" if said is None else json.dumps(said, separators=(",", ":"))
+            keep(KeptResult(result, value, recipe, text))
+            await self._show_plain(result, recipe, columns, text)
+            names = value.__dataclass_fields__
+            fields = {
+                name: getattr(value, name)
+                for name in names
+                if name not in ("Encoding", "HasTransferableDataOnFile")
+            }
+            await self._emit("ResultReadyEventType", result.error or result.id, fields)
+
+        self._outbox.put(publish)
+
+    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
+        """Raise an event with a text."""
+        fields: dict[str, Any] = {"CausePath": kind}
+        if job is not None:
+            fields |= {"JobId": self._values.identity("JobIdDataType", job.id)}
+            fields |= {"MeasId": job.meas, "PartId": job.part, "ProductId": job.product}
+
+        async def publish() -> None:
+            await self._write("Plain.Error", ua.Variant(text, ua.VariantType.String))
+            await self._emit("VisionDiagnosticInfoEventType", text, fields)
+
+        self._outbox.put(publish)
+
+    def trouble(self, why: str) -> None:
+        """Show why the camera cannot be used, as a condition; "" when it can."""
+        self._trouble, self._confirmed = why, not why
+        self._outbox.put(lambda: self._show_trouble(why, confirmed=not why))
+
+    def confirmed(self) -> None:
+        """Show that a client has confirmed the condition, if there is one."""
+        if not self._confirmed:
+            self._confirmed, why = True, self._trouble
+            self._outbox.put(lambda: self._show_trouble(why, confirmed=True))
+
+    async def _show_trouble(self, why: str, *, confirmed: bool) -> None:
+        await self._write("Plain.Error", ua.Variant(why, ua.VariantType.String))
+        fields = _condition(self.id("Condition"), bool(why), confirmed) | {"ErrorString": why}
+        text = why or "the camera is there"
+        await self._emit("VisionPersistentErrorConditionType", text, fields)
+
+    # ------------------------------------------------------------------ how it is shown
+
+    async def _emit(self, kind: str, message: str, fields: Mapping[str, Any]) -> None:
+        await self._events.emit(kind, self.root, self.name, message, fields)
+
+    async def _write(self, path: str, value: ua.Variant, status: int = 0) -> None:
+        told = ua.DataValue(value, StatusCode=ua.StatusCode(status), SourceTimestamp=_now())
+        node = self.id(path)
+        (
+            await self._server.iserver.aspace.write_attribute_value(
+                node, ua.AttributeIds.Value, told
+            )
+        ).check()
+
+    async def _show_states(self, vision: str, automatic: str) -> None:
+        for path, machine, state in (
+            (STATE_MACHINE, VISION, vision),
+            (AUTOMATIC_MACHINE, AUTOMATIC, automatic),
+        ):
+            status = 0 if state else ua.StatusCodes.BadStateNotActive
+            text = ua.Variant(ua.LocalizedText(state), ua.VariantType.LocalizedText)
+            node = ua.Variant(self._state(machine, state), ua.VariantType.NodeId)
+            await self._write(f"{path}.CurrentState", text, status)
+            await self._write(f"{path}.CurrentState.Id", node, status)
+        await self._write("Plain.State", ua.Variant(automatic or vision, ua.VariantType.String))
+
+    def _state(self, machine: str, state: str) -> ua.NodeId:
+        """Return the node of a state, which stands in the machine's type."""
+        return ua.NodeId(state_ids()[machine, state], self._vision) if state else ua.NodeId()
+
+    def _transition_fields(self, transition: Transition) -> dict[str, Any]:
+        machine = transition.machine
+        return {
+            "FromState": ua.LocalizedText(transition.source),
+            "FromState/Id": self._state(machine, transition.source),
+            "ToState": ua.LocalizedText(transition.target),
+            "ToState/Id": self._state(machine, transition.target),
+            "Transition": ua.LocalizedText(transition.name),
+            "Transition/Id": ua.NodeId(transition.node, self._vision),
+        }
+
+    def _job_fields(
+        self, kind: str, job: VisionJob | None, prepared: tuple[str, int]
+    ) -> dict[str, Any]:
+        """Return the fields of an event beside a change of state: of a job, or of a recipe."""
+        identity = self._values.identity
+        if kind != "RecipePreparedEventType":
+            return {"JobId": identity("JobIdDataType", "" if job is None else job.id)}
+        recipe, application = prepared
+        return {
+            "ExternalId": identity("RecipeIdExternalDataType", recipe),
+            "InternalId": identity("RecipeIdInternalDataType", str(application)),
+        }
+
+    async def _show_plain(
+        self, result: VisionResult, recipe: str, columns: Sequence[Column], text: str
+    ) -> None:
+        """Write the plain variables, the counter last."""
+        self._count = (self._count + 1) % (1 << 32)
+        records = records_of(result.said.get("value")) or []
+        job = result.job
+        told = {
+            "Error": result.error,
+            "ResultId": result.id,
+            "JobId": result.job_id,
+            "MeasId": "" if job is None or job.meas is None else job.meas.Id,
+            "PartId": "" if job is None or job.part is None else job.part.Id,
+            "Recipe": recipe,
+            "Application": result.application or 0,
+            "ResultState": result.state,
+            "CreationTime": result.created,
+            "Records": len(records),
+            "Value": text,
+        }
+        for name, one in told.items():
+            await self._write(f"Plain.{name}", ua.Variant(one, _PLAIN[name][0]))
+        if columns and result.application is not None:
+            first = records[0] if records and not result.error else {}
+            await self._show_columns(f"App{result.application}", columns[:MAX_FIELDS], first)
+        await self._write("Plain.Count", ua.Variant(self._count, ua.VariantType.UInt32))
+
+    async def _show_columns(
+        self, folder: str, columns: Sequence[Column], record: Mapping[str, Any]
+    ) -> None:
+        """Write the values of the first record; those that are not there get a bad status."""
+        if self._columns.get(folder) != tuple(columns):
+            await self._make_columns(folder, columns)
+        for name, kind, _ in columns:
+            path = f"Plain.{folder}.{name}"
+            try:
+                value = ua.Variant(plain(record[name], kind), type_of(kind))
+            except (KeyError, TypeError, ValueError):
+                await self._write(path, ua.Variant(), ua.StatusCodes.BadNoData)
+            else:
+                await self._write(path, value)
+
+    async def _make_columns(self, folder: str, columns: Sequence[Column]) -> None:
+        """Make a variable for each value; those of a layout before are replaced."""
+        node = self._node(f"Plain.{folder}")
+        if folder in self._columns:
+            await self._server.delete_nodes([node], recursive=True)
+        parent = self._node("Plain")
+        node = await parent.add_object(self.id(f"Plain.{folder}"), f"{self._own}:{folder}")
+        for name, kind, unit in columns:
+            made = await node.add_variable(
+                self.id(f"Plain.{folder}.{name}"),
+                ua.QualifiedName(name, self._own),
+                plain(_ZEROS.get(kind, 0 if kind in TYPES else ""), kind),
+                varianttype=type_of(kind),
+                datatype=ua.NodeId(type_of(kind).value),
+            )
+            if unit:
+                await made.write_attribute(
+                    ua.AttributeIds.Description, ua.DataValue(ua.LocalizedText(unit))
+                )
+        self._columns[folder] = tuple(columns)
+
+
+_ZEROS: Mapping[str, Any] = {"bool": False, "real32": 0.0, "real64": 0.0}
+_CHANGES = ("StateChangedEventType", "ErrorEventType", "ErrorResolvedEventType")
+
+
+def _condition(node: ua.NodeId, active: bool, confirmed: bool) -> dict[str, Any]:
+    return {
+        "NodeId": node,
+        "ConditionName": "Camera",
+        "Retain": active,
+        "EnabledState": ua.LocalizedText("Enabled"),
+        "EnabledState/Id": True,
+        "AckedState": ua.LocalizedText("Acknowledged" if confirmed else "Unacknowledged"),
+        "AckedState/Id": confirmed,
+        "ConfirmedState": ua.LocalizedText("Confirmed" if confirmed else "Unconfirmed"),
+        "ConfirmedState/Id": confirmed,
+        "Quality": ua.StatusCode(),
+        "LastSeverity": 800,
+        "Comment": ua.LocalizedText(""),
+        "BlockReaction": active,
+        "StopReaction": active,
+        "CausePath": "Camera",
+    }
+
+
+def _argument(name: str, kind: ua.VariantType) -> ua.Argument:
+    return ua.Argument(Name=name, DataType=ua.NodeId(kind.value), ValueRank=-1)
+
+
+async def _nothing(_parent: ua.NodeId, *_arguments: ua.Variant) -> ua.StatusCode:
+    return ua.StatusCode(ua.StatusCodes.BadNotImplemented)
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)

@@ -1,0 +1,121 @@
+"""The nodeset of OPC 40100-1: its text, and the transitions of its state machines."""
+
+from __future__ import annotations
+
+import functools
+import gzip
+import importlib.resources
+from typing import TYPE_CHECKING, NamedTuple
+from xml.etree import ElementTree as ET
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+URI = "http://opcfoundation.org/UA/MachineVision"
+"""Namespace of the nodeset."""
+
+VISION = "VisionStateMachineType"
+"""Name of the type of the state machine of a whole vision system."""
+
+AUTOMATIC = "VisionAutomaticModeStateMachineType"
+"""Name of the type of the state machine of jobs."""
+
+_NODE = "{http://opcfoundation.org/UA/2011/03/UANodeSet.xsd}"
+
+
+class Transition(NamedTuple):
+    """A transition of a state machine.
+
+    Attributes:
+        machine: name of the machine's type.
+        name: name of the transition.
+        node: numeric id of its node.
+        source: name of the state before it.
+        target: name of the state behind it.
+        cause: name of the method that causes it; "" for one by itself.
+        effects: names of the types of the events that it raises.
+    """
+
+    machine: str
+    name: str
+    node: int
+    source: str
+    target: str
+    cause: str
+    effects: tuple[str, ...]
+
+
+@functools.cache
+def nodeset_text() -> str:
+    """Return the nodeset as XML."""
+    file = importlib.resources.files(__package__) / "MachineVision.NodeSet2.xml.gz"
+    return gzip.decompress(file.read_bytes()).decode()
+
+
+@functools.cache
+def _nodes() -> Mapping[str, ET.Element]:
+    root = ET.fromstring(nodeset_text())  # noqa: S314 - a file of this package
+    return {one.attrib["NodeId"]: one for one in root if "NodeId" in one.attrib}
+
+
+def _name(node: ET.Element) -> str:
+    return node.attrib["BrowseName"].rpartition(":")[2]
+
+
+@functools.cache
+def node_ids() -> Mapping[str, int]:
+    """Return the numeric ids of all types of the nodeset, by their names."""
+    kinds = ("UAObjectType", "UAVariableType", "UADataType")
+    wanted = {_NODE + kind for kind in kinds}
+    return {_name(one): _number(key) for key, one in _nodes().items() if one.tag in wanted}
+
+
+@functools.cache
+def state_ids() -> Mapping[tuple[str, str], int]:
+    """Return the numeric ids of states, by the names of their machine's type and their own."""
+    found: dict[tuple[str, str], int] = {}
+    for one in transitions():
+        for name, key in _ends(_nodes()[f"ns=1;i={one.node}"]):
+            found[_machine(_nodes()[key]), name] = _number(key)
+    return found
+
+
+@functools.cache
+def transitions() -> tuple[Transition, ...]:
+    """Return the transitions of both machines that the XML says."""
+    found: list[Transition] = []
+    for key, node in _nodes().items():
+        ends = [name for name, _ in _ends(node)]
+        machine = _machine(node)
+        if len(ends) == 2 and machine in (VISION, AUTOMATIC):
+            causes = [_name(_nodes()[one]) for one in _refers(node, "HasCause")]
+            effects = tuple(_name(_nodes()[one]) for one in _refers(node, "HasEffect"))
+            source, target = ends
+            cause = causes[0] if causes else ""
+            made = Transition(machine, _name(node), _number(key), source, target, cause, effects)
+            found.append(made)
+    return tuple(found)
+
+
+def _ends(node: ET.Element) -> list[tuple[str, str]]:
+    """Return names and ids of a transition's states; empty for other nodes."""
+    keys = [*_refers(node, "FromState"), *_refers(node, "ToState")]
+    return [(_name(_nodes()[key]), key) for key in keys]
+
+
+def _refers(node: ET.Element, kind: str) -> list[str]:
+    found = node.iterfind(f"{_NODE}References/{_NODE}Reference")
+    return [
+        one.text or ""
+        for one in found
+        if one.get("ReferenceType") == kind and one.get("IsForward") != "false"
+    ]
+
+
+def _machine(node: ET.Element) -> str:
+    parent = _nodes().get(node.get("ParentNodeId", ""))
+    return "" if parent is None else _name(parent)
+
+
+def _number(key: str) -> int:
+    return int(key.rpartition("=")[2])

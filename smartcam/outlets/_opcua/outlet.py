@@ -1,0 +1,105 @@
+"""The outlet: a server of OPC UA in a thread of its own, and what it is given."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from smartcam._extras import load
+from smartcam._loop_thread import LoopThread
+from smartcam.exceptions import ConfigurationError
+from smartcam.outlets._entry import OutletError
+from smartcam.outlets._opcua.settings import OpcUaSettings
+from smartcam.outlets._outlet import Outlet, OutletDesk
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.outlets._entry import OutletEntry
+    from smartcam.outlets._opcua.server import VisionServer
+
+MAX_STATES = 1_000
+"""Cameras whose state is kept."""
+
+
+class OpcUaOutlet(Outlet[OpcUaSettings]):
+    """Serves cameras as vision systems; each result is delivered when the server has it.
+
+    The server has a thread, so that neither its nodeset nor its clients hold up the cameras.
+    """
+
+    settings_class = OpcUaSettings
+    max_batch: ClassVar[int] = 100
+
+    def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
+        super().__init__(name, settings, folder, desk)
+        self._thread = LoopThread(f"smartcam.outlets.{name}.server")
+        self._loop: asyncio.AbstractEventLoop | None = None  # of the cameras
+        self._server: VisionServer | None = None
+        self._states: dict[str, Mapping[str, Any]] = {}
+        self._open = False
+
+    async def open(self) -> None:
+        """Listen.
+
+        Raises:
+            MissingExtraError: asyncua is not installed.
+            ConfigurationError: a secret, a certificate or a key is not there.
+            OSError: the port is taken.
+        """
+        load("asyncua")
+        from smartcam.outlets._opcua.server import VisionServer
+
+        self._loop = asyncio.get_running_loop()
+        desk = OutletDesk(self.desk.columns, self._command, self.desk.cameras)
+        await asyncio.to_thread(self._thread.start)
+        self._server = server = VisionServer(self.name, self.settings, self.folder, desk)
+        await self._there(server.start())
+        self._open = True
+        for camera, state in self._states.items():
+            self._tell(server, camera, state)
+
+    async def deliver(self, entries: Sequence[OutletEntry]) -> None:
+        """Have entries published."""
+        if self._server is None:
+            raise OutletError("the server does not listen")
+        await self._there(self._server.publish(entries))
+
+    def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
+        """Have the camera's state published soon."""
+        if camera in self._states or len(self._states) < MAX_STATES:
+            self._states[camera] = state
+            if self._open and self._server is not None:
+                self._tell(self._server, camera, state)
+
+    async def watch(self) -> None:
+        """Wait until the server fails."""
+        if self._server is not None:
+            await self._there(self._server.failed())
+
+    async def close(self) -> None:
+        """Stop listening."""
+        server, self._server, self._open = self._server, None, False
+        try:
+            if server is not None:
+                await self._there(server.stop())
+        finally:
+            await asyncio.to_thread(self._thread.stop)
+
+    def _tell(self, server: VisionServer, camera: str, state: Mapping[str, Any]) -> None:
+        self._thread.post(lambda: server.state_changed(camera, state))
+
+    async def _there(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run a coroutine in the server's thread."""
+        await asyncio.wrap_future(self._thread.submit(work))
+
+    async def _command(self, camera: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Do a command in the cameras' thread; called in the server's."""
+        if self.desk.command is None or self._loop is None:
+            raise ConfigurationError("commands are not allowed here")
+        work: Any = self.desk.command(camera, verb, given)
+        done: dict[str, Any] = await asyncio.wrap_future(
+            asyncio.run_coroutine_threadsafe(work, self._loop)
+        )
+        return done

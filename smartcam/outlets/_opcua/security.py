@@ -1,0 +1,176 @@
+"""Access to the server: users, certificates, and what anonymous clients may do."""
+
+from __future__ import annotations
+
+import hmac
+import os
+import socket
+from typing import TYPE_CHECKING, Any
+
+from asyncua import ua
+from asyncua.crypto import cert_gen
+from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
+from asyncua.crypto.truststore import TrustStore
+from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from smartcam.exceptions import ConfigurationError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam.outlets._opcua.settings import OpcUaSettings
+
+CERTIFICATE_DAYS = 3650
+"""Days for which a certificate is good that the server makes for itself."""
+
+_READING = (
+    ua.ObjectIds.CreateSessionRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.CloseSessionRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.ActivateSessionRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.ReadRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.BrowseRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.GetEndpointsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.FindServersRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.TranslateBrowsePathsToNodeIdsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.CreateSubscriptionRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.ModifySubscriptionRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.DeleteSubscriptionsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.TransferSubscriptionsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.CreateMonitoredItemsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.ModifyMonitoredItemsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.DeleteMonitoredItemsRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.PublishRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.RepublishRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.CloseSecureChannelRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.SetMonitoringModeRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.SetPublishingModeRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.RegisterNodesRequest_Encoding_DefaultBinary,
+    ua.ObjectIds.UnregisterNodesRequest_Encoding_DefaultBinary,
+)
+"""Services of clients that may only read."""
+
+
+class Users:
+    """The users of a server, as asyncua asks for them.
+
+    Args:
+        settings: settings of the server.
+        folder: folder of relative paths.
+
+    Raises:
+        ConfigurationError: a password is not where it is said to be.
+    """
+
+    def __init__(self, settings: OpcUaSettings, folder: Path) -> None:
+        self._anonymous = settings.anonymous
+        self._passwords = {name: one.read(folder) for name, one in settings.users.items()}
+        for name, password in self._passwords.items():
+            if not password:
+                raise ConfigurationError(f"users.{name}: the password is empty")
+
+    def get_user(
+        self,
+        iserver: Any,
+        username: str | None = None,
+        password: str | None = None,
+        certificate: Any = None,
+    ) -> User | None:
+        """Return a user with rights, or None for one who may not come in."""
+        del iserver, certificate  # the channel has looked at it
+        if username is not None:
+            known = self._passwords.get(username)
+            given = (password or "").encode()
+            fits = hmac.compare_digest((known or "").encode(), given)
+            return User(UserRole.User, username) if known and fits else None
+        roles = {"read": UserRole.Anonymous, "control": UserRole.User}
+        role = roles.get(self._anonymous)
+        return None if role is None else User(role, "anonymous")
+
+
+class Rights(SimpleRoleRuleset):  # type: ignore[misc] # asyncua's types are not followed
+    """The rights of users: anonymous ones may read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._permission_dict[UserRole.Anonymous] = {*map(ua.NodeId, _READING)}
+
+
+def tokens(settings: OpcUaSettings) -> list[type]:
+    """Return the ways to log in."""
+    anonymous = [] if settings.anonymous == "no" else [ua.AnonymousIdentityToken]
+    return anonymous + ([ua.UserNameIdentityToken] if settings.users else [])
+
+
+def policies(settings: OpcUaSettings) -> list[ua.SecurityPolicyType]:
+    """Return the security policies that are offered."""
+    of = ua.SecurityPolicyType
+    return [
+        of.Basic256Sha256_SignAndEncrypt,
+        of.Aes128Sha256RsaOaep_SignAndEncrypt,
+        of.Aes256Sha256RsaPss_SignAndEncrypt,
+        *((of.NoSecurity,) if settings.unencrypted else ()),
+    ]
+
+
+async def secure(server: Any, name: str, settings: OpcUaSettings, folder: Path) -> None:
+    """Give a server its certificate, its policies and its rule of whom it trusts.
+
+    Raises:
+        ConfigurationError: a certificate or a key is not there, or is of no use.
+    """
+    try:
+        if settings.certificate is None or settings.key is None:
+            beside = folder / settings.spool
+            certificate, key = beside / f"{name}.opcua.der", beside / f"{name}.opcua.pem"
+            if not (certificate.is_file() and key.is_file()):
+                _make(certificate, key, f"urn:{socket.gethostname()}:smartcam:{name}")
+        else:
+            certificate, key = folder / settings.certificate, folder / settings.key
+        await server.load_certificate(certificate)
+        await server.load_private_key(key)
+        await server.set_application_uri(_application_uri(server.iserver.certificate))
+        if settings.clients is not None:
+            if not (folder / settings.clients).is_dir():
+                raise ValueError(f"clients: {folder / settings.clients} is no folder")
+            server.set_certificate_validator(await _validator(folder / settings.clients))
+    except (OSError, ValueError, x509.ExtensionNotFound) as exc:
+        raise ConfigurationError(f"outlet {name}: certificate: {exc}") from exc
+    server.set_security_policy(policies(settings), Rights())
+    server.set_identity_tokens(tokens(settings))
+
+
+def _application_uri(certificate: x509.Certificate) -> str:
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    uris = names.get_values_for_type(x509.UniformResourceIdentifier)
+    if not uris:
+        raise ValueError("it names no application: a URI among its alternative names is missing")
+    return str(uris[0])
+
+
+def _make(certificate: Path, key: Path, uri: str) -> None:
+    """Make a certificate that signs itself, and its key, which nobody else may read."""
+    made = cert_gen.generate_private_key()
+    host = socket.gethostname()
+    signed = cert_gen.generate_self_signed_app_certificate(
+        made,
+        uri.rpartition(":")[2],
+        {"organizationName": "smartcam"},
+        [x509.UniformResourceIdentifier(uri), x509.DNSName(host)],
+        [ExtendedKeyUsageOID.SERVER_AUTH],
+        days=CERTIFICATE_DAYS,
+    )
+    certificate.parent.mkdir(parents=True, exist_ok=True)
+    handle = os.open(key, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+    with open(handle, "wb") as stream:  # noqa: PTH123 - of a handle
+        stream.write(cert_gen.dump_private_key_as_pem(made))
+    certificate.write_bytes(signed.public_bytes(Encoding.DER))
+
+
+async def _validator(folder: Path) -> CertificateValidator:
+    store = TrustStore([folder], [])
+    await store.load()
+    of = CertificateValidatorOptions
+    return CertificateValidator(of.TIME_RANGE | of.URI | of.TRUSTED | of.PEER_CLIENT, store)

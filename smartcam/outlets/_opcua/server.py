@@ -1,0 +1,271 @@
+"""The server: cameras as vision systems, what they bring, and what clients ask."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import itertools
+import logging
+import secrets
+from typing import TYPE_CHECKING, Any
+
+from asyncua import Server, ua
+
+from smartcam._user_code import text_of
+from smartcam.exceptions import ConfigurationError, SmartCamError
+from smartcam.outlets._opcua.book import ResultBook
+from smartcam.outlets._opcua.events import Events
+from smartcam.outlets._opcua.files import TransferFiles
+from smartcam.outlets._opcua.methods import Method, Methods, kind_of
+from smartcam.outlets._opcua.nodes import CameraNodes
+from smartcam.outlets._opcua.nodeset import AUTOMATIC, URI, VISION, node_ids, nodeset_text
+from smartcam.outlets._opcua.publishing import PublishQueue
+from smartcam.outlets._opcua.security import Users, secure
+from smartcam.outlets._opcua.system import VisionSystem
+from smartcam.outlets._opcua.values import VisionValues
+from smartcam.outlets._records import picture_of
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from smartcam.outlets._entry import OutletEntry
+    from smartcam.outlets._opcua.jobs import VisionJob, VisionResult
+    from smartcam.outlets._opcua.nodeset import Transition
+    from smartcam.outlets._opcua.settings import OpcUaSettings
+    from smartcam.outlets._outlet import Column, OutletDesk
+
+logger: logging.Logger = logging.getLogger("smartcam.outlets")
+
+MAX_CAMERAS = 1_000
+"""Cameras of one server."""
+
+MAX_CONNECTIONS = 100
+"""Clients of one server at a time."""
+
+METHOD_TYPES = (VISION, AUTOMATIC, "RecipeManagementType", "ResultManagementType")
+"""Types whose methods a camera has."""
+
+OWN_URI = "urn:smartcam:outlets:opcua"
+"""Namespace of cameras and of the structures made from their layouts."""
+
+
+class VisionServer:
+    """A server of OPC UA with a vision system for each camera.
+
+    Args:
+        name: name of the outlet.
+        settings: settings of the server.
+        folder: folder of relative paths.
+        desk: what it may ask of the process that has the cameras.
+    """
+
+    def __init__(self, name: str, settings: OpcUaSettings, folder: Path, desk: OutletDesk) -> None:
+        self.name, self.settings, self.folder, self.desk = name, settings, folder, desk
+        self.outbox = PublishQueue()
+        self.book = ResultBook(settings.kept_results)
+        self.cameras: dict[str, CameraFace] = {}
+        self._states: dict[str, Mapping[str, Any]] = {}
+        self._making: dict[str, asyncio.Task[None]] = {}
+        self.calls: dict[tuple[ua.NodeId, str], Callable[..., Awaitable[Any]]] = {}
+        self._run_id, self._jobs = secrets.token_hex(4), itertools.count(1)
+        self.server: Any = None
+        self.files: TransferFiles | None = None
+
+    async def start(self) -> None:
+        """Listen.
+
+        Raises:
+            ConfigurationError: a secret, a certificate or a key is not there.
+            OSError: the port is taken.
+        """
+        self.server = server = Server(user_manager=Users(self.settings, self.folder))
+        await server.init()
+        server.set_server_name(f"smartcam {self.name}")
+        server.product_uri = "urn:smartcam"
+        server.set_endpoint(self.settings.listen)
+        server.iserver.max_connections = MAX_CONNECTIONS
+        await secure(server, self.name, self.settings, self.folder)
+        await server.import_xml(xmlstring=nodeset_text())
+        vision = await server.get_namespace_index(URI)
+        own = await server.register_namespace(OWN_URI)
+        self.spaces = vision, own
+        self.values = VisionValues(server, vision, own)
+        self.events = Events(server, vision)
+        self.files = TransferFiles(server, own)
+        await self._link_types()
+        self.outbox.start()
+        chosen = filter(self.settings.chooses, self.desk.cameras())
+        for name in itertools.islice(chosen, MAX_CAMERAS):
+            await self._make(name)
+        await server.start()
+
+    async def _link_types(self) -> None:
+        """Let clients call a camera's methods by the nodes of their types, too."""
+        for kind in METHOD_TYPES:
+            of = self.server.get_node(ua.NodeId(node_ids()[kind], self.spaces[0]))
+            for method in await of.get_methods():
+                name = (await method.read_browse_name()).Name
+                self.server.link_method(method, functools.partial(self._call, name))
+
+    async def _call(self, name: str, parent: ua.NodeId, *arguments: ua.Variant) -> Any:
+        call = self.calls.get((parent, name))
+        if call is None:
+            return ua.StatusCode(ua.StatusCodes.BadMethodInvalid)
+        return await call(parent, *arguments)
+
+    async def stop(self) -> None:
+        """End jobs, and stop listening; whatever fails, the port is free afterwards."""
+        for task in [*self._making.values()]:
+            task.cancel()
+        server, self.server = self.server, None
+        async with contextlib.AsyncExitStack() as stack:
+            if server is not None:
+                stack.push_async_callback(server.stop)
+            if self.files is not None:
+                stack.callback(self.files.close)
+            stack.push_async_callback(self.outbox.stop)
+            for camera in self.cameras.values():
+                stack.push_async_callback(camera.system.close)
+
+    async def failed(self) -> None:
+        """Wait until nothing can be published any more, and raise the reason."""
+        await self.outbox.failed()
+
+    def new_job(self) -> str:
+        """Return an id for a job, unlike all before, also those of earlier runs."""
+        return f"{self._run_id}-{next(self._jobs)}"
+
+    # ------------------------------------------------------------------ what cameras bring
+
+    def state_changed(self, camera: str, state: Mapping[str, Any]) -> None:
+        """Follow a camera's state; make the nodes of a new one."""
+        face = self.cameras.get(camera)
+        if face is not None:
+            face.system.camera_changed(state)
+            return
+        self._states[camera] = state
+        if camera not in self._making and len(self.cameras) < MAX_CAMERAS:
+            task = asyncio.get_running_loop().create_task(self._make(camera))
+            self._making[camera] = task
+            task.add_done_callback(lambda done: self._made(camera, done))
+
+    def _made(self, camera: str, done: asyncio.Task[None]) -> None:
+        self._making.pop(camera, None)
+        if not done.cancelled() and (error := done.exception()) is not None:
+            logger.error("outlet %s: camera %s: %s", self.name, camera, text_of(error))
+
+    async def publish(self, entries: Sequence[OutletEntry]) -> None:
+        """Publish entries, and return when clients can see them."""
+        for entry in entries:
+            if entry.camera and entry.camera not in self.cameras:
+                await self._make(entry.camera)
+            faces = [self.cameras[entry.camera]] if entry.camera else [*self.cameras.values()]
+            for face in faces:  # a gap may be one of all cameras
+                face.system.take(entry)
+        await self.outbox.settled()
+
+    async def _make(self, name: str) -> None:
+        """Make the nodes of a camera, once."""
+        making = self._making.get(name)
+        if making is not None and making is not asyncio.current_task():
+            await asyncio.shield(making)
+        if name in self.cameras:
+            return
+        if len(self.cameras) >= MAX_CAMERAS:
+            raise ConfigurationError(f"expected {MAX_CAMERAS} cameras at most")
+        face = CameraFace(self, name)
+        await face.make()
+        self.cameras[name] = face
+        state = self._states.pop(name, None)
+        if state is not None:
+            face.system.camera_changed(state)
+
+
+class CameraFace:
+    """One camera: its states and jobs, and the nodes that show them.
+
+    Args:
+        server: server that has it.
+        name: name of the camera.
+    """
+
+    def __init__(self, server: VisionServer, name: str) -> None:
+        self._server, self._settings = server, server.settings
+        parts = server.events, server.values, server.outbox
+        self.nodes = CameraNodes(server.server, server.spaces, name, parts)
+        self.system = VisionSystem(
+            name,
+            server.settings,
+            self._command,
+            self,
+            picture=self._picture,
+            new_job=server.new_job,
+            simulated=dict(server.desk.cameras()).get(name),
+        )
+        self._methods = Methods(
+            self.system, self.nodes, server.values, server.book, server.outbox.settled
+        )
+
+    async def make(self) -> None:
+        """Make the nodes, and link the methods."""
+        await self.nodes.make(self.system.states)
+        for path, method in self._methods.table().items():
+            await self._link(path, method)
+        if self._server.files is not None:
+            await self._server.files.link(self.nodes, self._server.book)
+
+    async def _link(self, path: str, method: Method) -> None:
+        node = self._server.server.get_node(self.nodes.id(path))
+        types: list[int] = []
+        with contextlib.suppress(ua.UaStatusCodeError):  # a method without arguments
+            inputs = await (await node.get_child("0:InputArguments")).read_value()
+            types = [kind_of(one.DataType, one.ValueRank) for one in inputs]
+
+        async def call(_parent: ua.NodeId, *arguments: ua.Variant) -> Any:
+            return await self._methods.call(method, types, arguments)
+
+        self._server.server.link_method(node, call)
+        parent, _, name = path.rpartition(".")
+        self._server.calls[self.nodes.id(parent), name] = call
+
+    async def _command(self, name: str, verb: str, given: Mapping[str, Any]) -> dict[str, Any]:
+        if self._server.desk.command is None:
+            raise ConfigurationError("commands are not allowed here")
+        return await self._server.desk.command(name, verb, given)
+
+    def _picture(self, said: Mapping[str, Any]) -> Path | None:
+        pattern = self._settings.pictures
+        return None if pattern is None else picture_of(pattern, self._server.folder, said)
+
+    # ------------------------------------------------------------------ what clients see
+
+    def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
+        """Show a transition, and raise its events."""
+        application = self.system.prepared or 0
+        self.nodes.prepared = self.system.recipe_name(application), application
+        self.nodes.moved(transition, job, why)
+
+    def result(self, result: VisionResult) -> None:
+        """Show a result, and raise its event."""
+        recipe = self.system.recipe_name(result.application)
+        self.nodes.result(result, recipe, self._columns(result), self._server.book.add)
+
+    def _columns(self, result: VisionResult) -> Sequence[Column]:
+        """Return the columns of a result's layout; none where it cannot be read."""
+        if result.application is None:
+            return ()
+        try:
+            return self._server.desk.columns(result.camera, result.application)
+        except SmartCamError as exc:
+            self.message(f"application {result.application}: {exc}", type(exc).__name__, None)
+            return ()
+
+    def message(self, text: str, kind: str, job: VisionJob | None) -> None:
+        """Raise an event with a text."""
+        self.nodes.message(text, kind, job)
+
+    def trouble(self, why: str) -> None:
+        """Show why the camera cannot be used; "" when it can."""
+        self.nodes.trouble(why)

@@ -1,0 +1,94 @@
+"""Settings of a server of OPC UA."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, Field, model_validator
+
+from smartcam.outlets._settings import OutletSettings, Secret
+
+MAX_USERS = 100
+"""Users of one server."""
+
+MAX_RECIPES = 1000
+"""Names for applications."""
+
+
+def _endpoint(text: str) -> str:
+    try:
+        parts = urlsplit(text)
+        fits = parts.scheme == "opc.tcp" and parts.hostname and parts.port
+        fits = fits and not (parts.query or parts.username)
+    except ValueError:
+        fits = False
+    if not fits:
+        raise ValueError("expected opc.tcp://HOST:PORT, such as opc.tcp://0.0.0.0:4840")
+    return text
+
+
+class OpcUaSettings(OutletSettings):
+    """The settings of a server of OPC UA."""
+
+    timeout: float = Field(
+        120.0, gt=0, le=3600, description="seconds within which the server listens"
+    )
+    listen: Annotated[str, AfterValidator(_endpoint)] = Field(
+        description="opc.tcp://HOST:PORT; 0.0.0.0 for all of this computer's addresses"
+    )
+    users: dict[str, Secret] = Field(
+        {},
+        max_length=MAX_USERS,
+        description="who may log in, and where the password is: {plc: {file: PATH}}",
+    )
+    anonymous: Literal["no", "read", "control"] = Field(
+        "no",
+        description="what everybody may do who can reach the server: read sees values and events, "
+        "control calls methods, too",
+    )
+    unencrypted: bool = Field(
+        False, description="also without encryption, which passwords are then sent without, too"
+    )
+    certificate: str | None = Field(
+        None,
+        min_length=1,
+        description="file of the server's own; made beside the spool if not said",
+    )
+    key: str | None = Field(
+        None, min_length=1, description="file of the certificate's private key, in PEM"
+    )
+    clients: str | None = Field(
+        None, min_length=1, description="folder of certificates; no other clients come in encrypted"
+    )
+    recipes: dict[str, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(
+        {}, max_length=MAX_RECIPES, description="names for applications: {housing: 7}"
+    )
+    automatic: bool = Field(
+        True,
+        description="become ready without a client: when the camera is there, and again when it "
+        "is back",
+    )
+    trigger_timeout: float = Field(
+        5.0, gt=0, le=300, description="seconds within which a job has its result"
+    )
+    switch_timeout: float = Field(
+        10.0, gt=0, le=300, description="seconds within which another application is ready"
+    )
+    kept_results: int = Field(
+        1000, ge=1, le=100_000, description="results of all cameras that clients may ask for"
+    )
+    pictures: str | None = Field(
+        None,
+        min_length=1,
+        description="place of a result's picture, beside this file, with {camera}, {application}, "
+        "{number} and {sequence} in it; clients get it by ResultTransfer",
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> Any:
+        if not self.users and self.anonymous == "no":
+            raise ValueError("nobody could log in: expected users:, or anonymous: read or control")
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("expected both certificate and key, or neither")
+        return self

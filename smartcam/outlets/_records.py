@@ -1,0 +1,50 @@
+"""The records of a result's value, and the file of its picture, for stores and servers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+
+def picture_of(pattern: str, folder: Path, said: Mapping[str, Any]) -> Path | None:
+    """Return the file of a result's picture; None where there is none below the folder.
+
+    Args:
+        pattern: place of the file, with ``{camera}``, ``{application}``, ``{number}`` and
+            ``{sequence}``.
+        folder: folder of relative places.
+        said: fields of the result.
+    """
+    for name in ("camera", "application", "number", "sequence"):
+        pattern = pattern.replace(f"{{{name}}}", str(said.get(name, "")))
+    path = folder / pattern
+    below = path.resolve().is_relative_to(folder.resolve())
+    return path if below and path.is_file() else None
+
+
+def records_of(value: Any) -> list[dict[str, Any]] | None:
+    """Return the records of a value, a mapping of plain values each; None where it has none."""
+    if isinstance(value, dict):
+        fields = cast("dict[str, Any]", value)
+        lists = [name for name, one in fields.items() if isinstance(one, list)]
+        if len(lists) == 1 and all(isinstance(one, dict) for one in fields[lists[0]]):
+            head = {name: one for name, one in fields.items() if name != lists[0]}
+            return [_flat({**head, **one}) for one in fields[lists[0]]] or [_flat(head)]
+        return [_flat(fields)]
+    if isinstance(value, list) and all(isinstance(one, dict) for one in value):
+        return [_flat(one) for one in cast("list[dict[str, Any]]", value)]
+    return None
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    """Return a record with the pose of a localization as plain values."""
+    pose = record.get("pose")
+    if not isinstance(pose, dict) or "orientation" not in pose:
+        return record
+    told = cast("dict[str, dict[str, Any]]", pose)
+    turned = {f"q{axis}": value for axis, value in told["orientation"].items()}
+    rest = {name: one for name, one in record.items() if name != "pose"}
+    return {**rest, **told["position"], **turned}
