@@ -37,7 +37,6 @@ from smartcam.emulator import (
 )
 from smartcam.fleet._inside import RecordSection
 from smartcam.frames import Codecs, FrameGroup, FrameSource, RateControl, RtpSender, RtspServer
-from smartcam.outlets import Outlets
 from smartcam.inspection import (
     Picture,
     Software,
@@ -50,6 +49,7 @@ from smartcam.inspection import (
     software_mistakes,
 )
 from smartcam.models import Result
+from smartcam.outlets import Outlets
 from smartcam.recording import (
     FleetRecorder,
     FleetReplay,

@@ -395,7 +395,7 @@ class FleetFile(Fields):
     )
     outlets: dict[str, dict[str, Any]] | None = Field(
         None,
-        description="where results go, by the outlet's name: mqtt, opcua, sqlite, those of plug-ins",
+        description="where results go, by the outlet's name: mqtt, opcua, sqlite or a plug-in",
     )
     calibrations: str | None = Field(
         None,

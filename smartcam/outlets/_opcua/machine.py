@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from smartcam.outlets._entry import OutletError
+from smartcam.exceptions import OutletError
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, VISION, Transition, transitions
 
 

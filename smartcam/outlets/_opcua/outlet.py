@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from smartcam._extras import load
 from smartcam._loop_thread import LoopThread
-from smartcam.exceptions import ConfigurationError
-from smartcam.outlets._entry import OutletError
+from smartcam.exceptions import ConfigurationError, OutletError
 from smartcam.outlets._opcua.settings import OpcUaSettings
 from smartcam.outlets._outlet import Outlet, OutletDesk
 
