@@ -22,6 +22,7 @@ from smartcam._arguments import check_flag
 from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
 from smartcam.calibration._homography import derivatives
+from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
@@ -242,6 +243,7 @@ class SheetCalibration(storage.SavedCalibration):
     plane=of_class("PlaneCalibration"),
     camera=or_none(of_class("CameraModel")),
 )
+@one_blas_thread
 def calibrate_sheet(
     view: TargetView,
     plane: PlaneCalibration,
