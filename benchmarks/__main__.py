@@ -22,6 +22,7 @@ __all__: list[str] = []
 
 BENCHMARKS = {
     "trigger": "await trigger() against a bare protocol and pymodbus, over TCP and UDP",
+    "questions": "query_application(), and connect and close, above a bare protocol",
     "sync": "camera.trigger() without asyncio, above await of it",
     "stream": "results as fast as the link gives them, one by one and in batches",
     "decode": "from a container's bytes to a table, localizations, texts",
