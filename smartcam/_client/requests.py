@@ -31,7 +31,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
-    from smartcam._client.waits import Answer, Waits
+    from smartcam._client.waits import OwedAnswer, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -157,7 +157,7 @@ class Requests:
 
     async def post(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
-    ) -> asyncio.Future[Answer]:
+    ) -> OwedAnswer:
         """Send a request as soon as none of its kind is open; its answer is owed from then on.
 
         Args:
@@ -182,13 +182,11 @@ class Requests:
         finally:
             lock.release()
 
-    def _send(
-        self, message: m.Message, key: type[m.Message] | int, deadline: float
-    ) -> asyncio.Future[Answer]:
+    def _send(self, message: m.Message, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
         self._connection.require_link().send(message)
         return self.expect(key, deadline)
 
-    def expect(self, key: type[m.Message] | int, deadline: float) -> asyncio.Future[Answer]:
+    def expect(self, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
         """Register for the answer to a request that was just sent, awaited until ``deadline``.
 
         It may come later: it is due when an answer of its kind has had its usual time, too.
@@ -266,7 +264,7 @@ class Requests:
         if loop.time() + TIMER_RESOLUTION >= self._due[key]:
             self._connection.require_link().give_up(error)
 
-    async def _take_answer(self, answer: asyncio.Future[Answer], deadline: float) -> m.Message:
+    async def _take_answer(self, answer: OwedAnswer, deadline: float) -> m.Message:
         if not answer.done():
             await _done_or_late(answer, deadline)
             if not answer.done():
@@ -287,22 +285,22 @@ class Requests:
         )
 
 
-async def _done_or_late(answer: asyncio.Future[Answer], deadline: float) -> None:
-    """Wait until an answer is there or the deadline is over, at a third of ``asyncio.wait``'s cost.
+async def _done_or_late(answer: OwedAnswer, deadline: float) -> None:
+    """Wait until an answer is there or the deadline is over.
 
-    The future is left alone when the task that waits is cancelled: the answer stays owed.
+    The answer is left alone when the task that waits is cancelled: it stays owed.
     """
     loop = asyncio.get_running_loop()
     waiter: asyncio.Future[None] = loop.create_future()
-
-    def go_on(_: object = None) -> None:
-        if not waiter.done():
-            waiter.set_result(None)
-
-    answer.add_done_callback(go_on)
-    timer = loop.call_at(deadline, go_on)
+    answer.waiters.append(waiter)
+    timer = loop.call_at(deadline, _wake, waiter)
     try:
         await waiter
     finally:
         timer.cancel()
-        answer.remove_done_callback(go_on)
+        answer.waiters.remove(waiter)
+
+
+def _wake(waiter: asyncio.Future[None]) -> None:
+    if not waiter.done():
+        waiter.set_result(None)
