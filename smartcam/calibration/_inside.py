@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from smartcam.calibration._files.load import AnyCalibration
     from smartcam.calibration._lens.comparison import compare_lenses, rig_difference
     from smartcam.calibration._lens.uncertainty import MapFigures
-    from smartcam.calibration._one_blas_thread import OneBlasThread
     from smartcam.calibration._plane.drawing import draw
     from smartcam.calibration._printing.sheets import on_paper
     from smartcam.calibration._stereo.rectification import Rectification, rectify
@@ -48,7 +47,6 @@ __all__ = [
     "CameraInfo",
     "Input",
     "MapFigures",
-    "OneBlasThread",
     "PixelPoseRequest",
     "Rectification",
     "StepRequest",
@@ -77,7 +75,6 @@ if not TYPE_CHECKING:
             "_files.load": "AnyCalibration",
             "_lens.comparison": "compare_lenses rig_difference",
             "_lens.uncertainty": "MapFigures",
-            "_one_blas_thread": "OneBlasThread",
             "_plane.drawing": "draw",
             "_printing.sheets": "on_paper",
             "_stereo.rectification": "Rectification rectify",
