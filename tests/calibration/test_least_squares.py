@@ -120,11 +120,8 @@ PATIENCE = 30.0
 def threads() -> list[int]:
     """Return the number of threads of each BLAS in the process."""
     np.ones((2, 2)) @ np.ones((2, 2))
-    return [
-        one["num_threads"]
-        for one in load("threadpoolctl").threadpool_info()
-        if "blas" in one["prefix"]
-    ]
+    found = load("threadpoolctl").threadpool_info()
+    return [one["num_threads"] for one in found if "blas" in one["prefix"]]
 
 
 @pytest.fixture
