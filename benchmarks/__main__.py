@@ -22,6 +22,7 @@ __all__: list[str] = []
 
 BENCHMARKS = {
     "trigger": "await trigger() against a bare protocol and pymodbus, over TCP and UDP",
+    "questions": "query_application(), and connect and close, above a bare protocol",
     "sync": "camera.trigger() without asyncio, above await of it",
     "stream": "results as fast as the link gives them, one by one and in batches",
     "decode": "from a container's bytes to a table, localizations, texts",
@@ -42,6 +43,7 @@ BENCHMARKS = {
     "stereo": "squares of OpenCV's pairs that were left out; boards against dots",
     "hand_eye": "error of a camera on a robot over the bound, and of recorded poses left out",
     "frames": "a frame to its readers and to a JPEG, and the delay of the loop",
+    "pixels": "colours and brightness of pixel formats, beside OpenCV alone",
     "inspection": "a software camera's trigger above its tools, and the delay of the loop",
     "pictures": "bytes of a picture at the same PSNR, and the CPU time of codecs",
     "transports": "pictures from stamp to stamp: bus, RTP, on request, GStreamer, rospy",

@@ -41,6 +41,7 @@ PACKAGES: Final = {
     "scipy": Package("SciPy", "calibration", "calibration needs"),
     "simplejpeg": Package("simplejpeg", "frames", "JPEG needs"),
     "small_gicp": Package("small-gicp", "depth", "registration needs"),
+    "threadpoolctl": Package("threadpoolctl", "calibration", "calibration needs"),
     "yaml": Package("PyYAML", "yaml", "YAML needs"),
     "zenoh": Package("Zenoh", "fleet", "a fleet over the network needs"),
     "zxingcpp": Package("zxing-cpp", "inspection", "reading codes needs"),

@@ -63,7 +63,7 @@ class Registry:
         infos = [PluginInfo(name, target, "built-in") for name, target in self._builtins.items()]
         infos += [PluginInfo(name, "", "registered") for name in self._registered]
         for name, points in self._entry_points().items():
-            if name not in self._builtins and name not in self._registered:
+            if name not in self._registered:
                 origin = ", ".join(_distribution(point) for point in points)
                 infos.append(PluginInfo(name, points[0].value, origin))
         return sorted(infos)
@@ -89,8 +89,7 @@ class Registry:
         """Return the plug-in of a name, importing it at the first call.
 
         Raises:
-            PluginError: unknown, provided by two distributions (or by one that takes a built-in's
-                name), or its import failed.
+            PluginError: unknown, provided by two distributions, or its import failed.
         """
         name = self._aliases.get(name, name)
         if name not in self._loaded:
@@ -108,20 +107,21 @@ class Registry:
             self._found = {}
             for point in _points(self.group):
                 self._found.setdefault(point.name, []).append(point)
+            for name in self._builtins.keys() & self._found.keys():
+                _log.warning(
+                    "%s: the name %s is smartcam's own, that of %s is left out",
+                    self.group,
+                    shown(name),
+                    " and ".join(_distribution(point) for point in self._found.pop(name)),
+                )
         return self._found
 
     def _load(self, name: str) -> object:
-        points = self._entry_points().get(name, [])
-        providers = [_distribution(point) for point in points]
-        if name in self._builtins:
-            if points:
-                raise PluginError(
-                    f"{self.group}: the name {shown(name)} is smartcam's own, "
-                    f"but {' and '.join(providers)} also provides it",
-                    name=name,
-                )
+        if name in self._builtins:  # whoever else is installed, which would take long to list
             module, _, attribute = self._builtins[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
+        points = self._entry_points().get(name, [])
+        providers = [_distribution(point) for point in points]
         if not points:
             known = [info.name for info in self.available()]
             raise PluginError(

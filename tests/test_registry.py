@@ -103,11 +103,25 @@ def test_name_of_two_distributions_names_both(install: Install) -> None:
     assert sorted(info.origin.split(", ")) == ["first", "second"]
 
 
-def test_built_in_is_never_replaced_silently(install: Install) -> None:
+def test_built_in_is_never_replaced_and_the_log_names_who_tried(
+    install: Install, caplog: pytest.LogCaptureFixture
+) -> None:
     install("first", raw="first_module:f")
-    with pytest.raises(PluginError, match="'raw' is smartcam's own, but first also provides it"):
-        INTERPRETERS.load("raw")
+    assert INTERPRETERS.load("raw") is RawInterpreter
     assert [i.origin for i in INTERPRETERS.available() if i.name == "raw"] == ["built-in"]
+    assert "the name 'raw' is smartcam's own, that of first is left out" in caplog.text
+
+
+def test_built_in_is_loaded_without_a_look_at_what_is_installed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def looked() -> Iterator[None]:
+        raise AssertionError("looked")
+
+    registry = Registry("smartcam.nothing", {"raw": "smartcam.interpreters._basic:RawInterpreter"})
+    monkeypatch.setattr("smartcam.registry.distributions", looked)
+    assert registry.load("raw") is RawInterpreter
+    assert "raw" in registry
 
 
 def test_refresh_looks_again(install: Install) -> None:

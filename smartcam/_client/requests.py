@@ -31,7 +31,7 @@ from smartcam.protocols import messages as m
 if TYPE_CHECKING:
     from smartcam._client.camera_state import CameraState
     from smartcam._client.connection import Connection
-    from smartcam._client.waits import Answer, Waits
+    from smartcam._client.waits import OwedAnswer, Waits
 
 AnswerT = TypeVar("AnswerT", bound=m.Message)
 
@@ -157,7 +157,7 @@ class Requests:
 
     async def post(
         self, message: m.Message, key: type[m.Message] | int, deadline: float
-    ) -> asyncio.Future[Answer]:
+    ) -> OwedAnswer:
         """Send a request as soon as none of its kind is open; its answer is owed from then on.
 
         Args:
@@ -169,6 +169,8 @@ class Requests:
             ResponseTimeoutError: an earlier one was open until ``deadline``.
         """
         lock = self._locks[key]
+        if not lock.locked() and not self._waits.owes(key):
+            return self._send(message, key, deadline)  # nothing is waited for
         try:
             async with asyncio.timeout_at(deadline):
                 await lock.acquire()
@@ -176,12 +178,15 @@ class Requests:
             raise self._unsent(message) from exc
         try:
             await self.await_owed(key, message, deadline)
-            self._connection.require_link().send(message)
-            return self.expect(key, deadline)
+            return self._send(message, key, deadline)
         finally:
             lock.release()
 
-    def expect(self, key: type[m.Message] | int, deadline: float) -> asyncio.Future[Answer]:
+    def _send(self, message: m.Message, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
+        self._connection.require_link().send(message)
+        return self.expect(key, deadline)
+
+    def expect(self, key: type[m.Message] | int, deadline: float) -> OwedAnswer:
         """Register for the answer to a request that was just sent, awaited until ``deadline``.
 
         It may come later: the link is given up only when ``request_timeout`` is over, too.
@@ -259,12 +264,11 @@ class Requests:
         if loop.time() + TIMER_RESOLUTION >= self._due[key]:
             self._connection.require_link().give_up(error)
 
-    async def _take_answer(self, answer: asyncio.Future[Answer], deadline: float) -> m.Message:
-        # asyncio.wait leaves the future alone when this task is cancelled: the answer stays owed
-        loop = asyncio.get_running_loop()
-        await asyncio.wait({answer}, timeout=max(0.0, deadline - loop.time()))
+    async def _take_answer(self, answer: OwedAnswer, deadline: float) -> m.Message:
         if not answer.done():
-            raise TimeoutError
+            await _done_or_late(answer, deadline)
+            if not answer.done():
+                raise TimeoutError
         got = answer.result()
         if isinstance(got, SmartCamError):
             raise got.with_traceback(None)
@@ -279,3 +283,24 @@ class Requests:
             f"{self.name}: {what} {dialect.called(message)} {why}; status: {self._state.status}",
             message_id=dialect.message_id(message),
         )
+
+
+async def _done_or_late(answer: OwedAnswer, deadline: float) -> None:
+    """Wait until an answer is there or the deadline is over.
+
+    The answer is left alone when the task that waits is cancelled: it stays owed.
+    """
+    loop = asyncio.get_running_loop()
+    waiter: asyncio.Future[None] = loop.create_future()
+    answer.waiters.append(waiter)
+    timer = loop.call_at(deadline, _wake, waiter)
+    try:
+        await waiter
+    finally:
+        timer.cancel()
+        answer.waiters.remove(waiter)
+
+
+def _wake(waiter: asyncio.Future[None]) -> None:
+    if not waiter.done():
+        waiter.set_result(None)

@@ -35,6 +35,26 @@ def told(error: ErrorT) -> ErrorT:
     return made
 
 
+class OwedAnswer(asyncio.Future[Answer]):
+    """An answer that the camera owes; it belongs to nobody who waits for it.
+
+    Attributes:
+        waiters: futures of those who wait, each one's own: they are woken in one turn of the loop,
+            where a callback would take two.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__(loop=loop)
+        self.waiters: list[asyncio.Future[None]] = []
+
+    def set_result(self, result: Answer) -> None:
+        """Have the answer, or why there is none, and wake those who wait."""
+        super().set_result(result)
+        for waiter in self.waiters:
+            if not waiter.done():
+                waiter.set_result(None)
+
+
 @dataclass(slots=True, eq=False)
 class StatusWaiter:
     """A caller that waits for a status.
@@ -65,7 +85,7 @@ class Waits:
     def __init__(self, counters: ClientCounters) -> None:
         self.end: SmartCamError | None = None
         self._counters = counters
-        self.answers: dict[type[m.Message] | int, asyncio.Future[Answer]] = {}
+        self.answers: dict[type[m.Message] | int, OwedAnswer] = {}
         self._asked_at: dict[object, float] = {}
         self._behind: dict[object, int] = {}  # deliveries that came before the request was sent
         self._fences_open = 0  # Queries that went out with the last trigger and are not answered
@@ -112,21 +132,21 @@ class Waits:
 
     # ------------------------------------------------------------------ answers
 
-    def next_answer(self, key: type[m.Message] | int, *, behind: int = 0) -> asyncio.Future[Answer]:
+    def next_answer(self, key: type[m.Message] | int, *, behind: int = 0) -> OwedAnswer:
         """Register for the next answer of this kind; errors come as a result, never raised.
 
         What came in the delivery ``behind`` of the link, or in an earlier one, is no answer: it was
         there before the request was sent, and waits to be handed on.
         """
         loop = asyncio.get_running_loop()
-        future: asyncio.Future[Answer] = loop.create_future()
+        future = OwedAnswer(loop)
         self.answers[key] = future
         self._behind[key] = behind
         if key is not m.SwitchAnswer:  # it takes its time, which is no round trip
             self._asked_at[key] = loop.time()
         return future
 
-    def owed_answer(self, key: type[m.Message] | int) -> asyncio.Future[Answer]:
+    def owed_answer(self, key: type[m.Message] | int) -> OwedAnswer:
         """Return the future of an answer that is owed (:meth:`owes`)."""
         return self.answers.get(key) or self.next_answer(key)
 

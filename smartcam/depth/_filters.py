@@ -133,7 +133,7 @@ def voxel_grid(cloud: Cloud, size: float) -> Cloud:
     if not len(cloud):
         return cloud
     keys = _voxels(cloud, size)
-    order = np.argsort(keys, kind="stable")
+    order = np.argsort(keys)  # whatever order the points of a voxel get: their sums are of float64
     keys = keys[order]
     first = np.flatnonzero(np.concatenate([[True], keys[1:] != keys[:-1]]))
     counts = np.diff(np.append(first, len(keys)))

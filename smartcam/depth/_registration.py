@@ -244,7 +244,8 @@ def _judged(
         )
     rms, information, covariance, left_open = math.nan, np.zeros((6, 6)), None, np.eye(6)
     if matched >= NEIGHBOURS:
-        planes = planes_of(goals, tree, NEIGHBOURS).taken(match.nearest)
+        once, places = np.unique(match.nearest, return_inverse=True)
+        planes = planes_of(goals, tree, NEIGHBOURS, once).taken(places.reshape(-1))
         centre = match.moved.mean(axis=0)
         steps = open_directions(match.moved - centre, planes)
         reasons += [_in_words(one, match.moved - centre) for one in steps]

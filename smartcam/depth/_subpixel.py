@@ -16,8 +16,11 @@ if TYPE_CHECKING:
 MIN_COARSE_SIGMA_PX: Final = 0.5
 """Least sigma of a disparity that least squares could not refine, pixels."""
 
-GAUSS_NEWTON_STEPS: Final = 3
+MAX_GAUSS_NEWTON_STEPS: Final = 3
 """Steps of Gauss and Newton that refine the disparities."""
+
+MAX_LAST_MOVE_SIGMAS: Final = 1.0
+"""Sigmas, rms, by which the last step may move the disparities: another would by about a tenth."""
 
 MAX_SHIFT_PX: Final = 0.5
 """Pixels by which a disparity may be moved: farther off is another point."""
@@ -77,13 +80,15 @@ def refined(
     # near an edge of depth a coarse value may be that of its other side
     told = np.fmax(sigma, plane.rough)
     found, usable = start, known
-    fit = _fitted(_linearized(pictures, found, known), found, usable, plane, sums)
-    for step in range(GAUSS_NEWTON_STEPS):
+    fit = _fitted(_linearized(pictures, found, known), found, None, plane, sums)
+    for step in range(MAX_GAUSS_NEWTON_STEPS):
+        last = step == MAX_GAUSS_NEWTON_STEPS - 1
         if step:
             plane = _plane(found, usable if usable.any() else known, sums)
             linear = _without_outliers(_linearized(pictures, found, known), fit)
             fit = _fitted(linear, found, usable, plane, sums)
-        if step == GAUSS_NEWTON_STEPS - 1:
+            last = last or _moved(fit, found, usable) < MAX_LAST_MOVE_SIGMAS
+        if last:
             fit = fit._replace(sigma=fit.sigma * np.float32(np.sqrt(_correlation(fit, usable))))
         usable = (
             smooth
@@ -91,10 +96,18 @@ def refined(
             & (np.abs(fit.disparity - start) < MAX_SHIFT_PX)
         )
         found = np.where(usable, fit.disparity, start)
+        if last:
+            break
     told = np.where(usable, fit.sigma, told)
     found[~known] = np.nan
     told[~known] = np.nan
     return found.astype(np.float32, copy=False), told.astype(np.float32, copy=False)
+
+
+def _moved(fit: _Refined, before: Field, usable: NDArray[np.bool_]) -> float:
+    """Return by how many sigmas a step moved the usable disparities, root mean square."""
+    moves = (fit.disparity - before)[usable] / fit.sigma[usable]
+    return float(np.sqrt((moves**2).mean())) if len(moves) else 0.0
 
 
 def _whole_around(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -194,7 +207,7 @@ def _without_outliers(linear: _LinearMatch, fit: _Refined) -> _LinearMatch:
 def _fitted(
     linear: _LinearMatch,
     disparity: Field,
-    trusted: NDArray[np.bool_],
+    trusted: NDArray[np.bool_] | None,
     plane: _DisparityPlane,
     sums: _WindowSums,
 ) -> _Refined:
@@ -206,25 +219,28 @@ def _fitted(
     # + noise for all q of the window around p: linear in D, b and the gain less 1, c. g is the mean
     # of both pictures' slopes, whose noise does not go with that of their difference.
     e, g, level, mask = linear
-    gd, gg, rg = g * disparity, g * g, g * level
+    gg, rg, rest = g * g, g * level, e - g * disparity
     n = np.maximum(sums(mask), 1)
-    sg, sr = sums(g), sums(level)
-    sgd = sums(gd) - plane.across * sums(g, 1) - plane.down * sums(g, 0, 1)
-    sggd = sums(g * gd) - plane.across * sums(gg, 1) - plane.down * sums(gg, 0, 1)
-    srgd = sums(rg * disparity) - plane.across * sums(rg, 1) - plane.down * sums(rg, 0, 1)
-    sy = sums(e) - sgd
-    gy, ry = sums(g * e) - sggd - sg * sy / n, sums(level * e) - srgd - sr * sy / n
-    trust = mask * trusted
-    m = np.maximum(sums(trust), 1)
-    se, st = sums(e * trust), sums(level * trust)
-    see = sums(e * e * trust) - se * se / m
-    sre = sums(level * e * trust) - st * se / m
-    srr = np.maximum(sums(level * level * trust) - st * st / m, 0)
+    sg, sr, mean = sums(g), sums(level), sums(level * level)
+    sy, gy, ry = (
+        sums(rest_) + plane.across * sums(g_, 1) + plane.down * sums(g_, 0, 1)
+        for rest_, g_ in ((rest, g), (rest * g, gg), (rest * level, rg))
+    )
+    gy -= sg * sy / n
+    ry -= sr * sy / n
+    if trusted is None:
+        m, st, srr, e_, level_ = n, sr, mean, e, level
+    else:
+        e_, level_ = e * trusted, level * trusted
+        m, st, srr = np.maximum(sums(mask * trusted), 1), sums(level_), sums(level_ * level)
+    se = sums(e_)
+    see, sre = sums(e_ * e) - se * se / m, sums(e_ * level) - st * se / m
+    srr = np.maximum(srr - st * st / m, 0)
     # how little is known of the gain beforehand, as so much variance of R
     held = np.maximum(see / np.maximum(m - 2, 1), MIN_VARIANCE) / np.float32(GAIN_SIGMA**2)
     gain = sre / (srr + held)
     variance = np.maximum((see - gain * sre) / np.maximum(m - 3, 1), MIN_VARIANCE)
-    rr = np.maximum(sums(level * level) - sr * sr / n, 0) + held
+    rr = np.maximum(mean - sr * sr / n, 0) + held
     gr = sums(rg) - sg * sr / n
     curvature = sums(gg) - sg * sg / n - gr * gr / rr
     # the slopes' own noise is no texture: a quarter of a picture's variance, an eighth of e's

@@ -42,19 +42,22 @@ class SurfacePlanes(NamedTuple):
         return SurfacePlanes(*(one[index] for one in self))
 
 
-def planes_of(points: Array, tree: Any, neighbours: int) -> SurfacePlanes:
-    """Return the planes through each point's nearest, itself among them; ``tree``: of them all."""
+def planes_of(points: Array, tree: Any, neighbours: int, index: NDArray[np.intp]) -> SurfacePlanes:
+    """Return the planes about points of an index: through their nearest, themselves among them.
+
+    ``tree``: of all points.
+    """
     found = []
-    for start in range(0, len(points), ROWS):
-        _, index = tree.query(points[start : start + ROWS], k=neighbours)
-        found.append(_fitted(points[index]))
+    for start in range(0, len(index), ROWS):
+        _, nearest = tree.query(points[index[start : start + ROWS]], k=neighbours)
+        found.append(_fitted(points[nearest]))
     return SurfacePlanes(*(np.concatenate(one) for one in zip(*found, strict=True)))
 
 
 def _fitted(groups: Array) -> SurfacePlanes:
     """Return planes through groups (N, K, 3) of points."""
     offsets = groups - groups.mean(axis=1, keepdims=True)
-    spreads = np.einsum("nki,nkj->nij", offsets, offsets) / groups.shape[1]
+    spreads = offsets.transpose(0, 2, 1) @ offsets / groups.shape[1]
     values, vectors = np.linalg.eigh(spreads)
     # An eigenvector turns towards another by noise of variance l0 l1 / (K (l1 - l0)^2).
     # Source: Anderson, Asymptotic theory for principal component analysis (1963).

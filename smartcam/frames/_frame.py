@@ -133,8 +133,8 @@ class Frame:
     def rgb(self) -> NDArray[Any]:
         """Return the colours, (H, W, 3), red first; Bayer patterns are demosaiced.
 
-        YUV is BT.601 of limited range, unless the format's name says ``709`` or ``full``; grey is
-        given three times.
+        YUV is BT.601 of limited range, unless the format's name says ``709``, ``2020`` or
+        ``full``; grey is given three times. No value is more than one level from the formulas'.
 
         Raises:
             FrameFormatError: the format has no colours, or its bytes are wrong.

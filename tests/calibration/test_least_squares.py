@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import threading
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 import pytest
 
+from smartcam._extras import load
+from smartcam.calibration import fit_plane
 from smartcam.calibration._least_squares import (
     MAX_UNKNOWNS_BY_SVD,
     Normal,
@@ -10,7 +15,11 @@ from smartcam.calibration._least_squares import (
     minimize,
     solve_scaled,
 )
+from smartcam.calibration._one_blas_thread import OneBlasThread
 from smartcam.exceptions import CalibrationError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 RANDOM = np.random.default_rng(2)
 SHARED = RANDOM.normal(size=(30, 4))
@@ -100,3 +109,94 @@ def test_many_scaled_equations_are_solved_even_where_some_are_missing() -> None:
     rows[:, -1] = 0.0
     again = solve_scaled(rows.T @ rows, rows.T @ rows @ expected)
     np.testing.assert_allclose(rows @ again, rows @ expected)
+
+
+# ------------------------------------------------------------------ BLAS has one thread
+
+PATIENCE = 30.0
+"""Seconds; only what hangs takes as long."""
+
+
+def threads() -> list[int]:
+    """Return the number of threads of each BLAS in the process."""
+    np.ones((2, 2)) @ np.ones((2, 2))
+    found = load("threadpoolctl").threadpool_info()
+    return [one["num_threads"] for one in found if "blas" in one["prefix"]]
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Have two, also where the machine has one core."""
+    with load("threadpoolctl").threadpool_limits(2, "blas"):
+        assert set(threads()) == {2}
+        yield
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_there_is_one_inside_and_two_afterwards() -> None:
+    with OneBlasThread():
+        assert set(threads()) == {1}
+    assert set(threads()) == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_an_error_gives_them_back() -> None:
+    with pytest.raises(RuntimeError, match="inside"), OneBlasThread():
+        raise RuntimeError("inside")
+    assert set(threads()) == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_each_of_two_threads_gives_them_back() -> None:
+    one, entered, leave, seen = OneBlasThread(), threading.Event(), threading.Event(), set[int]()
+
+    def stay() -> None:
+        with load("threadpoolctl").threadpool_limits(2, "blas"):
+            with one:
+                entered.set()
+                assert leave.wait(PATIENCE)
+            seen.update(threads())
+
+    other = threading.Thread(target=stay)
+    with one:
+        other.start()
+        assert entered.wait(PATIENCE)
+    assert set(threads()) == {2}
+    leave.set()
+    other.join(PATIENCE)
+    assert set(threads()) == seen == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_within_itself_it_stays_one() -> None:
+    one = OneBlasThread()
+    with one:
+        with one:
+            assert set(threads()) == {1}
+        assert set(threads()) == {1}
+    assert set(threads()) == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_copy_in_a_fork_begins_anew() -> None:
+    one = OneBlasThread()
+    with one:
+        one.forked()
+        with one:
+            assert set(threads()) == {1}
+    assert not one._inside  # who was inside in front of the fork leaves without a trace
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_plane_is_fitted_with_one() -> None:
+    seen: list[int] = []
+    marks = np.array([[0.0, 0.0], [100.0, 0.0], [0.0, 100.0], [100.0, 100.0]])
+
+    class Looking:
+        def __array__(self, *_: object, **__: object) -> Any:
+            seen.extend(threads())
+            return marks
+
+    fit_plane(Looking(), np.column_stack([marks / 1000, np.zeros(4)]))
+    assert set(seen) == {1}
+    assert set(threads()) == {2}

@@ -83,7 +83,11 @@ async def test_colours_stay_what_they_are(codecs: Codecs, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["YUYV", "UYVY", "NV12", "I420", "I422", "I444", "I420_full", "I420_709", "YCbCr422_8"]
+    "name",
+    [
+        *("YUYV", "UYVY", "NV12", "I420", "I422", "I444", "I420_full", "I420_709", "YCbCr422_8"),
+        *("I420_709_full", "I420_2020", "I420_2020_full"),
+    ],
 )
 async def test_planes_become_a_jpeg_of_the_same_colours(codecs: Codecs, name: str) -> None:
     found = find_format(name)

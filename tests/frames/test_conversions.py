@@ -220,7 +220,7 @@ def test_alpha_behind_y_u_and_v(alpha: int) -> None:
         assert np.array_equal(came[1], u[:, :WIDTH])
         return
     assert found.name == "RGBa8"
-    rgb = yuv_to_rgb(y, u, v, MATRICES["601"])[:, :WIDTH]
+    rgb = yuv_to_rgb(y, (u, v), MATRICES["601"])[:, :WIDTH]
     assert np.array_equal(came, np.dstack([rgb, np.full((HEIGHT, WIDTH), alpha, np.uint8)]))
 
 

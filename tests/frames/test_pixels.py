@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -13,9 +15,13 @@ from hypothesis import strategies as st
 
 from smartcam.exceptions import FrameFormatError, MissingExtraError
 from smartcam.frames import find_format
+from smartcam.frames._pixels import compiled
 from smartcam.frames._pixels.colours import MATRICES as COLOUR_MATRICES
 from smartcam.frames._pixels.formats import PIXEL_FORMATS, with_matrix
 from smartcam.frames._pixels.layouts import Planes, YuvPairs
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 PACKED = [
     (b"\x23\x61\x45\xab\xcd", "Mono10p", [0x123, 0x158, 0x2B4, 0x336]),
@@ -185,23 +191,108 @@ MATRICES = {"709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
 """Shares of red and blue in Y: ITU-R BT.709-6 and BT.2020-2, tables 4; else BT.601-7's."""
 
 
-def expected_rgb(y: int, u: int, v: int, name: str, depth: int) -> list[float]:
+def expected_rgb(y: Any, u: Any, v: Any, name: str, depth: int) -> list[Any]:
     """Return the colours by the formulas of the recommendations, in floating point."""
     red, blue = next((one for end, one in MATRICES.items() if end in name), (0.299, 0.114))
     full = "full" in name or name.startswith("YCbCr422")
     step, most = 2 ** (depth - 8), 2**depth - 1
     bright = y / most if full else (y / step - 16) / 219
-    cb, cr = ((one - 128 * step) / (most if full else 224 * step) for one in (u, v))
+    cb, cr = ((one - 128.0 * step) / (most if full else 224 * step) for one in (u, v))
     r, b = bright + 2 * (1 - red) * cr, bright + 2 * (1 - blue) * cb
     g = (bright - red * r - blue * b) / (1 - red - blue)
-    return [min(max(most * one, 0.0), float(most)) for one in (r, g, b)]
+    return [np.clip(most * one, 0.0, float(most)) for one in (r, g, b)]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [one.name for one in PIXEL_FORMATS if re.match(r"YUV|YCbCr|NV12|I4", one.name)],
-)
-def test_colours_are_exact_to_the_rounding(name: str) -> None:
+COLOURED = [one.name for one in PIXEL_FORMATS if re.match(r"YUV|YCbCr|NV12|I4", one.name)]
+"""Formats of Y, U and V."""
+
+
+@pytest.fixture
+def numpy_alone(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Have no OpenCV."""
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "cv2", None)
+        compiled.opencv.cache_clear()
+        assert compiled.opencv() is None
+        yield
+    compiled.opencv.cache_clear()
+
+
+def random_picture(name: str, width: int, height: int, low: int, seed: int) -> tuple[bytes, int]:
+    """Return the bytes of a picture whose Y are ``low`` or more, and its stride."""
+    found, random = find_format(name), np.random.default_rng(seed)
+    stride = found.stride(width) + 4 * int(random.integers(0, 2))
+    data = bytearray(random.bytes(found.size(width, height, stride)))
+    for plane in found.planes(data, width, height, stride)[:1]:
+        plane.flags.writeable = True
+        np.maximum(plane, low, out=plane)
+    return bytes(data), stride
+
+
+def expected_picture(name: str, data: bytes, width: int, height: int, stride: int) -> Any:
+    """Return the colours (H, W, 3) of a picture, in floating point."""
+    found = find_format(name)
+    top = (1 << found.depth) - 1
+    planes = [np.minimum(one, top) for one in found.planes(data, width, height, stride)]
+    rows, columns = np.indices((height, width))
+    across, down = 1 + (planes[1].shape[1] < width), 1 + (planes[1].shape[0] < height)
+    y, u, v = planes[0], *(one[rows // down, columns // across] for one in planes[1:])
+    return np.array(expected_rgb(y.astype(float), u, v, name, found.depth)).transpose(1, 2, 0)
+
+
+@pytest.mark.parametrize("low", [0, 16])
+@pytest.mark.parametrize("name", COLOURED)
+def test_colours_of_any_picture_are_within_a_level(name: str, low: int) -> None:
+    for seed, (width, height) in enumerate([(1, 1), (2, 2), (7, 5), (8, 70), (130, 3)]):
+        data, stride = random_picture(name, width, height, low, seed)
+        got = find_format(name).rgb(data, width, height, stride)
+        assert got.shape == (height, width, 3)
+        wanted = expected_picture(name, data, width, height, stride)
+        assert np.abs(got - wanted).max() < 1
+
+
+@pytest.mark.usefixtures("numpy_alone")
+@pytest.mark.parametrize("name", COLOURED)
+def test_colours_by_numpy_alone_are_the_nearest(name: str) -> None:
+    for seed, (width, height) in enumerate([(1, 1), (2, 2), (7, 5)]):
+        data, stride = random_picture(name, width, height, 0, seed)
+        got = find_format(name).rgb(data, width, height, stride)
+        wanted = expected_picture(name, data, width, height, stride)
+        assert np.abs(got - wanted).max() <= 0.501
+
+
+@pytest.mark.parametrize("matrix", COLOUR_MATRICES)
+def test_colours_of_all_u_and_v_are_within_a_level(matrix: str) -> None:
+    """Every fifth Y, U and V of 4:4:4, and for what OpenCV knows by itself of 4:2:0, too."""
+    end = "".join(f"_{part}" for part in matrix.split() if part != "601")
+    for name, low in ((f"I444{end}", 0), (f"I420{end}", 16)):
+        steps = np.arange(low, 256, 5, dtype=np.uint8)
+        y, u, v = (one.reshape(len(steps), -1) for one in np.meshgrid(steps, *[steps] * 2))
+        if name.startswith("I420"):
+            y = y.repeat(2, axis=0).repeat(2, axis=1)
+        data = b"".join(one.tobytes() for one in (y, u, v))
+        height, width = y.shape
+        got = find_format(name).rgb(data, width, height, width)
+        assert np.abs(got - expected_picture(name, data, width, height, width)).max() < 1
+
+
+@pytest.mark.parametrize("name", ["RGB8", "BGR8", "RGBa8", "BGRa8", "RGB16", "RGBa16"])
+def test_grey_of_colours_is_within_a_level(name: str) -> None:
+    found = find_format(name)
+    kind = np.uint8 if found.depth == 8 else np.uint16
+    channels = found.bits // found.depth
+    samples = np.random.default_rng(3).integers(0, 2**found.depth, (40, 50, channels), kind)
+    samples[0], samples[1] = 2**found.depth - 1, 0
+    rgb = samples[..., 2::-1] if name.startswith("BGR") else samples[..., :3]
+    wanted = rgb @ np.array([0.299, 0.587, 0.114])
+    grey = found.grey(samples.tobytes(), 50, 40, found.stride(50))
+    assert grey.dtype == kind
+    assert np.abs(grey - wanted).max() < 1
+    assert np.array_equal(found.rgb(samples.tobytes(), 50, 40, found.stride(50)), rgb)
+
+
+@pytest.mark.parametrize("name", COLOURED)
+def test_colours_of_known_values_are_those_of_the_formulas(name: str) -> None:
     found = find_format(name)
     step, kind = 2 ** (found.depth - 8), "<u1" if found.depth == 8 else "<u2"
     for plain in [(16, 128, 128), (235, 128, 128), (81, 90, 240), (145, 54, 34), (41, 240, 110)]:
@@ -216,7 +307,7 @@ def test_colours_are_exact_to_the_rounding(name: str) -> None:
         data = np.array(samples, kind).tobytes()
         got = found.rgb(data, 2, 2, found.stride(2)).astype(float)
         wanted = np.broadcast_to(expected_rgb(y, u, v, name, found.depth), (2, 2, 3))
-        assert np.abs(got - wanted).max() <= 0.501, (y, u, v)
+        assert np.abs(got - wanted).max() <= 0.7, (y, u, v)
 
 
 def test_every_format_of_y_u_and_v_has_each_matrix() -> None:

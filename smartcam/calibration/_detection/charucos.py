@@ -17,6 +17,7 @@ from smartcam.calibration._detection.markers import (
     agreeing,
     check_one_board,
     marker_dictionary,
+    marker_finder,
     seen_from_nearest,
     strays_told,
 )
@@ -200,9 +201,8 @@ def _is_all(seen: _Sighting, target: Charuco, image: GreyImage) -> bool:
 
 def _look(bytes_: NDArray[np.uint8], scale: float, target: Charuco, best: _Sighting) -> _Sighting:
     """Return the sighting in an image ``scale`` times as large, or the best one before it."""
-    cv2 = load("cv2")
     board = charuco_board(target)
-    finder = cv2.aruco.ArucoDetector(board.getDictionary())
+    finder = marker_finder(bytes_, board.getDictionary())
     quads, numbers, others = finder.detectMarkers(bytes_)
     side = _side(quads) if numbers is not None else _side_in_rows(others, board)
     best = best._replace(side=max(best.side, side / scale))

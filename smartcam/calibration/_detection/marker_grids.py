@@ -17,6 +17,7 @@ from smartcam.calibration._detection.markers import (
     agreeing,
     check_one_board,
     marker_dictionary,
+    marker_finder,
     strays_told,
 )
 from smartcam.calibration._homography import apply_homography, fit_homography, local_steps
@@ -95,7 +96,7 @@ def _read(bytes_: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Marker
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
     given = cv2.aruco.DetectorParameters()
     given.markerBorderBits = target.border
-    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary, given).detectMarkers(bytes_)
+    quads, numbers, _ = marker_finder(bytes_, dictionary, given).detectMarkers(bytes_)
     if numbers is None:
         return Markers(np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp))
     pixels = (np.array(quads, dtype=np.float64).reshape(-1, 4, 2) + 0.5) / scale - 0.5

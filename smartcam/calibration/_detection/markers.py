@@ -51,6 +51,15 @@ MIN_AGREEING = 2
 """Markers that agree at least: the number of a single one rests on one reading."""
 
 
+WINDOWS_PX = (3, 13, 23)
+"""Sides of the windows whose mean tells dark from light: OpenCV's."""
+
+MANY_OUTLINES, MAX_OUTLINES = 1500, 4000
+"""Dark outlines of an image, in the mean of the windows, above which one window does; and how many
+of that are looked at, at most. A board of 1,000 markers, the most that a dictionary has, shows some
+3,000."""
+
+
 class Markers(NamedTuple):
     """Markers that were read."""
 
@@ -90,6 +99,39 @@ def marker_dictionary(name: str, needed: int, what: str) -> Any:
             f"{what}: expected at least {needed} markers in {name}", needed, there
         )
     return dictionary
+
+
+def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = None) -> Any:
+    """Return OpenCV's detector for an image, bounded: it compares each outline with each other one.
+
+    Where there are many dark outlines they are looked for in one way instead of three, and where
+    there are too many, only the largest are looked at.
+    """
+    cv2 = load("cv2")
+    given = cv2.aruco.DetectorParameters() if parameters is None else parameters
+    lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
+    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MANY_OUTLINES:
+        window = sorted(WINDOWS_PX, key=lambda one: len(lengths[one]))[len(WINDOWS_PX) // 2]
+        given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
+        longest = np.sort(lengths[window])[::-1]
+        if len(longest) > MAX_OUTLINES:
+            given.minMarkerPerimeterRate = float(longest[MAX_OUTLINES] + 1.5) / max(bytes_.shape)
+    return cv2.aruco.ArucoDetector(dictionary, given)
+
+
+def _outlines(bytes_: NDArray[np.uint8], window: int, given: Any) -> NDArray[np.intp]:
+    """Return the lengths of the outlines, pixels, that may be a marker's.
+
+    What is darker than the mean of a window about it is taken for dark.
+    """
+    cv2 = load("cv2")
+    mean, kind = cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV
+    dark = cv2.adaptiveThreshold(bytes_, 255, mean, kind, window, given.adaptiveThreshConstant)
+    found, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    lengths = np.array([len(one) for one in found], dtype=np.intp)
+    low, high = given.minMarkerPerimeterRate, given.maxMarkerPerimeterRate
+    largest = max(bytes_.shape)  # OpenCV takes whole pixels
+    return lengths[(lengths >= int(low * largest)) & (lengths <= int(high * largest))]
 
 
 def agreeing(markers: Markers, board: Array) -> MarkerAgreement:

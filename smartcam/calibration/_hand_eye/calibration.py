@@ -58,6 +58,7 @@ from smartcam.calibration._lens.poses import CAMERA, TARGET, half_turn, half_tur
 from smartcam.calibration._lens.projection import excess, whitening
 from smartcam.calibration._lens.sheet_shape import MAX_FREE_POINTS
 from smartcam.calibration._lens.suspicions import without_strays
+from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.validation import check_positive
 from smartcam.calibration._views import as_list, as_views
 from smartcam.exceptions import CalibrationError
@@ -130,6 +131,7 @@ POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
     drop_bad=check_flag,
     most_scale=a_number,
 )
+@one_blas_thread
 def calibrate_hand_eye(
     robot_poses: Sequence[Transform | Pose],
     views: Sequence[TargetView],
@@ -241,6 +243,7 @@ def calibrate_hand_eye(
     drop_bad=check_flag,
     most_scale=a_number,
 )
+@one_blas_thread
 def calibrate_hand_eye_from_poses(
     robot_poses: Sequence[Transform | Pose],
     target_poses: Sequence[Transform],

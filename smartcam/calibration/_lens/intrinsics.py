@@ -30,6 +30,7 @@ from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
 from smartcam.calibration._lens.start import fit_lens, parameter_names
 from smartcam.calibration._lens.suspicions import examined
 from smartcam.calibration._lens.uncertainty import ProjectionUncertainty, uncertainty
+from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._views import TargetView, as_list, as_views, label
 from smartcam.geometry import CameraModel, Code, Remark, Transform
 from smartcam.geometry._inside import Array, Rigid, check_choice
@@ -229,6 +230,7 @@ class IntrinsicCalibration(storage.SavedCalibration):
     sheet=check_text,
     drop_bad=check_flag,
 )
+@one_blas_thread
 def calibrate_intrinsics(
     views: Sequence[TargetView],
     *,

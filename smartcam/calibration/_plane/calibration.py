@@ -25,6 +25,7 @@ from smartcam._arguments import check_flag, check_text, shown
 from smartcam._forks import cached_property
 from smartcam.calibration._files import storage
 from smartcam.calibration._homography import element_derivatives
+from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.diagnostics import (
     MAX_SIGMA,
     TYPICAL_SIGMA,
@@ -471,6 +472,7 @@ class PlaneCalibration(storage.SavedCalibration):
     tool_z=or_none(numbers),
     robust=check_flag,
 )
+@one_blas_thread
 def fit_plane(
     camera_points: ArrayLike,
     robot_points: ArrayLike,

@@ -20,7 +20,6 @@ import numpy as np
 
 from smartcam.calibration._files import storage
 from smartcam.calibration._homography import apply_homography, element_derivatives
-from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code
 
 if TYPE_CHECKING:
@@ -136,17 +135,14 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
     model = MODELS[name]
     matrix = model.solve(pairs, scale)
     tangent = model.tangent(matrix)
-    jacobian = element_derivatives(matrix, pairs.camera) @ tangent
-    root = np.sqrt(pairs.weights)[:, None, None]
-    weighted = (root * jacobian).reshape(-1, model.parameters)
+    scaled, lengths = _scaled_jacobian(name, matrix, pairs)
     # A matrix moves along T: m + T d, so the Jacobian by d is J T. With W^(1/2) J T = U S V^T (its
     # columns divided by their lengths l) the covariance of m is T (T^T J^T W J T)^-1 T^T = H H^T,
     # H = T diag(1/l) V S^-1, and the hat matrix of the residuals is U U^T: what is left of a
     # residual's variance is I - U_i U_i^T, over its weight.
     # Source: Hartley and Zisserman, Multiple View Geometry, 2nd edition, section 5.2; Cook and
     # Weisberg, Residuals and Influence in Regression (1982), chapter 2.
-    lengths = np.linalg.norm(weighted, axis=0)
-    left, singular, right = np.linalg.svd(weighted / lengths, full_matrices=False)
+    left, singular, right = np.linalg.svd(scaled, full_matrices=False)
     condition = float(singular[-1] / singular[0])
     if condition < MIN_CONDITION:
         raise Code.COLLINEAR.refusal(
@@ -166,6 +162,19 @@ def fit(name: ModelName, pairs: Pairs, scale: float = 1.0) -> Fit:
         (np.eye(3) - hat) / pairs.weights[:, None, None],
         3 * len(pairs.camera) - model.parameters,
     )
+
+
+def _scaled_jacobian(name: ModelName, matrix: Array, pairs: Pairs) -> tuple[Array, Array]:
+    """Return the weighted residuals' Jacobian by a model's parameters, and its columns' lengths.
+
+    Its columns are divided by these.
+    """
+    model = MODELS[name]
+    jacobian = element_derivatives(matrix, pairs.camera) @ model.tangent(matrix)
+    root = np.sqrt(pairs.weights)[:, None, None]
+    weighted = (root * jacobian).reshape(-1, model.parameters)
+    lengths = np.linalg.norm(weighted, axis=0)
+    return weighted / lengths, lengths
 
 
 def held_out(fitted: Fit, pairs: Pairs, scale: float = 1.0) -> Array:
@@ -196,9 +205,9 @@ def _held_out_by_leverage(fitted: Fit, pairs: Pairs) -> Array:
 
 def _held_out_anew(fitted: Fit, pairs: Pairs, index: int) -> Array:
     others = pairs.without(index)
-    try:
-        matrix = fit(fitted.model, others).matrix
-    except CalibrationError:
+    matrix = _refined_homography(others, fitted.matrix)
+    singular = np.linalg.svd(_scaled_jacobian(fitted.model, matrix, others)[0], compute_uv=False)
+    if singular[-1] < MIN_CONDITION * singular[0]:
         return np.full(3, np.nan)
     expected = apply_homography(matrix, pairs.camera[index : index + 1])
     residual: Array = pairs.robot[index] - expected[0]
@@ -259,8 +268,11 @@ def _solve_affine(pairs: Pairs, _scale: float) -> Array:
 
 
 def _solve_homography(pairs: Pairs, scale: float) -> Array:
-    """Refine the linear solution until the sum of squares does not get less."""
-    matrix = _linear_homography(pairs, scale)
+    return _refined_homography(pairs, _linear_homography(pairs, scale))
+
+
+def _refined_homography(pairs: Pairs, matrix: Array) -> Array:
+    """Refine a solution until the sum of squares does not get less."""
     root = np.sqrt(pairs.weights)[:, None]
     residuals = root * (pairs.robot - apply_homography(matrix, pairs.camera))
     tangent = _homography_tangent(matrix)
@@ -300,7 +312,7 @@ def _linear_homography(pairs: Pairs, scale: float) -> Array:
             root * np.column_stack([zero, u, -inside[:, 1:] * u]),
         ]
     )
-    solution = np.linalg.svd(equations)[2][-1].reshape(3, 3)
+    solution = np.linalg.svd(equations, full_matrices=False)[2][-1].reshape(3, 3)
     w = pairs.homogeneous @ solution[2]
     if abs(solution[2, 2]) < MIN_CONDITION or w.min() * w.max() <= 0:
         return _solve_affine(pairs, scale)  # a point beyond the horizon: noise, not a view

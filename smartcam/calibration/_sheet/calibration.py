@@ -26,6 +26,7 @@ from smartcam.calibration._files import storage
 from smartcam.calibration._homography import derivatives
 from smartcam.calibration._least_squares import independent_parts
 from smartcam.calibration._lens.bundle import lens_values, with_lens
+from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.calibration import PlaneCalibration, fit_plane
 from smartcam.calibration._sheet.plane import SheetPlane, look_at_sheet
 from smartcam.calibration._solvers import Chain, Poses, chain_of, check_frames
@@ -281,6 +282,7 @@ def _check_lens(covariance: Array, camera: CameraModel | None, called: str) -> N
     camera=or_none(of_class("CameraModel")),
     lens_covariance=or_none(numbers),
 )
+@one_blas_thread
 def calibrate_sheet(
     view: TargetView,
     plane: PlaneCalibration,

@@ -23,6 +23,7 @@ from smartcam.calibration._lens.intrinsics import (
 )
 from smartcam.calibration._lens.poses import TARGET, check_view, half_turned
 from smartcam.calibration._lens.sheet_shape import Sheet, choose_shape
+from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._stereo import triangulation
 from smartcam.calibration._stereo.checks import check_fit, check_pairs, examined, remark_sides
 from smartcam.calibration._stereo.errors import PairErrors, pair_errors
@@ -292,6 +293,7 @@ def _target(calibration: StereoCalibration) -> Target:
     sheet=check_text,
     drop_bad=check_flag,
 )
+@one_blas_thread
 def calibrate_stereo(
     left_views: Sequence[TargetView | None],
     right_views: Sequence[TargetView | None],

@@ -11,6 +11,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.jpeg import decode_jpeg, jpeg_header
+from smartcam.frames._pixels.compiled import looked_up
 from smartcam.frames._pixels.formats import find_format
 from smartcam.frames._pixels.layouts import Planes, SampleLayout, YuvPairs
 
@@ -90,12 +91,13 @@ def _samples_to_jpeg(pixels: NDArray[np.uint8], colours: str, quality: int) -> b
 
 def _planes_to_jpeg(frame: Frame, matrix: str, quality: int) -> bytes:
     """Encode from Y, U and V, which JPEG wants in full range and of BT.601."""
-    if matrix.startswith("709"):
+    if not matrix.startswith("601"):
         return _samples_to_jpeg(frame.rgb(), "RGB", quality)
     planes = frame.format.planes(frame.data, frame.width, frame.height, frame.stride)
     if matrix == "601":
         y, chroma = _wideners()
-        ready = [y[planes[0]], chroma[planes[1]], chroma[planes[2]]]
+        tables = (y, chroma, chroma)
+        ready = [looked_up(*one) for one in zip(tables, planes, strict=True)]
     else:
         ready = [np.ascontiguousarray(plane) for plane in planes]
     data: bytes = load("simplejpeg").encode_jpeg_yuv_planes(*ready, quality)

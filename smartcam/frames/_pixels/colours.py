@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from smartcam._extras import load
+from smartcam.frames._pixels.compiled import looked_up, opencv, planes_to_rgb
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
+    _Conversion = Callable[[NDArray[Any]], NDArray[Any]]
 
 FRACTION_BITS: Final = 16
 """Bits behind the binary point of the sums below, for samples of 8 bits."""
@@ -49,21 +51,60 @@ MATRICES: Final = {
 BT.709 (HD video) and of BT.2020 with non-constant luminance (UHD video)."""
 
 
-@lru_cache(maxsize=8)
-def _tables(matrix: Matrix, depth: int) -> dict[str, NDArray[np.int32]]:
-    """Return the share of each value of Y, U and V in a colour, as a whole number of fractions."""
+class _Weights(NamedTuple):
+    """The shares of Y, U and V in the colours."""
+
+    luma: float
+    red_of_v: float
+    green_of_u: float
+    green_of_v: float
+    blue_of_u: float
+    black: float  # Y of black
+    middle: float  # U and V without colour
+
+
+def _weights(matrix: Matrix, depth: int) -> _Weights:
     green = 1 - matrix.red - matrix.blue
     step, most = 2 ** (depth - 8), 2**depth - 1
     luma, chroma = (1.0, 1.0) if matrix.full else (most / 219 / step, most / 224 / step)
     of_v, of_u = 2 * (1 - matrix.red) * chroma, 2 * (1 - matrix.blue) * chroma
+    return _Weights(
+        luma,
+        of_v,
+        -of_u * matrix.blue / green,
+        -of_v * matrix.red / green,
+        of_u,
+        0 if matrix.full else 16 * step,
+        128 * step,
+    )
+
+
+@lru_cache(maxsize=8)
+def _rows(matrix: Matrix, depth: int) -> NDArray[np.float64]:
+    """Return the shares of Y, U, V and 1 in red, green and blue, (3, 4)."""
+    one = _weights(matrix, depth)
+    shares = np.array(
+        [
+            [one.luma, 0, one.red_of_v],
+            [one.luma, one.green_of_u, one.green_of_v],
+            [one.luma, one.blue_of_u, 0],
+        ]
+    )
+    return np.column_stack([shares, -shares @ [one.black, one.middle, one.middle]])
+
+
+@lru_cache(maxsize=8)
+def _tables(matrix: Matrix, depth: int) -> dict[str, NDArray[np.int32]]:
+    """Return the share of each value of Y, U and V in a colour, as a whole number of fractions."""
+    weights = _weights(matrix, depth)
     value = np.arange(2.0**depth)
-    middle = 128 * step
+    chroma = value - weights.middle
     parts = {
-        "y": luma * (value - (0 if matrix.full else 16 * step)) + 0.5,
-        "red of v": of_v * (value - middle),
-        "green of v": -of_v * matrix.red / green * (value - middle),
-        "green of u": -of_u * matrix.blue / green * (value - middle),
-        "blue of u": of_u * (value - middle),
+        "y": weights.luma * (value - weights.black) + 0.5,
+        "red of v": weights.red_of_v * chroma,
+        "green of v": weights.green_of_v * chroma,
+        "green of u": weights.green_of_u * chroma,
+        "blue of u": weights.blue_of_u * chroma,
     }
     one = 2 ** _fraction_bits(depth)
     return {name: np.rint(part * one).astype(np.int32) for name, part in parts.items()}
@@ -74,31 +115,47 @@ def _fraction_bits(depth: int) -> int:
 
 
 def yuv_to_rgb(
-    y: NDArray[Any], u: NDArray[Any], v: NDArray[Any], matrix: Matrix, depth: int = 8
+    y: NDArray[Any], chroma: Sequence[NDArray[Any]], matrix: Matrix, depth: int = 8
 ) -> NDArray[Any]:
     """Return the colours, (H, W, 3); each U and V is taken for all the pixels that share it.
 
+    They are the nearest whole numbers, or one beside where OpenCV is installed, which is faster.
+
     Args:
         y: brightness, (H, W), unsigned.
-        u: difference of blue, with as many or fewer rows and columns.
-        v: difference of red, of the same shape.
+        chroma: differences of blue and of red, U and V, (h, w) each, with as many or fewer rows
+            and columns; or one array (h, w, 2) with both.
         matrix: the meaning of the three.
         depth: bits of a sample, 8 to 16; the colours have as many.
     """
-    tables, most = _tables(matrix, depth), 2**depth - 1
-    if depth < 8 * y.dtype.itemsize:  # bits above the depth, which mean nothing
-        y, u, v = (np.minimum(one, most) for one in (y, u, v))
-    bright = tables["y"][y]
+    if opencv() is not None:
+        usual = depth == 8 and matrix == MATRICES["601"]
+        return planes_to_rgb(y, chroma, _rows(matrix, depth), 2**depth - 1, usual=usual)
+    u, v = chroma if len(chroma) == 2 else (chroma[0][..., 0], chroma[0][..., 1])
+    return _by_tables(y, u, v, _tables(matrix, depth), depth)
+
+
+def _by_tables(
+    y: NDArray[Any],
+    u: NDArray[Any],
+    v: NDArray[Any],
+    tables: dict[str, NDArray[np.int32]],
+    depth: int,
+) -> NDArray[Any]:
+    """Return the colours of planes, by NumPy."""
+    # bits above the depth mean nothing: a value beyond a table takes the table's last
+    bright = tables["y"].take(y, mode="clip")
     shares = (
-        tables["red of v"][v],
-        tables["green of v"][v] + tables["green of u"][u],
-        tables["blue of u"][u],
+        tables["red of v"].take(v, mode="clip"),
+        tables["green of v"].take(v, mode="clip") + tables["green of u"].take(u, mode="clip"),
+        tables["blue of u"].take(u, mode="clip"),
     )
     colours = np.empty((*y.shape, 3), y.dtype)
     fraction = _fraction_bits(depth)
     for channel, share in enumerate(shares):
-        total = (bright + _spread(share, *y.shape)) >> fraction
-        colours[..., channel] = np.clip(total, 0, most)
+        total = bright + _spread(share, *y.shape)
+        total >>= fraction
+        colours[..., channel] = np.clip(total, 0, 2**depth - 1, out=total)
     return colours
 
 
@@ -118,8 +175,8 @@ class Colours(NamedTuple):
         is_grey: True if the samples are the brightness themselves.
     """
 
-    grey: Callable[[NDArray[Any]], NDArray[Any]] | None
-    rgb: Callable[[NDArray[Any]], NDArray[Any]] | None
+    grey: _Conversion | None
+    rgb: _Conversion | None
     is_grey: bool = False
 
 
@@ -139,10 +196,39 @@ def _without_alpha(samples: NDArray[Any]) -> NDArray[Any]:
     return samples[..., :3]
 
 
+def _to_rgb(order: str, plainly: _Conversion) -> _Conversion:
+    """Return a function that makes colours of samples whose order OpenCV calls so."""
+
+    def convert(samples: NDArray[Any]) -> NDArray[Any]:
+        cv2 = opencv()
+        if cv2 is None:
+            return plainly(samples)
+        made: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{order}2RGB"))
+        return made
+
+    return convert
+
+
+def _to_grey(order: str, plainly: _Conversion) -> _Conversion:
+    """Return a function that makes the brightness of samples whose order OpenCV calls so."""
+
+    def convert(samples: NDArray[Any]) -> NDArray[Any]:
+        cv2 = opencv()
+        if cv2 is None or samples.dtype != np.uint8:  # of which OpenCV is off by up to two
+            return _brightness(plainly(samples))
+        made: NDArray[Any] = cv2.cvtColor(samples, getattr(cv2, f"COLOR_{order}2GRAY"))
+        return made
+
+    return convert
+
+
 def _widened(samples: NDArray[Any]) -> NDArray[Any]:
     """Return the full range of samples of 16 to 235."""
-    wide: NDArray[Any] = _wider()[samples]
-    return wide
+    return looked_up(_wider(), samples)
+
+
+def _of_limited(convert: _Conversion) -> _Conversion:
+    return lambda samples: convert(_widened(samples))
 
 
 @lru_cache(maxsize=1)
@@ -153,12 +239,16 @@ def _wider() -> NDArray[np.uint8]:
 
 def _brightness(rgb: NDArray[Any]) -> NDArray[Any]:
     """Return Y of BT.601, full range, rounded."""
+    cv2 = opencv()
+    if cv2 is not None:
+        bright: NDArray[Any] = cv2.transform(rgb, np.array([[0.299, 0.587, 0.114]]))
+        return bright
     weights = np.array([19595, 38470, 7471], np.uint32)  # 0.299, 0.587, 0.114 times 2 ** 16
     total: NDArray[np.uint32] = rgb @ weights
     return ((total + 2**15) >> 16).astype(rgb.dtype)
 
 
-def _demosaiced(pattern: str, to: str) -> Callable[[NDArray[Any]], NDArray[Any]]:
+def _demosaiced(pattern: str, to: str) -> _Conversion:
     """Return a function that makes grey or colours of a Bayer pattern, named by its first pixels.
 
     OpenCV names a pattern by the second row's second and third pixel, so RG is its BG.
@@ -174,15 +264,14 @@ def _demosaiced(pattern: str, to: str) -> Callable[[NDArray[Any]], NDArray[Any]]
 
 
 COLOURS: Final = {
-    "grey": Colours(_itself, _threefold, is_grey=True),
-    "rgb": Colours(_brightness, _itself),
-    "bgr": Colours(lambda samples: _brightness(_swapped(samples)), _swapped),
-    "rgba": Colours(lambda samples: _brightness(samples[..., :3]), _without_alpha),
-    "bgra": Colours(lambda samples: _brightness(_swapped(samples)), _swapped),
-    "rgb limited": Colours(lambda samples: _brightness(_widened(samples)), _widened),
+    "grey": Colours(_itself, _to_rgb("GRAY", _threefold), is_grey=True),
+    "rgb": Colours(_to_grey("RGB", _itself), _itself),
+    "bgr": Colours(_to_grey("BGR", _swapped), _to_rgb("BGR", _swapped)),
+    "rgba": Colours(_to_grey("RGBA", _without_alpha), _to_rgb("RGBA", _without_alpha)),
+    "bgra": Colours(_to_grey("BGRA", _swapped), _to_rgb("BGRA", _swapped)),
+    "rgb limited": Colours(_of_limited(_to_grey("RGB", _itself)), _widened),
     "bgr limited": Colours(
-        lambda samples: _brightness(_widened(_swapped(samples))),
-        lambda samples: _widened(_swapped(samples)),
+        _of_limited(_to_grey("BGR", _swapped)), _of_limited(_to_rgb("BGR", _swapped))
     ),
     "depth": Colours(None, None),
 } | {

@@ -12,6 +12,7 @@ import numpy as np
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames._codecs.jpeg import decode_jpeg
 from smartcam.frames._pixels.colours import MATRICES, Colours, yuv_to_rgb
+from smartcam.frames._pixels.compiled import pairs_to_rgb
 from smartcam.frames._pixels.unpacking import Packing, unpack
 
 logger: logging.Logger = logging.getLogger("smartcam.frames")
@@ -213,8 +214,16 @@ class YuvPairs(PixelLayout):
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
-        y, u, v = self.planes(picture)
-        return yuv_to_rgb(y, u, v, MATRICES[self.matrix])
+        pairs = self.array(picture)
+        usual = self.matrix == "601" and picture.width % 2 == 0
+        made = pairs_to_rgb(pairs, self.y) if usual else None
+        if made is not None:
+            return made
+        y, *_ = self.planes(picture)
+        _, _, width, height, stride = picture
+        shape = (height, (width + 1) // 2, 2)
+        chroma = _view(picture, "u1", shape, (stride, 4, 2), 1 - self.y)
+        return yuv_to_rgb(y, [chroma], MATRICES[self.matrix])
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,8 +295,12 @@ class Planes(PixelLayout):
 
     def rgb(self, picture: RawPicture) -> NDArray[Any]:
         """Return the colours."""
-        y, u, v = self.planes(picture)
-        return yuv_to_rgb(y, u, v, MATRICES[self.matrix], self.depth)
+        y, *chroma = self.planes(picture)
+        if self.woven:
+            shape, strides = (*chroma[0].shape, 2), (*chroma[0].strides, self.size_of)
+            begin = picture.stride * picture.height
+            chroma = [_view(picture, f"<u{self.size_of}", shape, strides, begin)]
+        return yuv_to_rgb(y, chroma, MATRICES[self.matrix], self.depth)
 
 
 @dataclass(frozen=True, slots=True)

@@ -226,7 +226,7 @@ def _with_alpha(video: Any) -> Pixels:
     meant = format_of(_TRANSPARENT[video.format.name], video.color_range, video.colorspace)
     matrix = MATRICES[cast("Planes", meant.layout).matrix]
     y, u, v, alpha = (_rows(plane) for plane in video.planes)
-    data = np.dstack([yuv_to_rgb(y, u, v, matrix), alpha]).tobytes()
+    data = np.dstack([yuv_to_rgb(y, (u, v), matrix), alpha]).tobytes()
     return Pixels(find_format("RGBa8"), video.width, video.height, 4 * video.width, data)
 
 

@@ -12,6 +12,13 @@ import pytest
 from smartcam.calibration import Charuco, Checkerboard, CircleGrid, Code, find_target
 from smartcam.calibration._detection import boards, charucos, circle_grids, corners
 from smartcam.calibration._detection.grid_growing import MAX_SEEDS_TRIED, _Grown
+from smartcam.calibration._detection.markers import (
+    MANY_OUTLINES,
+    MAX_OUTLINES,
+    WINDOWS_PX,
+    _outlines,
+    marker_finder,
+)
 from smartcam.calibration._detection.saddles import (
     MAX_SADDLES_EXAMINED,
     MAX_SADDLES_KEPT,
@@ -267,3 +274,31 @@ def test_find_checkerboard_of_a_part_without_the_mark_is_not_found() -> None:
 def test_saddles_of_noise_are_no_more_than_the_most() -> None:
     image = np.random.default_rng(3).integers(0, 255, (1500, 1500), dtype=np.uint8)
     assert 100 < len(find_saddles(image).points) <= MAX_SADDLES_KEPT < MAX_SADDLES_EXAMINED
+
+
+def squares(size: tuple[int, int], step: int, side: int) -> Picture:
+    """Draw dark squares in rows and columns."""
+    y, x = np.indices(size)
+    return np.where((x % step < side) & (y % step < side), 30, 220).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("step", "side"), [(28, 20), (14, 10), (20, 12)])
+def test_many_squares_are_few_outlines_to_opencv(step: int, side: int) -> None:
+    """It compares each outline with each other one."""
+    image = squares((1024, 1224), step, side)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    without = cv2.aruco.DetectorParameters()
+    windows = {window: len(_outlines(image, window, without)) for window in WINDOWS_PX}
+    assert sum(windows.values()) > len(windows) * MANY_OUTLINES
+    given = marker_finder(image, dictionary).getDetectorParameters()
+    window = given.adaptiveThreshWinSizeMin
+    assert window == given.adaptiveThreshWinSizeMax
+    assert len(_outlines(image, window, given)) <= MAX_OUTLINES
+
+
+def test_board_before_many_squares_is_found() -> None:
+    image = squares((1024, 1280), 20, 12)
+    board = charucos.charuco_board(CHARUCO).generateImage((640, 480), marginSize=30)
+    image[300:780, 400:1040] = board
+    found = find_target(image, CHARUCO)
+    assert len(found.ids) == len(CHARUCO.points)

@@ -1,0 +1,60 @@
+"""Hold the linear algebra to one thread while something is calibrated.
+
+The matrices have up to some hundred rows. OpenBLAS divides such a one among threads that wait for
+each other without sleeping: that takes several times the CPU time, and where other work keeps the
+processors busy, a hundred times as long.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from contextlib import ContextDecorator, suppress
+from typing import Any
+
+from smartcam._extras import load
+from smartcam._forks import tell_of_forks
+from smartcam.exceptions import MissingExtraError
+
+
+class OneBlasThread(ContextDecorator):
+    """Have BLAS use one thread inside of ``with``, or in a function, and afterwards what it did.
+
+    Whether that is a matter of the calling thread or of the process depends on the version of
+    threadpoolctl (extra ``calibration``). So each thread limits it, and gives back what the first
+    of those inside found. Without threadpoolctl nothing changes.
+    """
+
+    def __init__(self) -> None:
+        self.forked()
+        tell_of_forks(self)
+
+    def forked(self) -> None:
+        """Be the copy in a fork, which may go on with one thread."""
+        self._lock = threading.Lock()
+        self._inside: Counter[int] = Counter()  # how deep, by thread
+        self._before: Any = None
+
+    def __enter__(self) -> None:
+        thread = threading.get_ident()
+        with self._lock, suppress(MissingExtraError):
+            self._inside[thread] += 1
+            if self._inside[thread] == 1:
+                found = load("threadpoolctl").ThreadpoolController()
+                limits = found.limit(limits=1, user_api="blas")
+                self._before = self._before or limits
+
+    def __exit__(self, *_: object) -> None:
+        thread = threading.get_ident()
+        with self._lock:
+            self._inside[thread] -= 1
+            if self._inside[thread] > 0:
+                return
+            del self._inside[thread]
+            if self._before is not None:
+                self._before.restore_original_limits()
+            if not self._inside:
+                self._before = None
+
+
+one_blas_thread = OneBlasThread()

@@ -1,0 +1,98 @@
+"""Conversions by OpenCV where it is installed: at most one level from the exact colours."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.exceptions import MissingExtraError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+MIN_LIMITED_Y: Final = 16
+"""Least Y of limited range, black: OpenCV's own conversions take any Y below for it."""
+
+BAND_BYTES: Final = 1 << 17
+"""Bytes of colours that are made at a time, with what is in between in the processor's cache."""
+
+
+@cache
+def opencv() -> Any:
+    """Return OpenCV; None: it is not installed."""
+    try:
+        return load("cv2")
+    except MissingExtraError:
+        return None
+
+
+def looked_up(table: NDArray[Any], samples: NDArray[np.uint8]) -> NDArray[Any]:
+    """Return each sample's value in a table of 256."""
+    cv2 = opencv()
+    found: NDArray[Any]
+    found = table.take(samples, mode="clip") if cv2 is None else cv2.LUT(samples, table)
+    return found
+
+
+def pairs_to_rgb(pairs: NDArray[np.uint8], y: int) -> NDArray[np.uint8] | None:
+    """Return the colours (H, W, 3) of pairs of BT.601 in limited range.
+
+    Args:
+        pairs: (H, W, 2): Y, and by turns U and V; W is even.
+        y: place of Y.
+
+    Returns:
+        None: a Y is below that range, or OpenCV is not installed.
+    """
+    cv2 = opencv()
+    if cv2 is None or cv2.extractChannel(pairs, y).min() < MIN_LIMITED_Y:
+        return None
+    made: NDArray[np.uint8]
+    made = cv2.cvtColor(pairs, cv2.COLOR_YUV2RGB_UYVY if y else cv2.COLOR_YUV2RGB_YUY2)
+    return made
+
+
+def planes_to_rgb(
+    y: NDArray[Any],
+    chroma: Sequence[NDArray[Any]],
+    weights: NDArray[np.float64],
+    most: int,
+    *,
+    usual: bool,
+) -> NDArray[Any]:
+    """Return the colours (H, W, 3) of planes, by OpenCV.
+
+    Args:
+        y: (H, W).
+        chroma: U and V, (h, w) each, or one plane (h, w, 2) with both; each value is taken for all
+            the pixels that share it.
+        weights: (3, 4), of Y, U, V and 1 in red, green and blue.
+        most: largest value of a sample.
+        usual: the planes are of 8 bits, BT.601 and limited range.
+    """
+    cv2, (height, width), (rows, columns) = opencv(), y.shape, chroma[0].shape[:2]
+    if usual and (height, width) == (2 * rows, 2 * columns) and y.min() >= MIN_LIMITED_Y:
+        made: NDArray[Any]
+        made = cv2.cvtColorTwoPlane(y, cv2.merge(chroma), cv2.COLOR_YUV2RGB_NV12)
+        return made
+    across, down = 1 + (columns < width), 1 + (rows < height)
+    colours, spare = np.empty((height, width, 3), y.dtype), most < np.iinfo(y.dtype).max
+    step = -(-BAND_BYTES // (colours.strides[0] * down))
+    for top in range(0, rows, step):
+        parts = [one[top : top + step] for one in chroma]
+        if across * down > 1:
+            size = (columns * across, len(parts[0]) * down)
+            woven = cv2.merge(parts)
+            parts = [cv2.resize(woven, size, interpolation=cv2.INTER_NEAREST)]
+        band = slice(top * down, (top + step) * down)
+        merged = cv2.merge([y[band], *(one[: height - band.start, :width] for one in parts)])
+        if spare:  # bits above the depth, which mean nothing
+            cv2.threshold(merged, most, 0, cv2.THRESH_TRUNC, merged)
+        found = cv2.transform(merged, weights)
+        colours[band] = cv2.threshold(found, most, 0, cv2.THRESH_TRUNC)[1] if spare else found
+    return colours
