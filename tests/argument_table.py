@@ -297,6 +297,7 @@ TABLE: dict[str, dict[str, str]] = {
         "folder": "text",
         "columns": "function",
         "command": "function or None",
+        "cameras": "function",
         "tell": "function",
     },
     "Outlets.stored": {"question": "object"},

@@ -65,6 +65,8 @@ from smartcam.settings import CameraOptions, CameraSettings, OtherOptions
 from smartcam.testing import ThreadedCamera
 from tests.argument_table import CAMERA, KINDS, NOT_HERE, ODD, OPTIONS, TABLE, public_calls
 
+CELL_OF_ONE = {"frames": "x", "applications": {7: {"present": {"grey": [0, 90]}}}}
+
 BASE: dict[str, Any] = {
     "set_clock": {"when": datetime(2030, 1, 1)},  # noqa: DTZ001 - as cameras have it
     "set_input": {"data": b""},
@@ -251,7 +253,7 @@ def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], 
     cell = load_cell(path)["cam"]
     camera: Any = smartcam.connect(f"software:{path}")
     program, teaching = cell.program(7), Teaching(path, "cam", 7)
-    software = {"software": Software(frames="x", applications={7: {"present": {"grey": [0, 90]}}})}
+    software = {"software": Software.model_validate(CELL_OF_ONE)}
 
     def mistakes(name: Any = "cam", folder: Any = folder, **more: Any) -> Any:
         return [*software_mistakes(name, **{**software, **more}, folder=folder)]

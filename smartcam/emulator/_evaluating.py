@@ -91,7 +91,7 @@ class EvaluatingCamera(LineCamera):
         """Take the parts of each application by its number.
 
         Args:
-            parts: by the number of the application.
+            parts: parts of each application, by its number.
             active: number of the active one; None for the first one.
             none: numbers that say that no application is active.
 

@@ -632,6 +632,7 @@ async def test_remarks_of_a_camera_reach_the_programs_of_a_fleet() -> None:
                 async for event in events:
                     if isinstance(event, smartcam.NoticeReceived):
                         break
+        assert isinstance(event, smartcam.NoticeReceived)
         assert (event.camera, event.kind, event.code) == ("left", "error", 110001006)
         assert event.text == "Trigger overrun"
         assert fleet["left"].statistics().notices == 1

@@ -49,7 +49,8 @@ class Pictures(Observer):
 
 def opened(path: Path, *observers: Observer, **options: Any) -> SoftwareCamera[Any]:
     given = {**LIMITS, **options}
-    camera: Any = smartcam.connect(f"software:{path}", observers=[*observers], **given)
+    camera = smartcam.connect(f"software:{path}", observers=[*observers], **given)
+    assert isinstance(camera, SoftwareCamera)
     return camera
 
 
@@ -130,7 +131,7 @@ async def test_results_of_a_free_run_keep_their_pictures_whoever_listened_before
         await camera.start()
         await until(lambda: camera.statistics().received >= 3)  # nobody listens
         await listen(camera)
-        emulator = camera._device.emulator
+        emulator: Any = camera._device.emulator
         before = emulator.device.sessions
         emulator._active.close("the cable is cut")
         await until(lambda: emulator.device.sessions > before)

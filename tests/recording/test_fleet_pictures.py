@@ -116,7 +116,12 @@ async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bou
 ) -> None:
     monkeypatch.setattr(folder_files, "STEP", 1)
     async with NumberedCamera() as box:
-        options = {"source": "synthetic://", "pictures": "all", "size": 20_000.0, "keep": 60_000.0}
+        options: dict[str, Any] = {
+            "source": "synthetic://",
+            "pictures": "all",
+            "size": 20_000.0,
+            "keep": 60_000.0,
+        }
         async with recording(tmp_path, box.url, **options) as (recorder, agent):
             await until(lambda: files(tmp_path) and device.given)
             first = files(tmp_path)[0]
@@ -274,10 +279,10 @@ def test_results_that_are_alike_have_pictures_only_in_one_order(tmp_path: Path) 
 
     def shown(applications: dict[int, TakeList], *given: bytes) -> list[int | None]:
         pictures = ReplayedPictures(found, "left", applications, 1.0)
-        numbers = []
+        numbers: list[int | None] = []
         for data in given:
             pictures.given(5, data)
-            numbers.append(pictures.shown and pictures.shown.sequence)
+            numbers.append(None if pictures.shown is None else pictures.shown.sequence)
         return numbers
 
     one = [(True, b"a"), (True, b"b"), (True, b"a")]

@@ -239,7 +239,7 @@ class Talkative(Machine):
 
     def receive_data(self, data: bytes) -> None:
         if self.state is State.FAILED:
-            self._events.append(m.QueryAnswer(application=1))
+            self._held.pass_on((m.QueryAnswer(application=1),))
         super().receive_data(data)
 
 
@@ -248,7 +248,7 @@ class Nonsense(Machine):
         try:
             super()._read(line)
         except FrameError:
-            self._events.append(m.Trigger())
+            self._held.pass_on((m.Trigger(),))
 
 
 class Verbose(Machine):
@@ -340,7 +340,7 @@ class Credulous(Machine):
 
     def _read(self, line: str) -> None:
         if line.isdecimal() and not self._asked:
-            self._events.append(m.QueryAnswer(application=int(line)))
+            self._held.pass_on((m.QueryAnswer(application=int(line)),))
         else:
             super()._read(line)
 
@@ -372,7 +372,9 @@ class Kinless(Machine):
 
 class Sharing(Machine):
     def events(self) -> Any:
-        return self._events
+        shared = self.__dict__.setdefault("shared", [])
+        shared[:] = super().events()
+        return shared
 
 
 class Stuck(Machine):

@@ -137,7 +137,7 @@ class Trailer(NamedTuple):
     """The contents of a block's last packet.
 
     Attributes:
-        payload_type: of :class:`PayloadType`.
+        payload_type: a value of :class:`PayloadType`.
         rows: number of rows that were sent; 0: it does not say.
         length: bytes of the payload; 0: it does not say.
     """

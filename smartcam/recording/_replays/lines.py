@@ -118,7 +118,7 @@ def eight_bits(picture: Frame) -> NDArray[np.uint8]:
 
 
 @dataclass(slots=True)
-class _Asked:
+class _AskedLine:
     """A line of the recorded client: what it got, and where in the recording that began and ended.
 
     A line that was not recorded is known by its place in its session.
@@ -138,13 +138,13 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
         RecordingError: it is more than :data:`MAX_REPLAY`.
     """
     plan = LinesPlan()
-    now, place, size = _Asked(0.0, pieces=plan.greeting), 0, 0
-    known: dict[str, _Asked] = {}  # by what answers are known by
-    lines: list[_Asked] = []
+    now, place, size = _AskedLine(0.0, pieces=plan.greeting), 0, 0
+    known: dict[str, _AskedLine] = {}  # by what answers are known by
+    lines: list[_AskedLine] = []
     for number, item in enumerate(items):
         if isinstance(item, Disconnected):
             _forget_silence(lines)
-            now, place = _Asked(item.at.timestamp()), 0
+            now, place = _AskedLine(item.at.timestamp()), 0
             known.clear()
         if not isinstance(item, TraceEntry) or item.direction == "!":
             continue
@@ -158,7 +158,7 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
             answered.end = number
             answered.pieces.append(TimedLine(max(0.0, at - answered.at), data))
             continue
-        now = _Asked(at, bare(codec, data) if data else place, number)
+        now = _AskedLine(at, bare(codec, data) if data else place, number)
         known[codec.request_key(data)] = now
         lines.append(now)
         place += 1
@@ -167,13 +167,13 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
     return plan
 
 
-def _forget_silence(lines: list[_Asked]) -> None:
+def _forget_silence(lines: list[_AskedLine]) -> None:
     """Leave out the last line of a link that ended before an answer: its answer is not known."""
     if lines and not lines[-1].pieces:
         lines.pop()
 
 
-def _arrange(plan: LinesPlan, lines: list[_Asked], codec: LineCodec) -> None:
+def _arrange(plan: LinesPlan, lines: list[_AskedLine], codec: LineCodec) -> None:
     """Put what each line got in its place in a plan."""
     triggers = [one for one in lines if isinstance(one.line, bytes) and is_trigger(codec, one.line)]
     plan.triggers = len(triggers)
@@ -187,7 +187,7 @@ def _arrange(plan: LinesPlan, lines: list[_Asked], codec: LineCodec) -> None:
         answers.moments.append(_moment(one.begin, triggers))
 
 
-def _moment(place: int, triggers: list[_Asked]) -> int:
+def _moment(place: int, triggers: list[_AskedLine]) -> int:
     """Return the moment of a place in a recording, see :class:`LineAnswers`."""
     before = bisect_left(triggers, place, key=lambda one: one.begin)
     end = triggers[before - 1].end if before else None
@@ -347,7 +347,7 @@ class ReplayedLines(LineCamera):
             tell()
 
     def _take(self, line: bytes, found: LineAnswers) -> list[TimedLine]:
-        """Return what a line gets now."""
+        """Return the recorded pieces that answer a line now."""
         if (
             is_trigger(self.lines, line)
             or not self.plan.triggers
@@ -364,7 +364,7 @@ class ReplayedLines(LineCamera):
         return 2 * number - (self._answered < self._triggered)
 
     def _ended(self, client: LineClient, *, trigger: bool) -> Callable[[], None]:
-        """Return what is done once a line has got all that it gets."""
+        """Return the call for the moment when a line has its whole answer."""
         number = self._triggered
 
         def end() -> None:
