@@ -257,7 +257,7 @@ def _result(
     if not use.turned:
         covariance[2, 2] = UNKNOWN_ANGLE**2
     lengths = segments.halves / segments.halves.sum()
-    wrong = (fit.heights < -use.contrast) & ~use.any_polarity
+    wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     return FinePose(
         pose._replace(angle=math.remainder(pose.angle, 2 * math.pi)),
         covariance,

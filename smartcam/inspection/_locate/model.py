@@ -244,7 +244,7 @@ def _taught(
     _check_directions(segments)
     centre = found.points.mean(axis=0)
     segments = _ordered(segments._replace(middles=segments.middles - centre))
-    symmetry, off = find_symmetry(segments)
+    symmetry, off = find_symmetry(segments, found.points - centre, found.normals)
     segments, centre = segments._replace(middles=segments.middles - off), centre + off
     return PartModel(
         name=name,

@@ -35,6 +35,9 @@ CENTRE_STEPS: Final = 6
 CENTRE_PX: Final = 3.0
 """Pixels between a turned segment and the one that it lies on, at most."""
 
+MAX_POINTS: Final = 1000
+"""Edge pixels that are turned, about."""
+
 TURNS: Final = 720
 """Turns of the full circle that are tried."""
 
@@ -74,18 +77,20 @@ class Symmetry:
         return said
 
 
-def find_symmetry(segments: Segments) -> tuple[Symmetry, Array]:
-    """Return the turns at which segments lie on themselves, and the place they turn about.
+def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Symmetry, Array]:
+    """Return the turns at which a part's edges lie on themselves, and the place they turn about.
+
+    ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
+    is told to a fraction of a pixel.
 
     The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
     """
-    shares = _shares(segments)
+    shares = _shares(points, normals)
     for count in (0, *range(MAX_FOLD, 1, -1)):
         if _least(shares, count) < ALIKE:
             continue
         centre = _centre(segments, count or MAX_FOLD)
-        moved = segments._replace(middles=segments.middles - centre)
-        again = _shares(moved)
+        again = _shares(points - centre, normals)
         if _least(again, count) >= SAME:
             return Symmetry(count, _alike(again, count) if count else ()), centre
     return Symmetry(1, _alike(shares, 1)), np.zeros(2)
@@ -122,10 +127,9 @@ def _centre(segments: Segments, count: int) -> Array:
     return centre
 
 
-def _shares(segments: Segments) -> Array:
-    """Return the part of the outline that each turn brings onto itself, (TURNS,)."""
+def _shares(points: Array, normals: Array) -> Array:
+    """Return the part of the edges that each turn brings onto others, (TURNS,)."""
     cv2 = load("cv2", "inspection needs")
-    points, owners = segments.curve(1.0)
     radius = math.ceil(float(np.linalg.norm(points, axis=1).max())) + 3
     image = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
     at = np.rint(points).astype(int) + radius
@@ -133,17 +137,17 @@ def _shares(segments: Segments) -> Array:
     distance, nearest = cv2.distanceTransformWithLabels(
         image, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    owner_of = np.zeros(int(nearest.max()) + 1, int)
-    owner_of[nearest[at[:, 1], at[:, 0]]] = owners
-    angles = 2 * math.pi * np.arange(TURNS) / TURNS
-    cos, sin = np.cos(angles), np.sin(angles)
-    turns = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)
-    moved = np.einsum("nk,akl->anl", points, turns)
-    normals = np.einsum("nk,akl->anl", segments.normals[owners], turns)
-    columns, rows = (np.rint(moved[..., k]).astype(int) + radius for k in (0, 1))
-    met = owner_of[nearest[rows, columns]]
-    agreed = (segments.normals[met] * normals).sum(axis=2) >= math.cos(MAX_TURN)
-    shares: Array = (agreed & (distance[rows, columns] <= NEAR_PX)).mean(axis=1)
+    point_of = np.zeros(int(nearest.max()) + 1, int)
+    point_of[nearest[at[:, 1], at[:, 0]]] = np.arange(len(at))
+    step = max(1, len(points) // MAX_POINTS)
+    shares = np.empty(TURNS)
+    for number in range(TURNS):
+        angle = 2 * math.pi * number / TURNS
+        turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
+        met = point_of[nearest[rows, columns]]
+        agreed = (normals[met] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(MAX_TURN)
+        shares[number] = (agreed & (distance[rows, columns] <= NEAR_PX)).mean()
     return shares
 
 
