@@ -30,8 +30,8 @@ DIRECTIONS: Final = 16
 AGREEMENT: Final = (4, 3, 1)
 """Agreement of two directions that are so many steps apart; of others it is 0."""
 
-MAX_TOP_POINTS: Final = 63
-"""Points of a part that are looked up everywhere: with four each, their sum is a byte."""
+MAX_TOP_POINTS: Final = 44
+"""Points of a part that are looked up everywhere: with 4 of agreement each, their sum is a byte."""
 
 MAX_POINTS: Final = 150
 """Points of a part that are looked up at the places that are followed."""
@@ -303,19 +303,26 @@ class _AgreementTable:
     ) -> list[tuple[int, int, int, int]]:
         """Return the highest peaks: index of the angle, row, column, and sum."""
         cv2 = load("cv2", "inspection needs")
-        inside = stack[:, :, : self._width]
-        candidates = np.flatnonzero(inside.max(axis=(1, 2)) >= least)
+        flat = stack.reshape(len(stack), -1)
         found: list[tuple[int, int, int, int]] = []
         around = np.ones((3, 3), np.uint8)
-        for turn in candidates.tolist():
-            mine = np.ascontiguousarray(inside[turn])
-            highest = cv2.dilate(mine, around)
+        for turn in np.flatnonzero(flat.max(axis=1) >= least).tolist():
+            high = np.flatnonzero(flat[turn] >= least)
+            totals = flat[turn][high]
+            highest = totals >= cv2.dilate(stack[turn], around).ravel()[high]
             for other in (turn - 1, turn + 1):
                 if closes or 0 <= other < len(stack):
-                    highest = np.maximum(highest, inside[other % len(stack)])
-            rows, columns = np.nonzero((mine >= highest) & (mine >= least))
-            totals = mine[rows, columns].tolist()
-            found += zip([turn] * len(totals), rows.tolist(), columns.tolist(), totals, strict=True)
+                    highest &= totals >= flat[other % len(stack)][high]
+            high, totals = high[highest], totals[highest]
+            rows, columns = np.divmod(high, self._row)
+            mine = columns < self._width
+            found += zip(
+                [turn] * int(np.count_nonzero(mine)),
+                rows[mine].tolist(),
+                columns[mine].tolist(),
+                totals[mine].tolist(),
+                strict=True,
+            )
         return sorted(found, key=lambda one: -one[3])[: 4 * MAX_CANDIDATES]
 
 

@@ -180,7 +180,8 @@ class _Look:
         self._levels = picture.levels
         self._unit = float(2**picture.depth - 1) / 255
         grey = np.ascontiguousarray(picture.grey[top:below, left:right])
-        self._pyramid = PicturePyramid(grey, noise_of(grey))
+        self._noise = noise_of(grey)
+        self._pyramid = PicturePyramid(grey, self._noise)
 
     def find(
         self,
@@ -218,6 +219,7 @@ class _Look:
     ) -> FinePose | None:
         use = FineSettings(
             contrast * self._unit,
+            self._noise * self._unit,
             search.any_polarity,
             search.scales[1] > search.scales[0],
             model.symmetry.fold != 0,

@@ -46,10 +46,10 @@ EDGE_SIGNIFICANCE: Final = 4.0
 """Standard deviations of its height that an edge has at least."""
 
 SEEN_PX: Final = 1.0
-"""Pixels beside its place, besides the noise, up to which a segment counts as seen."""
+"""Pixels beside its place, besides the noise, from which on a segment counts nothing as seen."""
 
-MISFIT_NOISES, MAX_MISFIT = 3.0, 0.3
-"""Rms about a step in parts of the noise, and of the edge's height, up to which it is an edge."""
+MAX_MISFIT: Final = 0.3
+"""Rms about a step beyond the noise, in parts of the edge's height, up to which it is an edge."""
 
 MIN_SEEN: Final = 6
 """Segments that a pose is worked out from at least."""
@@ -57,14 +57,15 @@ MIN_SEEN: Final = 6
 UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
 """Standard deviation of an angle of which nothing is known, in radians."""
 
-MAX_CONDITION: Final = 1e10
-"""Condition of the equations above which the edges leave the pose open."""
+MAX_INVERSE: Final = 1e8
+"""Largest element of the inverse of the scaled equations; above it the edges leave a pose open."""
 
 
 class FineSettings(NamedTuple):
     """Settings of a fit."""
 
     contrast: float  # grey levels from the darker to the brighter side at least
+    noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
     scaled: bool = False  # whether the scale is fitted
     turned: bool = True  # whether the angle is fitted; that of a round part is not
@@ -166,9 +167,16 @@ def _edges(fit: StepFit, use: FineSettings) -> tuple[NDArray[np.bool_], float]:
     noise = _noise(fit, there)
     heights = np.abs(fit.heights) if use.any_polarity else fit.heights
     tall = heights >= np.maximum(use.contrast, EDGE_SIGNIFICANCE * noise * fit.height_sigmas)
-    misfit = np.sqrt(fit.variances)
-    steps = misfit <= np.maximum(MISFIT_NOISES * noise, MAX_MISFIT * np.abs(fit.heights))
-    return there & tall & steps, noise
+    return there & tall & (_misfits(fit, use) <= 1), noise
+
+
+def _misfits(fit: StepFit, use: FineSettings) -> Array:
+    """Return the rms about each step beyond the noise, in parts of what an edge may have."""
+    # by chance a band's pixels stray more or less than others
+    noise = use.noise**2 * (1 + 3 * np.sqrt(2 / fit.freedoms))
+    beyond = np.sqrt(np.maximum(fit.variances - noise, 0.0))
+    misfits: Array = beyond / np.maximum(MAX_MISFIT * np.abs(fit.heights), 1e-6)
+    return misfits
 
 
 def _noise(fit: StepFit, there: NDArray[np.bool_]) -> float:
@@ -214,9 +222,13 @@ def _least_squares(
     square = a.T @ a
     scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
     unit = square / np.outer(scale, scale)
-    if np.linalg.cond(unit) > MAX_CONDITION:
+    try:
+        inverse = np.linalg.inv(unit)
+    except np.linalg.LinAlgError:
         return None
-    inverse = np.linalg.inv(unit) / np.outer(scale, scale)
+    if not np.abs(inverse).max() < MAX_INVERSE:
+        return None
+    inverse = inverse / np.outer(scale, scale)
     found, covariance = np.zeros(4), np.zeros((4, 4))
     found[free] = inverse @ (a.T @ (values * np.sqrt(weights)))
     covariance[np.ix_(free, free)] = inverse
@@ -256,12 +268,15 @@ def _result(
     covariance[:, 3] *= pose.scale
     if not use.turned:
         covariance[2, 2] = UNKNOWN_ANGLE**2
+    # as much of each edge counts as it is where it should be, and a step
+    beside = off / (SEEN_PX + CUT * np.minimum(sigmas, 1.0))
+    alike = (1 - beside**2) * (1 - _misfits(fit, use) ** 2)
     lengths = segments.halves / segments.halves.sum()
     wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
     return FinePose(
         pose._replace(angle=math.remainder(pose.angle, 2 * math.pi)),
         covariance,
-        float(lengths[seen].sum()),
+        float((lengths * alike)[seen].sum()),
         seen,
         kept,
         noise,

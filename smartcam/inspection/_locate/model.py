@@ -62,6 +62,9 @@ MIN_ACROSS: Final = 0.02
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
 """Cosine of the angle up to which a level's gradient has the direction of a point of the part."""
 
+LEVEL_RESPONSE: Final = 0.8
+"""Response of Sobel's operator to a part's edge of one grey level at a level, at least."""
+
 NOISES: Final = 6.0
 """Standard deviations of the noise that a taught edge's contrast has at least."""
 
@@ -341,15 +344,19 @@ def _seen_at(
     """Return the segments whose direction a level shows, one for each of its pixels."""
     cv2 = load("cv2", "inspection needs")
     across, down = (cv2.Sobel(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1)))
-    at = np.rint((segments.middles + centre) / 2**level).astype(int)
-    at = at.clip(0, np.array(grey.shape[::-1]) - 1)
-    gradient = np.column_stack([across[at[:, 1], at[:, 0]], down[at[:, 1], at[:, 0]]])
-    size = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
-    agreed = (gradient * segments.normals).sum(axis=1) / size >= LEVEL_AGREEMENT
-    _, first = np.unique(at @ [1, 1 << 20], return_index=True)
-    once = np.zeros(len(at), dtype=np.bool_)
+    exact = (segments.middles + centre) / 2**level
+    limit = np.array(grey.shape[::-1]) - 1
+    agreed = np.zeros(len(exact), dtype=np.bool_)
+    for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):  # the search looks at neighbours, too
+        x, y = (np.floor(exact).astype(int) + corner).clip(0, limit).T
+        gradient = np.column_stack([across[y, x], down[y, x]])
+        size = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
+        alike = (gradient * segments.normals).sum(axis=1) / size >= LEVEL_AGREEMENT
+        agreed |= alike & (size >= LEVEL_RESPONSE * segments.heights)
+    _, first = np.unique(np.rint(exact).astype(int) @ [1, 1 << 20], return_index=True)
+    once = np.zeros(len(exact), dtype=np.bool_)
     once[first] = True
-    return np.flatnonzero(agreed & once & (size >= 2.0 * segments.heights * 0.3))
+    return np.flatnonzero(agreed & once)
 
 
 # ---------------------------------------------------------------------- files
