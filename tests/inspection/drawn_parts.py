@@ -129,41 +129,68 @@ def shares(shape: tuple[int, int], parts: Sequence[PlacedPart], blur: float) -> 
     """Return the light of parts (H, W), 0 for the background; exact to about 0.001 pixels."""
     canvas = np.zeros(shape)
     for part in parts:
-        reach = math.ceil(part.size * part.scale + 5 * blur + 4)
-        left, top = math.floor(part.x) - reach, math.floor(part.y) - reach
-        patch = _patch(part, (left, top), 2 * reach + 1, blur)
-        low = max(left, 0), max(top, 0)
-        high = min(left + len(patch), shape[1]), min(top + len(patch), shape[0])
+        corner, fine = _samples(part, blur)
+        own, light = _pixels(fine)
+        low = max(corner[0], 0), max(corner[1], 0)
+        high = min(corner[0] + len(own), shape[1]), min(corner[1] + len(own), shape[0])
         if high[0] <= low[0] or high[1] <= low[1]:
             continue
-        rows, columns = slice(low[1] - top, high[1] - top), slice(low[0] - left, high[0] - left)
-        own, light = (one[rows, columns] for one in patch_of(patch))
-        there = canvas[low[1] : high[1], low[0] : high[0]]
-        canvas[low[1] : high[1], low[0] : high[0]] = there * (1 - own) + light
+        cut = slice(low[1] - corner[1], high[1] - corner[1]), slice(
+            low[0] - corner[0], high[0] - corner[0]
+        )
+        there = slice(low[1], high[1]), slice(low[0], high[0])
+        canvas[there] = canvas[there] * (1 - own[cut]) + light[cut]
     return canvas
 
 
-def patch_of(patch: Array) -> tuple[Array, Array]:
-    """Return how much of each pixel is of the part, and its light."""
-    return patch[..., 0], patch[..., 1]
+def slopes(shape: tuple[int, int], part: PlacedPart, blur: float) -> Array:
+    """Return the derivatives of a part's light (4, H, W) by its x, y, angle and scale."""
+    corner, fine = _samples(part, blur)
+    down, across = np.gradient(fine[..., 1].astype(float) * SAMPLES)
+    u, v = (one - at for one, at in zip(_places(corner, len(fine)), (part.x, part.y), strict=True))
+    ways = (
+        -across,
+        -down,
+        across * v - down * u,
+        -(across * u + down * v) / part.scale,
+    )
+    found = np.zeros((4, *shape))
+    for one, way in zip(found, ways, strict=True):
+        (small,) = _pixels(way[..., None])
+        rows, columns = slice(corner[1], corner[1] + len(small)), slice(
+            corner[0], corner[0] + len(small)
+        )
+        one[rows, columns] = small
+    return found
 
 
-def _patch(part: PlacedPart, corner: tuple[int, int], side: int, blur: float) -> Array:
-    at = (np.arange(side * SAMPLES, dtype=np.float32) + 0.5) / SAMPLES - 0.5
-    u, v = np.meshgrid(at + corner[0] - part.x, at + corner[1] - part.y)
+def _places(corner: tuple[int, int], count: int) -> list[Array]:
+    at = (np.arange(count, dtype=np.float32) + 0.5) / SAMPLES - 0.5
+    return list(np.meshgrid(at + corner[0], at + corner[1]))
+
+
+def _samples(part: PlacedPart, blur: float) -> tuple[tuple[int, int], NDArray[np.float32]]:
+    """Return the first pixel of a part, and at its samples how much is of the part, and light."""
+    reach = math.ceil(part.size * part.scale + 5 * blur + 4)
+    corner = math.floor(part.x) - reach, math.floor(part.y) - reach
+    u, v = _places(corner, (2 * reach + 1) * SAMPLES)
     cos, sin = math.cos(part.angle) / part.scale, math.sin(part.angle) / part.scale
+    u, v = u - np.float32(part.x), v - np.float32(part.y)
     x, y = cos * u + sin * v, cos * v - sin * u
     light = np.zeros(u.shape, np.float32)
     own = np.zeros(u.shape, np.float32)
     for shape in part.shapes:
         share = (shape.inside(x, y) * part.scale * SAMPLES + 0.5).clip(0, 1).astype(np.float32)
-        light += share * (shape.level - light)
+        light += share * (np.float32(shape.level) - light)
         own = np.maximum(own, share)
-    both = np.dstack([own, light])
-    both = cv2.GaussianBlur(both, (0, 0), blur * SAMPLES)
-    # a pixel's samples are SAMPLES of a side: their mean, without another interpolation
-    means: Array = both.reshape(side, SAMPLES, side, SAMPLES, 2).mean(axis=(1, 3)).astype(float)
-    return means
+    return corner, cv2.GaussianBlur(np.dstack([own, light]), (0, 0), blur * SAMPLES)
+
+
+def _pixels(fine: NDArray[np.generic]) -> Array:
+    """Return the means over pixels, (K, H, W), of samples (H, W, K)."""
+    side = len(fine) // SAMPLES
+    means = fine.reshape(side, SAMPLES, side, SAMPLES, -1).mean(axis=(1, 3), dtype=np.float64)
+    return np.moveaxis(means, 2, 0)
 
 
 def photograph(light: Array, look: Look, random: np.random.Generator) -> NDArray[np.generic]:
