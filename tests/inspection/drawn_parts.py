@@ -75,7 +75,14 @@ PARTS: dict[str, tuple[Shape, ...]] = {
     ),
     "tee": (
         polygon(
-            1.0, (-50, -40), (50, -40), (50, -14), (13, -14), (13, 45), (-13, 45), (-13, -14),
+            1.0,
+            (-50, -40),
+            (50, -40),
+            (50, -14),
+            (13, -14),
+            (13, 45),
+            (-13, 45),
+            (-13, -14),
             (-50, -14),
         ),
         disc(0.0, 0, 28, 7),
@@ -135,8 +142,9 @@ def shares(shape: tuple[int, int], parts: Sequence[PlacedPart], blur: float) -> 
         high = min(corner[0] + len(own), shape[1]), min(corner[1] + len(own), shape[0])
         if high[0] <= low[0] or high[1] <= low[1]:
             continue
-        cut = slice(low[1] - corner[1], high[1] - corner[1]), slice(
-            low[0] - corner[0], high[0] - corner[0]
+        cut = (
+            slice(low[1] - corner[1], high[1] - corner[1]),
+            slice(low[0] - corner[0], high[0] - corner[0]),
         )
         there = slice(low[1], high[1]), slice(low[0], high[0])
         canvas[there] = canvas[there] * (1 - own[cut]) + light[cut]
@@ -157,8 +165,9 @@ def slopes(shape: tuple[int, int], part: PlacedPart, blur: float) -> Array:
     found = np.zeros((4, *shape))
     for one, way in zip(found, ways, strict=True):
         (small,) = _pixels(way[..., None])
-        rows, columns = slice(corner[1], corner[1] + len(small)), slice(
-            corner[0], corner[0] + len(small)
+        rows, columns = (
+            slice(corner[1], corner[1] + len(small)),
+            slice(corner[0], corner[0] + len(small)),
         )
         one[rows, columns] = small
     return found

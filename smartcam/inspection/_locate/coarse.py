@@ -246,9 +246,7 @@ def find_candidates(
     return found, refused
 
 
-def _everywhere(
-    pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges
-) -> Iterator[Candidate]:
+def _everywhere(pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges) -> Iterator[Candidate]:
     """Yield places at the smallest level, of all angles and scales."""
     top = model.top
     maps = pyramid.agreement(top, ranges.contrast, any_polarity=ranges.any_polarity)
@@ -258,7 +256,9 @@ def _everywhere(
     for scale in ranges.sizes(TOP_STEP_PX / radius).tolist():
         angles, closed = ranges.turns(TOP_STEP_PX / (radius * scale))
         table = _AgreementTable(maps, math.ceil(radius * scale) + 1)
-        for part in np.array_split(angles, max(1, -(-table.bytes * len(angles) // MAX_STACK_BYTES))):
+        for part in np.array_split(
+            angles, max(1, -(-table.bytes * len(angles) // MAX_STACK_BYTES))
+        ):
             stack = table.sums(scale * points, normals, part)
             least = max(1, math.floor(TOP_SHARE * ranges.least_score * 4 * len(points)))
             closes = closed and len(part) == len(angles)

@@ -220,7 +220,9 @@ def _taught(
     contrast: float | None,
 ) -> PartModel:
     mask, corner = _mask(region, picture)
-    rows, columns = (slice(at, at + size) for at, size in zip(corner[::-1], mask.shape, strict=True))
+    rows, columns = (
+        slice(at, at + size) for at, size in zip(corner[::-1], mask.shape, strict=True)
+    )
     grey, levels = picture.grey[rows, columns], picture.levels[rows, columns]
     top = float(2**picture.depth - 1)
     noise = noise_of(levels) * 255 / top
@@ -275,8 +277,8 @@ def _mask(
         placed = place(region, None, picture.size)
         if placed.is_empty:
             raise TeachingError(
-                TeachingTrouble.EMPTY, "the region has no pixel in the picture of "
-                f"{picture.size[0]} x {picture.size[1]}"
+                TeachingTrouble.EMPTY,
+                f"the region has no pixel in the picture of {picture.size[0]} x {picture.size[1]}",
             )
         mask, corner = placed.mask() > 0, (placed.left, placed.top)
     if not mask.any():

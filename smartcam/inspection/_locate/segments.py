@@ -220,4 +220,3 @@ def _widening(residuals: Array, widen: Array, heights: Array, owners: NDArray[np
     column = -widen * np.where(tall >= np.median(tall), heights, 0.0)[owners]
     square = float(column @ column)
     return float(column @ residuals) / square if square > 0 else 0.0
-

@@ -7,6 +7,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from smartcam.inspection._places import RegionSetting
 from smartcam.inspection._tool import ToolSettings
 
 MAX_PARTS: Final = 200
@@ -34,9 +35,18 @@ File = Annotated[str, Field(min_length=1)]
 class LocateSettings(ToolSettings):
     """The models that are looked for, and the poses that they may have."""
 
-    model: File | Annotated[list[File], Field(min_length=1, max_length=MAX_MODELS)] = Field(
-        description="file with a model of the part, beside this one, as smartcam teach makes it; "
-        "or a list of them"
+    model: File | Annotated[list[File], Field(min_length=1, max_length=MAX_MODELS)] | None = Field(
+        None,
+        description="file with a model of the part, beside this one, as PartModel.write makes it; "
+        "or a list of them",
+    )
+    taught: File | None = Field(
+        None, description="instead of a model: file with a picture of the part, beside this one"
+    )
+    part: RegionSetting | None = Field(
+        None,
+        description="where the part is in the taught picture: [x, y, width, height] or corners; "
+        "default: the whole picture",
     )
     angle: Annotated[tuple[Angle, Angle], AfterValidator(_rising)] = Field(
         (-180.0, 180.0),
@@ -80,6 +90,11 @@ class LocateSettings(ToolSettings):
 
     @model_validator(mode="after")
     def _goes_together(self) -> LocateSettings:
+        if (self.model is None) == (self.taught is None):
+            got = "neither" if self.model is None else "both"
+            raise ValueError(f"expected either a model or a taught picture, got {got}")
+        if self.part is not None and self.taught is None:
+            raise ValueError("part: expected it with a taught picture only")
         if self.angle[1] - self.angle[0] > 360:
             raise ValueError(f"angle: expected 360 degrees at most, got {list(self.angle)}")
         return self
@@ -87,7 +102,7 @@ class LocateSettings(ToolSettings):
     @property
     def models(self) -> list[str]:
         """Files of the models."""
-        return [self.model] if isinstance(self.model, str) else self.model
+        return [self.model] if isinstance(self.model, str) else self.model or []
 
     @property
     def angles(self) -> tuple[float, float]:

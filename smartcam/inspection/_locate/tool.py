@@ -14,7 +14,7 @@ from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.settings import MAX_PARTS, LocateSettings
 from smartcam.inspection._measure.planes import PIXELS, robot_plane_of
 from smartcam.inspection._measure.troubles import NotMeasuredError
-from smartcam.inspection._places import PixelPose
+from smartcam.inspection._picture import Picture
 from smartcam.inspection._tool import Tool
 
 if TYPE_CHECKING:
@@ -67,7 +67,11 @@ class Locate(Tool[LocateSettings]):
         super().__init__(settings, setup)
         load("scipy.special", "locate needs")  # now, so that the first picture need not wait
         self.models = [PartModel.read(setup.folder / one) for one in settings.models]
-        for model in self.models:  # the same
+        if settings.taught is not None:
+            file = setup.folder / settings.taught
+            model = PartModel.teach(Picture.read(file), settings.part, name=file.stem)
+            self.models.append(model)
+        for model in self.models:  # worked out now, for the same reason
             _ = model.bands, model.coarse
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
@@ -83,8 +87,9 @@ class Locate(Tool[LocateSettings]):
             seconds=settings.seconds,
         )
         count = settings.count
-        default = (1, MAX_PARTS * len(self.models))
-        self._wanted = default if count is None else count if isinstance(count, tuple) else (count,) * 2
+        self._wanted = (1, MAX_PARTS * len(self.models))
+        if count is not None:
+            self._wanted = count if isinstance(count, tuple) else (count, count)
 
     @property
     def fields(self) -> str:

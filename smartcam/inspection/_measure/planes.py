@@ -103,9 +103,7 @@ def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
     """
     kind = getattr(calibration, "kind", None)
     if kind == "plane":
-        return _with_variants(
-            calibration, calibration, _plane_variants(calibration), robot=robot
-        )
+        return _with_variants(calibration, calibration, _plane_variants(calibration), robot=robot)
     if kind == "sheet":
         variants = [
             dataclasses.replace(calibration, plane=one)
