@@ -67,6 +67,9 @@ FALSE_PX, FALSE_DEGREES = 3.0, 3.0
 KIND_RANGE, MEAN_RANGE, WORST_OVER_BOUND = (0.85, 1.15), (0.95, 1.05), 1.2
 
 
+LOOK, QUIET = Look(), Look(noise=0.3)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Kind:
     """A kind of scenes.
@@ -86,8 +89,8 @@ class Kind:
 
     name: str
     part: str = "bracket"
-    look: Look = Look()
-    taught: Look = Look(noise=0.3)
+    look: Look = LOOK
+    taught: Look = QUIET
     scales: tuple[float, float] = (1.0, 1.0)
     covered: float = 0.0
     clutter: int = 0
@@ -366,13 +369,18 @@ def photographs(folder: Path, seed: int) -> tuple[int, list[str]]:
     files = sorted(one for one in folder.rglob("*") if one.suffix.lower() in {".jpg", ".png"})
     found = []
     for file in files:
-        for part in locate(Picture.read(file), models, Search(seconds=30.0)).parts:
-            found.append(f"{file}: {part.name} {part.score:.2f}")
+        parts = locate(Picture.read(file), models, Search(seconds=30.0)).parts
+        found += [f"{file}: {part.name} {part.score:.2f}" for part in parts]
     return len(files), found
 
 
 def _kinds(text: str | None) -> Iterator[Kind]:
     yield from (one for one in KINDS if text is None or text in one.name)
+
+
+def _say(text: str) -> None:
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
 
 
 def main() -> int:
@@ -384,19 +392,20 @@ def main() -> int:
     parser.add_argument("--photographs", type=Path)
     parser.add_argument("--others", action="store_true")
     given = parser.parse_args()
-    print(HEAD, flush=True)
+    _say(HEAD)
     rows = []
     for kind in _kinds(given.kind):
         rows.append(judge(kind, given.scenes, given.seed))
-        print(rows[-1], "" if rows[-1].good else "BAD", flush=True)
+        _say(f"{rows[-1]}{'' if rows[-1].good else ' BAD'}")
     mean = float(np.nanmean([one.ratio for one in rows]))
     good = all(one.good for one in rows)
     chance = 3 / math.sqrt(6 * given.scenes * len(rows))
     good &= MEAN_RANGE[0] - chance <= mean <= MEAN_RANGE[1] + chance
-    print(f"\npredicted over observed, mean of {len(rows)} kinds: {mean:.3f}; seed {given.seed}")
+    _say(f"\npredicted over observed, mean of {len(rows)} kinds: {mean:.3f}; seed {given.seed}")
     if given.photographs is not None:
         count, found = photographs(given.photographs, given.seed)
-        print(f"{len(found)} false finds of {len(PARTS)} parts in {count} photographs", *found)
+        _say(f"{len(found)} false finds of {len(PARTS)} parts in {count} photographs")
+        _say("\n".join(found))
         good &= not found and count > 0
     if given.others:
         from tests.proofs import locating_of_others

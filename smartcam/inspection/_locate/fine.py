@@ -9,8 +9,8 @@ import numpy as np
 
 from smartcam.inspection._locate.segments import (
     MIN_BLUR_PX,
-    Bands,
     BandPixels,
+    Bands,
     Segments,
     StepFit,
     fit_bands,
