@@ -24,7 +24,8 @@ from smartcam.inspection import (
     load_cell,
 )
 from smartcam.inspection._locate.find import Search, locate
-from smartcam.interpreters import Context, LocalizationsInterpreter
+from smartcam.interpreters import Context
+from smartcam.interpreters._localizations import LocalizationsInterpreter
 from smartcam.layout import Layout
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
@@ -101,7 +102,7 @@ def test_symmetric_part_turns_about_its_middle() -> None:
         ("plain", None, TeachingTrouble.FEW_EDGES),
         ("plain", [500, 500, 20, 20], TeachingTrouble.EMPTY),
         ("stripes", [8, 10, 130, 140], TeachingTrouble.OPEN),
-        ("part", [70, 70, 60, 60], TeachingTrouble.BORDER),
+        ("part", [18, 45, 95, 40], TeachingTrouble.BORDER),
     ],
 )
 def test_what_cannot_be_taught_is_told(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 DIRECTIONS: Final = 16
 """Directions of gradients that are told apart in the full circle."""
 
-AGREEMENT: Final = (4, 3, 1)
+AGREEMENT: Final = (np.uint8(4), np.uint8(3), np.uint8(1))
 """Agreement of two directions that are so many steps apart; of others it is 0."""
 
 MAX_TOP_POINTS: Final = 44
@@ -172,13 +172,13 @@ class PyramidLevel:
         number %= count
         number[size < self.least_response(contrast)] = 255
         around = np.ones((3, 3), np.uint8)
-        there = [cv2.dilate(cv2.compare(number, k, cv2.CMP_EQ), around) for k in range(count)]
+        there = [cv2.dilate((number == k).view(np.uint8), around) for k in range(count)]
         found = []
         for k in range(count):
-            best = there[k] & AGREEMENT[0]
+            best = there[k] * AGREEMENT[0]
             for apart in (1, 2):
                 both = there[(k + apart) % count] | there[k - apart]
-                best = np.maximum(best, both & AGREEMENT[apart])
+                best = np.maximum(best, both * AGREEMENT[apart])
             found.append(best)
         return found
 

@@ -103,7 +103,7 @@ def _sampled(image: NDArray[Any], at: Array) -> Array:
     x, y = at.astype(np.float32).T
     # cv2.remap takes fewer than 32768 columns: the points are laid out in rows
     wide = 4096
-    padded = np.zeros((2, -(-len(x) // wide) * wide), np.float32)
+    padded = np.zeros((2, (len(x) // wide + 1) * wide), np.float32)
     padded[0, : len(x)], padded[1, : len(x)] = x, y
     maps = padded.reshape(2, -1, wide)
     found: Array = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR).ravel()[: len(x)]
@@ -113,6 +113,8 @@ def _sampled(image: NDArray[Any], at: Array) -> Array:
 def segments_of(found: EdgePoints) -> Segments:
     """Return segments that edge pixels are divided into, the strongest first."""
     points, normals = found.points, found.normals
+    if not len(points):
+        return _no_segments()
     index = load("scipy.spatial", "locate needs").cKDTree(points)
     free = np.ones(len(points), dtype=np.bool_)
     rows: list[tuple[Array, Array, float, float]] = []
@@ -130,11 +132,15 @@ def segments_of(found: EdgePoints) -> Segments:
         free[mine] = False
         rows.append(_segment(points[mine], normals[mine]))
     if not rows:
-        empty = np.zeros(0)
-        return Segments(np.zeros((0, 2)), np.zeros((0, 2)), empty, empty, empty, empty, empty)
+        return _no_segments()
     middles, directions, bends, halves = (np.array(one) for one in zip(*rows, strict=True))
     ones = np.ones(len(rows))
     return Segments(middles, directions, bends, halves, 0 * ones, 1.2 * ones, 0 * ones)
+
+
+def _no_segments() -> Segments:
+    none = np.zeros(0)
+    return Segments(np.zeros((0, 2)), np.zeros((0, 2)), none, none, none, none, none)
 
 
 def _segment(points: Array, normals: Array) -> tuple[Array, Array, float, float]:

@@ -260,7 +260,7 @@ class _Look:
         for angle, share in model.symmetry.alike:
             if part.score >= share + SAME_SCORE:
                 continue
-            turned = part.pose._replace(angle=part.pose.angle + angle)
+            turned = _turned(part.pose, model.symmetry.about, angle)
             other = self._fit(model, turned, search, contrast)
             if other is not None and other.score >= part.score - SAME_SCORE:
                 doubt = (
@@ -305,6 +305,14 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
         chi_square=fine.chi_square,
         hull=fine.pose.to_picture(model.hull),
     )
+
+
+def _turned(pose: PixelPose, about: tuple[float, float], angle: float) -> PixelPose:
+    """Return a pose of a part that is turned about a place of it."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    x, y = about
+    place = pose.to_picture((x - cos * x + sin * y, y - sin * x - cos * y))
+    return PixelPose(float(place[0]), float(place[1]), pose.angle + angle, pose.scale)
 
 
 def _too_little(score: float, fine: FinePose, search: Search) -> str:

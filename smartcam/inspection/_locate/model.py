@@ -383,6 +383,7 @@ class _ModelFile(BaseModel):
     noise: Annotated[float, Field(ge=0, le=1000)]
     fold: Annotated[int, Field(ge=0, le=1000)]
     alike: Annotated[list[tuple[Number, Number]], Field(max_length=100)]
+    about: tuple[Number, Number]
     segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
     levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
     outline: Places
@@ -401,6 +402,7 @@ class _ModelFile(BaseModel):
             noise=model.noise,
             fold=model.symmetry.fold,
             alike=list(model.symmetry.alike),
+            about=model.symmetry.about,
             segments=[tuple(row) for row in rows.round(6).tolist()],
             levels=[one.tolist() for one in model.levels],
             outline=[tuple(row) for row in model.outline.round(2).tolist()],
@@ -418,7 +420,7 @@ class _ModelFile(BaseModel):
             segments=Segments(rows[:, :2], normals, *rows[:, 4:].T),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
             levels=tuple(levels),
-            symmetry=Symmetry(self.fold, tuple(self.alike)),
+            symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
             reference=self.reference,
             border=self.border,
             noise=self.noise,

@@ -32,8 +32,14 @@ MAX_TURN: Final = math.radians(20.0)
 CENTRE_STEPS: Final = 6
 """Steps in which the place is found that a part turns about."""
 
-CENTRE_PX: Final = 3.0
-"""Pixels between a turned segment and the one that it lies on, at most."""
+CENTRE_PX: Final = 8.0
+"""Pixels between a turned segment and the one that it lies on at the first step, at most."""
+
+MIN_MET: Final = 8
+"""Segments that lie on another one when they are turned, at least."""
+
+COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
+"""Folds of which the middle is always looked for: a notch may move the reference off it."""
 
 MAX_POINTS: Final = 1000
 """Edge pixels that are turned, about."""
@@ -51,10 +57,12 @@ class Symmetry:
             square, 0 of a round one, which has no angle.
         alike: other turns at which it may be taken for itself: radians, and the part of the
             outline that is the same, the most alike first.
+        about: place that these turns are about, pixels from the reference.
     """
 
     fold: int = 1
     alike: tuple[tuple[float, float], ...] = ()
+    about: tuple[float, float] = (0.0, 0.0)
 
     @property
     def period(self) -> float:
@@ -86,14 +94,19 @@ def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Sy
     The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
     """
     shares = _shares(points, normals)
+    best, most = Symmetry(1, _alike(shares, 1)), ALIKE
     for count in (0, *range(MAX_FOLD, 1, -1)):
-        if _least(shares, count) < ALIKE:
+        if count not in COMMON_FOLDS and _least(shares, count) < ALIKE:
             continue
         centre = _centre(segments, count or MAX_FOLD)
         again = _shares(points - centre, normals)
-        if _least(again, count) >= SAME:
+        least = _least(again, count)
+        if least >= SAME:
             return Symmetry(count, _alike(again, count) if count else ()), centre
-    return Symmetry(1, _alike(shares, 1)), np.zeros(2)
+        if least > most and count:
+            x, y = centre.tolist()
+            best, most = Symmetry(1, _alike(again, 1), (x, y)), least
+    return best, np.zeros(2)
 
 
 def _least(shares: Array, count: int) -> float:
@@ -109,7 +122,8 @@ def _centre(segments: Segments, count: int) -> Array:
     """Return the place about which turns of a fold bring segments nearest to themselves."""
     centre = np.zeros(2)
     index = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
-    for _ in range(CENTRE_STEPS):
+    for step in range(CENTRE_STEPS):
+        near = max(CENTRE_PX * (1 - step / 4), NEAR_PX)
         rows, values = [], []
         for number in range(1, count):
             angle = 2 * math.pi * number / count
@@ -119,10 +133,12 @@ def _centre(segments: Segments, count: int) -> Array:
             met = index.query(moved)[1]
             off, along = segments.places(moved, met)
             agreed = (segments.normals @ turn.T * segments.normals[met]).sum(axis=1)
-            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(off) <= CENTRE_PX)
+            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(off) <= near)
             used &= np.abs(along) <= segments.halves[met] + 1
             rows.append((segments.normals[met] @ (np.eye(2) - turn))[used])
             values.append(-off[used])
+        if sum(map(len, values)) < MIN_MET:
+            return np.zeros(2)
         centre = centre + np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
     return centre
 
