@@ -102,7 +102,7 @@ def test_symmetric_part_turns_about_its_middle() -> None:
         ("plain", None, TeachingTrouble.FEW_EDGES),
         ("plain", [500, 500, 20, 20], TeachingTrouble.EMPTY),
         ("stripes", [8, 10, 130, 140], TeachingTrouble.OPEN),
-        ("part", [20, 26, 90, 78], TeachingTrouble.BORDER),
+        ("part", [18, 45, 95, 40], TeachingTrouble.BORDER),
     ],
 )
 def test_what_cannot_be_taught_is_told(

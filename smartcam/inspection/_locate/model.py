@@ -53,7 +53,7 @@ MIN_TOP_POINTS: Final = 16
 BORDER_PX: Final = 3.0
 """Pixels from the region's border within which an edge is left out."""
 
-MAX_BORDER_SHARE: Final = 0.25
+MAX_BORDER_SHARE: Final = 0.1
 """Part of the edges that may lie at the region's border."""
 
 MIN_ACROSS: Final = 0.02
