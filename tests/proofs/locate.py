@@ -416,7 +416,8 @@ def main() -> int:
     if given.others:
         from tests.proofs import locating_of_others
 
-        locating_of_others.compare(given.scenes, given.seed)
+        _say("| way | found | missed | false | median px | median degrees | ms |")
+        _say("\n".join(["| --- " * 7 + "|", *locating_of_others.compare(given.scenes, given.seed)]))
     return 0 if good else 1
 
 
