@@ -2,12 +2,13 @@
 
 ``python -m tests.proofs.locate [--scenes N] [--kind TEXT] [--photographs FOLDER] [--others]``
 
-Draws parts at exact poses in scenes of 29 kinds, five pictures of each drawing, locates them by a model that was taught
-from another picture, and compares. No estimate without a bias can be better than the Cramer-Rao
-bound, which is worked out here from the drawing alone: of the pixels beside the edges that were
-used, where both levels of each piece of an edge are unknown. A kind is good where predicted over
-observed errors are between 0.85 and 1.15, and the mean over the kinds between 0.95 and 1.05; where
-the error is at most 1.2 times the bound; and where nothing is missed or found beside its place.
+Draws parts at exact poses in scenes of 29 kinds, five pictures of each drawing, locates them by a
+model that was taught from another picture, and compares. No estimate without a bias can be better
+than the Cramer-Rao bound, which is worked out here from the drawing alone: of the pixels beside the
+edges that were used, where both levels of each piece of an edge are unknown. A kind is good where
+predicted over observed errors are between 0.85 and 1.15, and the mean over the kinds between 0.95
+and 1.05; where the error is at most 1.2 times the bound; and where nothing is missed or found
+beside its place.
 
 FOLDER of ``--photographs`` has JPEG or PNG files without any of the parts, such as
 ``BSDS500/data/images`` of github.com/BIDS/BSDS500: nothing may be found there. ``--others`` puts
@@ -44,8 +45,6 @@ from tests.inspection.drawn_parts import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
 
     from smartcam.inspection._locate.find import LocatedPart
 
