@@ -160,6 +160,7 @@ def test_model_is_the_same_from_its_file(tmp_path: Path) -> None:
         ({"segments": []}, "segments"),
         ({"levels": [[0], [9999]]}, "levels"),
         ({"fold": -1}, "fold"),
+        ({"outline": [[0, 0], [20000, 0], [0, 20000]]}, "pixels at most"),
         ({"more": 1}, "more"),
     ],
 )

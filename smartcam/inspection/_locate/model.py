@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from smartcam._arguments import check_path, check_text, wrong_argument
 from smartcam._extras import load
@@ -147,9 +147,10 @@ class PartModel:
             return _ModelFile.model_validate_json(data).model()
         except ValidationError as exc:
             first = exc.errors(include_url=False)[0]
-            place = ".".join(map(str, first["loc"]))
+            place = ".".join(map(str, first["loc"])) or "model"
+            text = first["msg"].removeprefix("Value error, ")
             raise ConfigurationError(
-                f"model {path}: {place}: {first['msg']}; expected a file that "
+                f"model {path}: {place}: {text}; expected a file that "
                 "PartModel.write made of this version"
             ) from exc
 
@@ -364,8 +365,11 @@ def _seen_at(
 # ---------------------------------------------------------------------- files
 
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
-Places = Annotated[list[tuple[Number, Number]], Field(max_length=100_000)]
-Row = tuple[Number, Number, Number, Number, Number, Number, Number, Number, Number]
+Place = Annotated[float, Field(allow_inf_nan=False, ge=-20_000, le=20_000)]
+Part = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
+Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=20)]
+Height = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
+Row = tuple[Place, Place, Part, Part, Part, Length, Height, Length, Length]
 
 
 class _ModelFile(BaseModel):
@@ -386,7 +390,19 @@ class _ModelFile(BaseModel):
     about: tuple[Number, Number]
     segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
     levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
-    outline: Places
+    outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> _ModelFile:
+        for number, level in enumerate(self.levels):
+            if not level or max(level) >= len(self.segments):
+                raise ValueError(f"levels.{number}: expected indices of segments")
+        places = np.array([row[:2] for row in self.segments] + self.outline)
+        if float(np.prod(np.ptp(places, axis=0))) > MAX_REGION_PX:
+            raise ValueError(f"expected a part of {MAX_REGION_PX} pixels at most")
+        if min(math.hypot(*row[2:4]) for row in self.segments) < 0.9:
+            raise ValueError("segments: expected normals of the length 1")
+        return self
 
     @classmethod
     def of(cls, model: PartModel) -> _ModelFile:
@@ -412,14 +428,11 @@ class _ModelFile(BaseModel):
         """Return the model of the file."""
         rows = np.array(self.segments, np.float64)
         normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
-        levels = [np.array(one, np.intp) for one in self.levels]
-        if any(len(one) == 0 or one.max() >= len(rows) for one in levels):
-            raise ConfigurationError("levels: expected indices of segments")
         return PartModel(
             name=self.name,
             segments=Segments(rows[:, :2], normals, *rows[:, 4:].T),
             outline=np.array(self.outline, np.float64).reshape(-1, 2),
-            levels=tuple(levels),
+            levels=tuple(np.array(one, np.intp) for one in self.levels),
             symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
             reference=self.reference,
             border=self.border,
