@@ -103,7 +103,7 @@ class Kind:
     @property
     def search(self) -> Search:
         """What is looked for."""
-        least = 0.7 - 0.5 * self.covered
+        least = 0.7 - self.covered
         return Search(
             scales=self.scales, least_score=least, any_polarity=self.any_polarity, seconds=30.0
         )
@@ -189,7 +189,7 @@ def scene_of(kind: Kind, random: np.random.Generator) -> Scene:
 def _covered(light: Array, part: PlacedPart, kind: Kind, random: np.random.Generator) -> Array:
     """Return a scene with a bar over a part of the part."""
     turn, level = random.uniform(0, 2 * math.pi), random.uniform(0.2, 0.8)
-    edge = 48 * (1 - 2 * kind.covered)
+    edge = 52 * math.cos(math.pi * kind.covered)
     bar = polygon(level, (edge, -90), (90, -90), (90, 90), (edge, 90))
     cover = PlacedPart((bar,), part.x, part.y, turn, 1.0, 130.0)
     own = shares(light.shape, [cover], kind.look.blur) / level
