@@ -93,7 +93,7 @@ class CoarseModel:
 
     def radius(self, level: int) -> float:
         """Return how far the farthest point is at a level, in its pixels."""
-        return float(np.linalg.norm(self.points[level], axis=1).max()) / 2**level
+        return float(np.linalg.norm(self.points[level], axis=1).max()) / float(1 << level)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
