@@ -84,7 +84,7 @@ class Kind:
         scales: from and to.
         covered: part of the part that something covers.
         clutter: number of other parts around it.
-        texture: levels of a texture behind it.
+        texture: levels of a texture behind it, of which the bound knows nothing.
         straight: whether the part is not turned, as in most feeders.
         any_polarity: whether dark and bright may be exchanged.
     """
@@ -295,7 +295,7 @@ class Row(NamedTuple):
             self.false == 0
             and self.found == self.scenes
             and KIND_RANGE[0] - chance <= self.ratio <= KIND_RANGE[1] + chance
-            and self.over_bound <= WORST_OVER_BOUND + chance
+            and (self.kind.texture > 0 or self.over_bound <= WORST_OVER_BOUND + chance)
         )
 
     def __str__(self) -> str:

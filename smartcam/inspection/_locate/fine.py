@@ -36,6 +36,9 @@ STILL_PX: Final = 2e-4
 MAX_SHIFT_PX: Final = 2.0
 """Pixels that a segment says in one step at most that it should move."""
 
+MIN_BEND: Final = 0.01
+"""Bend of an edge, per pixel, from which on a blur moves it by something that matters."""
+
 MAX_BLUR_PX: Final = 4.0
 """Blur of a picture's edges up to which they are fitted, in pixels."""
 
@@ -99,7 +102,7 @@ def fit_pose(
             pixels = pixels_in(bands, _matrix(pose), levels)
         first = FIRST_BLURS_PX[number] if number < len(FIRST_BLURS_PX) else None
         fit, blurs = _steps(pixels, segments, pose, widened, first)
-        rows, weights, _, _ = _equations(fit, segments, pose, use, number)
+        rows, weights, _, _ = _equations((fit, blurs), segments, pose, use, number)
         solved = _solve(rows, fit.shifts, weights, free)
         if solved is None:
             return None
@@ -133,7 +136,11 @@ def _steps(
     if first is not None:
         blurs = np.full_like(blurs, first)
     count = len(segments.halves)
-    return fit_bands(across * pose.scale, blurs[pixels.owners], pixels, count), blurs
+    # a blur moves a bent edge towards its middle, by its variance over the diameter
+    bent = np.where(np.abs(segments.bends) >= MIN_BEND, segments.bends, 0.0)
+    moved = 0.5 * bent * widened / pose.scale
+    across = across * pose.scale - moved[pixels.owners]
+    return fit_bands(across, blurs[pixels.owners], pixels, count), blurs
 
 
 def _widened(widened: float, growth: float, blur: float) -> float:
@@ -144,9 +151,14 @@ def _widened(widened: float, growth: float, blur: float) -> float:
 
 
 def _equations(
-    fit: StepFit, segments: Segments, pose: PixelPose, use: FineSettings, number: int
+    steps: tuple[StepFit, Array],
+    segments: Segments,
+    pose: PixelPose,
+    use: FineSettings,
+    number: int,
 ) -> tuple[Array, Array, float, NDArray[np.bool_]]:
     """Return the rows (N, 4) and weights (N,) of the steps, the noise, and which are edges."""
+    fit, blurs = steps
     edges, noise = _edges(fit, use)
     cos, sin = math.cos(pose.angle), math.sin(pose.angle)
     turn = np.array([[cos, sin], [-sin, cos]])
@@ -154,7 +166,7 @@ def _equations(
     arms = pose.scale * segments.middles @ turn
     crossed = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
     rows = np.column_stack([normals, crossed, (normals * arms).sum(axis=1)])
-    sigmas = _sigmas(fit, segments, pose, noise)
+    sigmas = _sigmas(fit, segments, pose, noise, blurs)
     weights = np.where(edges & np.isfinite(sigmas), 1 / np.maximum(sigmas, 1e-6) ** 2, 0.0)
     if number < 3:  # before the pose is near, what is noisy says as much as what is not
         weights = (weights > 0).astype(np.float64)
@@ -188,12 +200,15 @@ def _noise(fit: StepFit, there: NDArray[np.bool_]) -> float:
     return max(math.sqrt(median), ROUNDING)
 
 
-def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float) -> Array:
-    """Return the standard deviation of each shift: of both pictures' noise."""
+def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blurs: Array) -> Array:
+    """Return the standard deviation of each shift: of both pictures' noise, and of a misfit."""
     # a band whose pixels stray more than by chance from a step has more than noise in it
     beyond = fit.variances > noise**2 * (1 + 4 * np.sqrt(2 / fit.freedoms))
     own = np.where(beyond, fit.variances, noise**2)
-    return np.sqrt(own * fit.sigmas**2 + (pose.scale * segments.sigmas) ** 2)
+    # and what it has may move the edge, by as much as it is at the steepest place
+    steepest = np.maximum(np.abs(fit.heights), 1e-6) / (math.sqrt(2 * math.pi) * blurs)
+    misfit = np.where(beyond, fit.variances - noise**2, 0.0) / steepest**2
+    return np.sqrt(own * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
 
 
 def _solve(
@@ -245,7 +260,7 @@ def _result(
 ) -> FinePose | None:
     """Return the pose with what the steps at it say."""
     fit, blurs = _steps(pixels, segments, pose, widened, None)
-    rows, weights, noise, edges = _equations(fit, segments, pose, use, MAX_STEPS)
+    rows, weights, noise, edges = _equations((fit, blurs), segments, pose, use, MAX_STEPS)
     off = np.abs(fit.shifts)
     sigmas = np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 1e-12)), np.inf)
     seen = edges & (off <= SEEN_PX + CUT * np.minimum(sigmas, 1.0))
