@@ -245,11 +245,13 @@ def _over_bound(kind: Kind, model: PartModel, scene: Scene, found: LocatedPart) 
     unit = (2**kind.look.bits - 1) / 255
     variance = (kind.look.noise * unit) ** 2 + 1 / 12
     information = np.zeros((4, 4))
-    middles = found.pose.to_picture(model.segments.middles)
-    kept = {tuple(one) for one in found.edges.round(6).tolist()}
+    turn = np.array([[cos, sin], [-sin, cos]])
+    middles = model.segments.middles @ turn + (x, y)
+    # pieces of a part that looks like itself may lie one on the other
+    near = np.linalg.norm(middles[:, None] - found.edges, axis=2).min(axis=1) <= 3
     for owner in np.unique(pixels.owners).tolist():
         mine = pixels.owners == owner
-        if tuple(middles[owner].round(6).tolist()) not in kept or mine.sum() < 12:
+        if not near[owner] or mine.sum() < 12:
             continue
         levels = np.column_stack([np.ones(mine.sum()), light[mine]])
         a = by_pose[:, mine].T

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from smartcam.inspection import Picture
-from smartcam.inspection._locate.find import locate
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, photograph, shares
 from tests.proofs import locate as judge
 
@@ -134,7 +133,7 @@ def hough(picture: NDArray[np.uint8]) -> Pose | None:
 
 def smartcam(model: PartModel, search: Any, picture: NDArray[np.uint8]) -> Pose | None:
     """Find the part by `locate`."""
-    found = locate(Picture(picture), [model], search).parts
+    found = judge.locate(Picture(picture), [model], search).parts
     if not found:
         return None
     pose = found[0].pose

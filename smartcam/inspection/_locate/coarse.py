@@ -92,7 +92,7 @@ class CoarseModel:
         return len(self.points) - 1
 
     def radius(self, level: int) -> float:
-        """Return how far the farthest point is at a level, in its pixels."""
+        """Return the distance of the farthest point at a level, in its pixels."""
         return float(np.linalg.norm(self.points[level], axis=1).max()) / float(1 << level)
 
 
@@ -163,7 +163,7 @@ class PyramidLevel:
         return cv2.divide(across, size), cv2.divide(down, size)
 
     def agreement(self, contrast: float, *, any_polarity: bool) -> list[NDArray[np.uint8]]:
-        """Return how well the pixels around each one agree with each direction, (H, W), 0 to 4."""
+        """Return maps (H, W) of the agreement around each pixel with each direction, 0 to 4."""
         cv2 = load("cv2", "inspection needs")
         across, down = (one.astype(np.float32) for one in self.gradient)
         size, angle = cv2.cartToPolar(across, down)

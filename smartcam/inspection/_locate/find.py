@@ -114,7 +114,7 @@ class LocatedPart:
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """What was found in a picture.
+    """The parts that were found in a picture.
 
     Attributes:
         parts: found parts, the best first.

@@ -174,7 +174,7 @@ def _equations(
 
 
 def _edges(fit: StepFit, use: FineSettings) -> tuple[NDArray[np.bool_], float]:
-    """Return which steps are edges (N,), and the noise of their pixels."""
+    """Return a mask of the steps that are edges (N,), and the noise of their pixels."""
     there = np.isfinite(fit.sigmas)
     noise = _noise(fit, there)
     heights = np.abs(fit.heights) if use.any_polarity else fit.heights
@@ -203,7 +203,7 @@ def _noise(fit: StepFit, there: NDArray[np.bool_]) -> float:
 def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blurs: Array) -> Array:
     """Return the standard deviation of each shift: of both pictures' noise, and of a misfit."""
     # a band whose pixels stray more than by chance from a step has more than noise in it
-    beyond = fit.variances > noise**2 * (1 + 4 * np.sqrt(2 / fit.freedoms))
+    beyond = fit.variances > noise**2 * (1 + 2.5 * np.sqrt(2 / fit.freedoms))
     own = np.where(beyond, fit.variances, noise**2)
     # and what it has may move the edge, by as much as it is at the steepest place
     steepest = np.maximum(np.abs(fit.heights), 1e-6) / (math.sqrt(2 * math.pi) * blurs)

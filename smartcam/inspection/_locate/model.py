@@ -168,7 +168,7 @@ class PartModel:
 
     @property
     def radius(self) -> float:
-        """How far the outline reaches from the reference, pixels."""
+        """Distance of the farthest edge from the reference, pixels."""
         return float(np.linalg.norm(self.outline, axis=1).max())
 
     def predicted_sigma(self, noise: float | None = None) -> tuple[float, float]:
@@ -293,7 +293,7 @@ def _mask(
 
 
 def _inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
-    """Return which edges are taught, and the part of the edges that lies at the border."""
+    """Return a mask of the edges that are taught, and the part of them that lies at the border."""
     cv2 = load("cv2", "inspection needs")
     padded = np.pad(mask, 1).astype(np.uint8)
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]

@@ -70,7 +70,7 @@ class Symmetry:
         return 2 * math.pi / max(self.fold, 1)
 
     def text(self) -> str:
-        """Return what people are told."""
+        """Return the sentence that people are told."""
         if self.fold == 0:
             return "round: it has no angle"
         said = "has one angle"

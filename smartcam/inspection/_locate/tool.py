@@ -225,7 +225,7 @@ def _near(nearest: LocatedPart | None, named: bool) -> str:
 
 
 def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
-    """Return what is drawn of a part: its hull, its axes, its edges, and those not seen."""
+    """Return the drawings of a part: its hull, its axes, its edges, and those not seen."""
     pose = part.pose
     reach = 0.25 * float(np.linalg.norm(part.hull - (pose.x, pose.y), axis=1).max()) / pose.scale
     axes = pose.to_picture([(2 * reach, 0), (0, 0), (0, reach)])
