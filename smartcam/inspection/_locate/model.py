@@ -16,12 +16,13 @@ from smartcam._whole_files import replace_file
 from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
 from smartcam.inspection._locate.edges import edge_points, fit_segments, segments_of
+from smartcam.inspection._locate.fine import FineSettings, fit_pose
 from smartcam.inspection._locate.segments import Bands, Segments, make_bands
 from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
 from smartcam.inspection._picture import Picture
-from smartcam.inspection._places import place
+from smartcam.inspection._places import PixelPose, place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -61,6 +62,12 @@ MIN_ACROSS: Final = 0.02
 
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
 """Cosine of the angle up to which a level's gradient has the direction of a point of the part."""
+
+ROUND_TURNS: Final = 8
+"""Turns at which a round part is located in its own picture."""
+
+MIN_SELF_CONTRAST: Final = 1.0
+"""Grey levels of an edge of a part that is located in its own picture, at least."""
 
 LEVEL_RESPONSE: Final = 0.8
 """Response of Sobel's operator to a part's edge of one grey level at a level, at least."""
@@ -252,6 +259,8 @@ def _taught(
     segments = _ordered(segments._replace(middles=segments.middles - centre))
     symmetry, off = find_symmetry(segments, found.points - centre, found.normals)
     segments, centre = segments._replace(middles=segments.middles - off), centre + off
+    off = _off_middle(segments, found.points - centre, symmetry.fold, (levels, centre, noise))
+    segments, centre = segments._replace(middles=segments.middles - off), centre + off
     return PartModel(
         name=name,
         segments=segments,
@@ -262,6 +271,27 @@ def _taught(
         border=border,
         noise=noise,
     )
+
+
+def _off_middle(
+    segments: Segments, outline: Array, fold: int, taught: tuple[NDArray[Any], Array, float]
+) -> Array:
+    """Return the place that a part turns about exactly, (2,), from the reference.
+
+    ``taught``: the picture, the reference in it, and its noise. The part is located in its own
+    picture at each of the turns; where it lies then tells its middle.
+    """
+    levels, (x, y), noise = taught
+    turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
+    use = FineSettings(MIN_SELF_CONTRAST, noise, turned=fold != 0)
+    found = []
+    for number in range(turns if fold != 1 else 0):
+        start = PixelPose(float(x), float(y), 2 * math.pi * number / turns)
+        fine = fit_pose(levels, segments, bands, start, use)
+        if fine is None:
+            return np.zeros(2)
+        found.append((fine.pose.x - x, fine.pose.y - y))
+    return np.mean(found, axis=0) if found else np.zeros(2)
 
 
 def _mask(
