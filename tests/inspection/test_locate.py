@@ -23,12 +23,12 @@ from smartcam.inspection import (
     TeachingTrouble,
     load_cell,
 )
-from smartcam.inspection._locate.find import Search, locate
 from smartcam.interpreters import Context
-from smartcam.interpreters._localizations import LocalizationsInterpreter
+from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
+from tests.proofs.locate import Search, locate
 
 if TYPE_CHECKING:
     from pathlib import Path
