@@ -24,8 +24,8 @@ from smartcam.inspection import (
     load_cell,
 )
 from smartcam.interpreters import Context
-from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout import Layout
+from smartcam.registry import INTERPRETERS
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
 from tests.proofs.locate import Search, locate
@@ -328,7 +328,8 @@ def test_results_are_localizations(tmp_path: Path) -> None:
     part = PlacedPart(PARTS["bolt"], 98.37, 101.81, 0.6)
     found = program.inspect(drawn(part))
     assert found.ok, found.reason
-    reader = LocalizationsInterpreter(Layout(program.interpret_as))
+    kind: Any = INTERPRETERS.load("localizations")
+    reader = kind(Layout(program.interpret_as))
     (one,) = reader.read(found.payload(), Context(camera="cam", number=1, y_down=True))
     assert (one.feature_id, round(one.quality, 1)) == ("bolt", 1.0)
     x, y = truth("bolt", part)
