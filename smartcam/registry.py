@@ -255,6 +255,7 @@ TOOLS = Registry(
     "smartcam.tools",
     {
         "compare": "smartcam.inspection._compare:Compare",
+        "locate": "smartcam.inspection._locate.tool:Locate",
         "measure": "smartcam.inspection._measure.tool:Measure",
         "present": "smartcam.inspection._present:Present",
         "read": "smartcam.inspection._read.tool:ReadTool",

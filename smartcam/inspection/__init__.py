@@ -34,6 +34,10 @@ if TYPE_CHECKING:
         software_mistakes,
     )
     from smartcam.inspection._finding import Drawing, Finding, Inspection
+    from smartcam.inspection._locate.find import LocatedPart
+    from smartcam.inspection._locate.model import PartModel
+    from smartcam.inspection._locate.symmetry import Symmetry
+    from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
     from smartcam.inspection._picture import Picture
     from smartcam.inspection._places import PixelPose, PlacedRegion, Region
     from smartcam.inspection._program import Program, register_tool
@@ -45,6 +49,8 @@ __all__ = [
     "Drawing",
     "Finding",
     "Inspection",
+    "LocatedPart",
+    "PartModel",
     "Picture",
     "PixelPose",
     "PlacedRegion",
@@ -53,7 +59,10 @@ __all__ = [
     "Software",
     "SoftwareCamera",
     "SoftwareDevice",
+    "Symmetry",
     "Teaching",
+    "TeachingError",
+    "TeachingTrouble",
     "Tool",
     "ToolSettings",
     "ToolSetup",
@@ -72,6 +81,10 @@ if not TYPE_CHECKING:
             "_camera.device": "SoftwareDevice",
             "_cell": "CellCamera Software load_cell make_camera software_mistakes",
             "_finding": "Drawing Finding Inspection",
+            "_locate.find": "LocatedPart",
+            "_locate.model": "PartModel",
+            "_locate.symmetry": "Symmetry",
+            "_locate.troubles": "TeachingError TeachingTrouble",
             "_picture": "Picture",
             "_places": "PixelPose PlacedRegion Region",
             "_program": "Program register_tool",

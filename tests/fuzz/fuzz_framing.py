@@ -28,7 +28,9 @@ MAX_READ = 128
 
 def check(data: bytes) -> None:
     """Cut a stream into frames by chunks and compare with what :func:`expected` finds in it."""
-    with mock.patch.multiple(framing, LARGE=32, FIRST_READ=16, MAX_READ_BYTES=MAX_READ):
+    with mock.patch.multiple(
+        framing, MIN_OWN_BUFFER_BYTES=32, FIRST_READ=16, MAX_READ_BYTES=MAX_READ
+    ):
         check_framer(data)
 
 

@@ -50,7 +50,11 @@ each_header = pytest.mark.parametrize(
 @contextlib.contextmanager
 def small_buffers() -> Iterator[None]:
     with mock.patch.multiple(
-        framing, LARGE=LARGE, FIRST_READ=FIRST_READ, MAX_READ_BYTES=MAX_READ, ALIKE=ALIKE
+        framing,
+        MIN_OWN_BUFFER_BYTES=LARGE,
+        FIRST_READ=FIRST_READ,
+        MAX_READ_BYTES=MAX_READ,
+        MAX_ALIKE_FRAMES=ALIKE,
     ):
         yield
 

@@ -122,7 +122,8 @@ async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bou
             "size": 20_000.0,
             "keep": 60_000.0,
         }
-        async with recording(tmp_path, box.url, **options) as (recorder, agent):
+        camera = recording(tmp_path, box.url, source="synthetic://", **options)
+        async with camera as (recorder, agent):
             await until(lambda: files(tmp_path) and device.given)
             first = files(tmp_path)[0]
             device.left = 0

@@ -83,8 +83,18 @@ def picture_of(calibration: Any) -> Plane:
     return PIXELS if camera is None else Plane("px", camera.undistort)
 
 
-def plane_of(calibration: Any) -> Plane:
+def robot_plane_of(calibration: Any) -> Plane:
+    """Return the plane of a calibration in the robot's x and y, millimetres, as :func:`plane_of`.
+
+    The plane is as good as level: of what lies in it, the robot's z follows.
+    """
+    return plane_of(calibration, robot=True)
+
+
+def plane_of(calibration: Any, *, robot: bool = False) -> Plane:
     """Return the plane of a calibration, in millimetres.
+
+    ``robot``: whether its axes are the robot's x and y; else they lie in it.
 
     ``calibration``: a :class:`~smartcam.calibration.PlaneCalibration` of pixels or a
     :class:`~smartcam.calibration.SheetCalibration`; a lens alone has no length.
@@ -94,7 +104,7 @@ def plane_of(calibration: Any) -> Plane:
     """
     kind = getattr(calibration, "kind", None)
     if kind == "plane":
-        return _with_variants(calibration, calibration, _plane_variants(calibration))
+        return _with_variants(calibration, calibration, _plane_variants(calibration), robot=robot)
     if kind == "sheet":
         variants = [
             dataclasses.replace(calibration, plane=one)
@@ -103,7 +113,7 @@ def plane_of(calibration: Any) -> Plane:
             dataclasses.replace(calibration, sheet=one)
             for one in (*_view_variants(calibration.sheet), *calibration.lens_planes)
         ]
-        return _with_variants(calibration, calibration.plane, variants)
+        return _with_variants(calibration, calibration.plane, variants, robot=robot)
     raise ConfigurationError(
         "measure: calibration: expected one of a plane, with or without a lens, as fit_plane and "
         f"calibrate_sheet make it, got {kind or type(calibration).__name__}: it does not say how "
@@ -111,9 +121,10 @@ def plane_of(calibration: Any) -> Plane:
     )
 
 
-def _with_variants(calibration: Any, plane: Any, variants: list[Any]) -> Plane:
-    axes = plane.rotation[:, :2]
-    origin = np.asarray(plane.robot_points, dtype=np.float64).mean(axis=0)
+def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: bool) -> Plane:
+    axes = np.eye(3)[:, :2] if robot else plane.rotation[:, :2]
+    middle = np.asarray(plane.robot_points, dtype=np.float64).mean(axis=0)
+    origin = np.zeros(3) if robot else middle
     turned_up = calibration.kind == "plane" and calibration.y_down
 
     def mapped(one: Any) -> Callable[[Array], Array]:

@@ -1,0 +1,376 @@
+"""Find taught parts in a picture: places where they may be, fitted one by one and judged."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.inspection._locate.coarse import PicturePyramid, Ranges, find_candidates
+from smartcam.inspection._locate.fine import FineSettings, fit_pose
+from smartcam.inspection._measure.edges import noise_of
+from smartcam.inspection._places import PixelPose
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+    from smartcam.inspection._locate.coarse import Candidate
+    from smartcam.inspection._locate.fine import FinePose
+    from smartcam.inspection._locate.model import PartModel
+    from smartcam.inspection._picture import Picture
+
+CONTRAST_SHARE: Final = 0.15
+"""Part of the taught contrast that a found edge has at least, where nothing else is said."""
+
+MIN_CONTRAST: Final = 8.0
+"""Grey levels of 255 of a found edge at least, where nothing else is said."""
+
+MAX_FITS: Final = 12
+"""Places that are fitted at most, besides four for each part that is looked for."""
+
+SCORE_MARGIN: Final = 0.1
+"""Score by which a fit may raise the coarse one: what is below that of the parts that were found by
+more is not fitted."""
+
+SAME_SCORE: Final = 0.02
+"""Difference of two scores that says nothing."""
+
+RANGE_MARGIN: Final = math.radians(1.0)
+"""Angle, and part of the scale, by which a fitted pose may lie beside what was asked for."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """The poses that are looked for, and what counts as found.
+
+    Attributes:
+        angles: from and to, radians, from the taught picture.
+        scales: from and to.
+        most: parts that are found at most, of each model.
+        least_score: part of the edges that has to be seen.
+        overlap: part of a part's area that another one may cover.
+        any_polarity: whether dark and bright may be exchanged.
+        contrast: grey levels of 255 of an edge at least; None: a part of the taught one.
+        seconds: seconds after which no further place is looked at.
+    """
+
+    angles: tuple[float, float] = (-math.pi, math.pi)
+    scales: tuple[float, float] = (1.0, 1.0)
+    most: int = 1
+    least_score: float = 0.7
+    overlap: float = 0.5
+    any_polarity: bool = False
+    contrast: float | None = None
+    seconds: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocatedPart:
+    """A part that was found, or that was refused.
+
+    Attributes:
+        name: name of the model.
+        pose: place of the model's reference in the picture, and how the part is turned and scaled
+            since it was taught.
+        covariance: (4, 4), of x and y (pixels), the angle (radians) and the scale.
+        score: part of its edges that was seen, 0 to 1.
+        edges: places of the edges that the pose follows from, (N, 2), pixels.
+        missing: places where edges were not seen, (M, 2), pixels.
+        noise: standard deviation of the picture's noise, grey levels.
+        blur: standard deviation of the edges' blur, pixels.
+        chi_square: squared residuals of the edges in parts of what the noise explains.
+        refusal: why it is none; "" for one that was found.
+        doubt: why it may be turned otherwise; mostly "".
+        hull: convex hull of the part, (K, 2), pixels of the picture.
+    """
+
+    name: str
+    pose: PixelPose
+    covariance: Array
+    score: float
+    edges: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    missing: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    noise: float = math.nan
+    blur: float = math.nan
+    chi_square: float = math.nan
+    refusal: str = ""
+    doubt: str = ""
+    hull: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+
+    @property
+    def sigmas(self) -> tuple[float, float, float, float]:
+        """Standard deviations of x and y (pixels), the angle (radians) and the scale."""
+        x, y, angle, scale = np.sqrt(np.diag(self.covariance)).tolist()
+        return x, y, angle, scale
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """The parts that were found in a picture.
+
+    Attributes:
+        parts: found parts, the best first.
+        nearest: best one of those that were refused; None: nothing was near.
+    """
+
+    parts: tuple[LocatedPart, ...]
+    nearest: LocatedPart | None
+
+
+def locate(
+    picture: Picture,
+    models: Sequence[PartModel],
+    search: Search,
+    *,
+    box: tuple[int, int, int, int] | None = None,
+    allowed: Callable[[tuple[float, float]], bool] | None = None,
+) -> Located:
+    """Return the parts in a picture.
+
+    ``box`` (left, top, right, below): where their references are; ``allowed``: whether a reference
+    may be at a place of it.
+    """
+    end = time.monotonic() + search.seconds
+    looks: dict[tuple[int, int, int, int], _Look] = {}
+    parts: list[LocatedPart] = []
+    refused: list[LocatedPart] = []
+    for model in models:
+        area = _area(picture, box, model.radius * search.scales[1])
+        if area not in looks:
+            looks[area] = _Look(picture, area)
+        found, bad = looks[area].find(model, search, end, allowed)
+        parts += found
+        refused += bad
+    kept = _apart(parts, search.overlap)
+    refused.sort(key=lambda one: -one.score)
+    return Located(tuple(kept), refused[0] if refused else None)
+
+
+def _area(
+    picture: Picture, box: tuple[int, int, int, int] | None, radius: float
+) -> tuple[int, int, int, int]:
+    """Return the part of the picture that is looked at for references in a box."""
+    width, height = picture.size
+    if box is None:
+        return 0, 0, width, height
+    reach = math.ceil(radius) + 2
+    left, top, right, below = box
+    return (
+        max(left - reach, 0),
+        max(top - reach, 0),
+        min(right + reach, width),
+        min(below + reach, height),
+    )
+
+
+class _Look:
+    """One look at a part of a picture, for any number of models."""
+
+    def __init__(self, picture: Picture, area: tuple[int, int, int, int]) -> None:
+        left, top, right, below = area
+        self._corner = left, top
+        self._levels = picture.levels
+        self._unit = float(2**picture.depth - 1) / 255
+        grey = np.ascontiguousarray(picture.grey[top:below, left:right])
+        self._noise = noise_of(grey)
+        self._pyramid = PicturePyramid(grey, self._noise)
+
+    def find(
+        self,
+        model: PartModel,
+        search: Search,
+        end: float,
+        allowed: Callable[[tuple[float, float]], bool] | None,
+    ) -> tuple[list[LocatedPart], list[LocatedPart]]:
+        """Return the parts of one model, and those that were refused."""
+        ranges = ranges_of(model, search)
+        candidates, refused = find_candidates(self._pyramid, model.coarse, ranges, search.most)
+        bad = [] if refused is None else [_unfitted(model, self._moved(refused), search, "")]
+        found: list[LocatedPart] = []
+        for number, candidate in enumerate(candidates[: MAX_FITS + 4 * search.most]):
+            one = self._moved(candidate)
+            if time.monotonic() > end and number:
+                bad.append(_unfitted(model, one, search, "there was no time left to look at it"))
+                break
+            if _is_enough(found, one, search) or any(_is_near(one, other) for other in found):
+                continue
+            part = self._fitted(model, one, search, ranges.contrast, allowed)
+            if part.refusal:
+                bad.append(part)
+            else:
+                found.append(part)
+        kept = _apart(found, search.overlap)[: search.most]
+        return [self._without_doubt(model, one, search, ranges.contrast) for one in kept], bad
+
+    def _moved(self, one: Candidate) -> Candidate:
+        """Return a candidate in the whole picture's pixels."""
+        return one._replace(x=one.x + self._corner[0], y=one.y + self._corner[1])
+
+    def _fit(
+        self, model: PartModel, start: PixelPose, search: Search, contrast: float
+    ) -> FinePose | None:
+        use = FineSettings(
+            contrast * self._unit,
+            self._noise * self._unit,
+            search.any_polarity,
+            search.scales[1] > search.scales[0],
+            model.symmetry.fold != 0,
+        )
+        return fit_pose(self._levels, model.segments, model.bands, start, use)
+
+    def _fitted(
+        self,
+        model: PartModel,
+        one: Candidate,
+        search: Search,
+        contrast: float,
+        allowed: Callable[[tuple[float, float]], bool] | None,
+    ) -> LocatedPart:
+        """Return the part at a place, or why there is none."""
+        start = PixelPose(one.x, one.y, one.angle, one.scale)
+        fine = self._fit(model, start, search, contrast)
+        if fine is None:
+            return _unfitted(model, one, search, "too few of its edges agree on a pose")
+        part = _part(model, fine)
+        pose = part.pose
+        refusal = ""
+        if part.score < search.least_score:
+            refusal = _too_little(part.score, fine, search)
+        elif not _in_ranges(pose, model, search):
+            refusal = (
+                f"it is turned by {math.degrees(pose.angle):.1f} degrees and scaled by "
+                f"{pose.scale:.3f}, which was not asked for"
+            )
+        elif allowed is not None and not allowed((pose.x, pose.y)):
+            refusal = "its reference is outside of the region"
+        return dataclasses.replace(part, refusal=refusal)
+
+    def _without_doubt(
+        self, model: PartModel, part: LocatedPart, search: Search, contrast: float
+    ) -> LocatedPart:
+        """Return a part with the doubt whether it is turned otherwise."""
+        for angle, share in model.symmetry.alike:
+            if part.score >= share + SAME_SCORE:
+                continue
+            turned = _turned(part.pose, model.symmetry.about, angle)
+            other = self._fit(model, turned, search, contrast)
+            if other is not None and other.score >= part.score - SAME_SCORE:
+                doubt = (
+                    f"as much of it is seen if it is turned by {math.degrees(angle):.0f} degrees"
+                )
+                return dataclasses.replace(part, doubt=doubt)
+        return part
+
+
+def ranges_of(model: PartModel, search: Search) -> Ranges:
+    """Return the ranges of the coarse search for a model."""
+    taught = float(np.median(model.segments.heights))
+    contrast = search.contrast
+    if contrast is None:
+        contrast = max(MIN_CONTRAST, CONTRAST_SHARE * taught)
+    return Ranges(
+        angles=(0.0, 0.0) if model.symmetry.fold == 0 else search.angles,
+        scales=search.scales,
+        period=model.symmetry.period,
+        any_polarity=search.any_polarity,
+        contrast=contrast,
+        least_score=search.least_score,
+    )
+
+
+def _part(model: PartModel, fine: FinePose) -> LocatedPart:
+    pose = fine.pose
+    if model.symmetry.fold == 0:
+        pose = pose._replace(angle=0.0)
+    else:
+        pose = pose._replace(angle=math.remainder(pose.angle, model.symmetry.period))
+    middles = fine.pose.to_picture(model.segments.middles)
+    return LocatedPart(
+        name=model.name,
+        pose=pose,
+        covariance=fine.covariance,
+        score=fine.score,
+        edges=middles[fine.kept],
+        missing=middles[~fine.seen],
+        noise=fine.noise,
+        blur=fine.blur,
+        chi_square=fine.chi_square,
+        hull=fine.pose.to_picture(model.hull),
+    )
+
+
+def _turned(pose: PixelPose, about: tuple[float, float], angle: float) -> PixelPose:
+    """Return a pose of a part that is turned about a place of it."""
+    cos, sin = math.cos(angle), math.sin(angle)
+    x, y = about
+    place = pose.to_picture((x - cos * x + sin * y, y - sin * x - cos * y))
+    return PixelPose(float(place[0]), float(place[1]), pose.angle + angle, pose.scale)
+
+
+def _too_little(score: float, fine: FinePose, search: Search) -> str:
+    text = f"{100 * score:.0f} % of its edges are seen, expected {100 * search.least_score:.0f} %"
+    if fine.reversed > 0.1:
+        text += f"; {100 * fine.reversed:.0f} % are there with dark and bright exchanged"
+    return text
+
+
+def _unfitted(model: PartModel, one: Candidate, search: Search, why: str) -> LocatedPart:
+    pose = PixelPose(one.x, one.y, math.remainder(one.angle, model.symmetry.period), one.scale)
+    return LocatedPart(
+        name=model.name,
+        pose=pose,
+        covariance=np.full((4, 4), np.nan),
+        score=one.score,
+        refusal=why
+        or f"about {100 * one.score:.0f} % of its edges agree, expected "
+        f"{100 * search.least_score:.0f} %",
+        hull=pose.to_picture(model.hull),
+    )
+
+
+def _in_ranges(pose: PixelPose, model: PartModel, search: Search) -> bool:
+    """Return True if a pose is one of those that are looked for."""
+    low, high = search.angles
+    if model.symmetry.fold and high - low < model.symmetry.period - 1e-9:
+        off = math.remainder(pose.angle - (low + high) / 2, model.symmetry.period)
+        if abs(off) > (high - low) / 2 + RANGE_MARGIN:
+            return False
+    least, most = search.scales
+    return least * (1 - RANGE_MARGIN) <= pose.scale <= most * (1 + RANGE_MARGIN)
+
+
+def _is_enough(found: Sequence[LocatedPart], one: Candidate, search: Search) -> bool:
+    """Return True if a place cannot be better than the parts that were found already."""
+    best = sorted(part.score for part in found)[-search.most :]
+    return len(best) == search.most and one.score < best[0] - SCORE_MARGIN
+
+
+def _is_near(one: Candidate, other: LocatedPart) -> bool:
+    """Return True if a candidate is a part that was found already."""
+    turned = abs(math.remainder(one.angle - other.pose.angle, 2 * math.pi))
+    return math.hypot(one.x - other.pose.x, one.y - other.pose.y) < 4 and turned < 0.1
+
+
+def _apart(parts: Sequence[LocatedPart], overlap: float) -> list[LocatedPart]:
+    """Return the best parts that do not cover more of each other than is allowed."""
+    kept: list[LocatedPart] = []
+    for one in sorted(parts, key=lambda one: (-one.score, one.chi_square)):
+        if all(_covered(one.hull, other.hull) <= overlap for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:
+    """Return the common area of two convex hulls in parts of the smaller one."""
+    cv2 = load("cv2", "inspection needs")
+    hulls = [np.asarray(hull - one[0], np.float32) for hull in (one, other)]
+    common, _ = cv2.intersectConvexConvex(*hulls)
+    return float(common) / max(min(cv2.contourArea(hull) for hull in hulls), 1e-6)

@@ -1,0 +1,301 @@
+"""Fit a pose to a picture's edges by weighted least squares, with its covariance."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam.inspection._locate.segments import (
+    MIN_BLUR_PX,
+    BandPixels,
+    Bands,
+    Segments,
+    StepFit,
+    fit_bands,
+    pixels_in,
+)
+from smartcam.inspection._measure.edges import ROUNDING
+from smartcam.inspection._places import PixelPose
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+FIRST_BLURS_PX: Final = (3.0, 2.0)
+"""Blurs of the first steps of a fit, in pixels: a wide step is drawn from farther away."""
+
+MAX_STEPS: Final = 12
+"""Steps of a fit at most."""
+
+STILL_PX: Final = 2e-4
+"""Pixels that no segment moves by any more when a fit has come to rest."""
+
+MAX_SHIFT_PX: Final = 2.0
+"""Pixels that a segment says in one step at most that it should move."""
+
+MIN_BEND: Final = 0.01
+"""Bend of an edge, per pixel, from which on a blur moves it by something that matters."""
+
+MAX_BLUR_PX: Final = 4.0
+"""Blur of a picture's edges up to which they are fitted, in pixels."""
+
+CUT: Final = 4.0
+"""Standard deviations beside its place from which on a segment is another edge."""
+
+EDGE_SIGNIFICANCE: Final = 4.0
+"""Standard deviations of its height that an edge has at least."""
+
+SEEN_PX: Final = 1.0
+"""Pixels beside its place, besides the noise, from which on a segment counts nothing as seen."""
+
+MAX_MISFIT: Final = 0.3
+"""Rms about a step beyond the noise, in parts of the edge's height, up to which it is an edge."""
+
+MIN_SEEN: Final = 6
+"""Segments that a pose is worked out from at least."""
+
+UNKNOWN_ANGLE: Final = math.pi / math.sqrt(3)
+"""Standard deviation of an angle of which nothing is known, in radians."""
+
+MAX_INVERSE: Final = 1e8
+"""Largest element of the inverse of the scaled equations; above it the edges leave a pose open."""
+
+
+class FineSettings(NamedTuple):
+    """Settings of a fit."""
+
+    contrast: float  # grey levels from the darker to the brighter side at least
+    noise: float  # standard deviation of the picture's noise, grey levels
+    any_polarity: bool = False
+    scaled: bool = False  # whether the scale is fitted
+    turned: bool = True  # whether the angle is fitted; that of a round part is not
+
+
+class FinePose(NamedTuple):
+    """A fitted pose."""
+
+    pose: PixelPose
+    covariance: Array  # (4, 4), of x, y (pixels), angle (radians), scale
+    score: float  # part of the edges that were seen, by length
+    seen: NDArray[np.bool_]  # (N,), segments that were seen
+    kept: NDArray[np.bool_]  # (N,), segments that the pose follows from
+    noise: float  # standard deviation of the pixels, grey levels
+    chi_square: float  # of the kept segments about the pose, per degree of freedom
+    reversed: float  # part of the edges that are there with the other polarity
+    blur: float  # median standard deviation of the edges' blur, pixels
+
+
+def fit_pose(
+    levels: NDArray[Any], segments: Segments, bands: Bands, start: PixelPose, use: FineSettings
+) -> FinePose | None:
+    """Return the pose that fits best, from one that is known to two pixels; None: there is none.
+
+    ``levels`` (H, W) is the picture.
+    """
+    pose, free = start, np.array([True, True, use.turned, use.scaled])
+    widened, pixels = 0.0, None
+    for number in range(MAX_STEPS):
+        if number < 4 or pixels is None:
+            pixels = pixels_in(bands, _matrix(pose), levels)
+        first = FIRST_BLURS_PX[number] if number < len(FIRST_BLURS_PX) else None
+        fit, blurs = _steps(pixels, segments, pose, widened, first)
+        rows, weights, _, _ = _equations((fit, blurs), segments, pose, use, number)
+        solved = _solve(rows, fit.shifts, weights, free)
+        if solved is None:
+            return None
+        move, _ = solved
+        pose = _moved(pose, move)
+        if first is None:
+            widened = _widened(widened, fit.widening, float(np.median(blurs)))
+        if number >= 4 and float(np.abs(rows @ move).max()) < STILL_PX:
+            break
+    return _result(pixels, segments, pose, widened, use, free)
+
+
+def _moved(pose: PixelPose, move: Array) -> PixelPose:
+    x, y, angle, scale = move.tolist()
+    return PixelPose(pose.x + x, pose.y + y, pose.angle + angle, pose.scale * (1 + scale))
+
+
+def _matrix(pose: PixelPose) -> Array:
+    """Return the matrix (2, 3) from a model's places to the picture's pixels."""
+    cos, sin = pose.scale * math.cos(pose.angle), pose.scale * math.sin(pose.angle)
+    return np.array([[cos, -sin, pose.x], [sin, cos, pose.y]])
+
+
+def _steps(
+    pixels: BandPixels, segments: Segments, pose: PixelPose, widened: float, first: float | None
+) -> tuple[StepFit, Array]:
+    """Return the steps in all bands at a pose, and the blurs that they were fitted with."""
+    across, _ = segments.places(pose.from_picture(pixels.points), pixels.owners)
+    blurs = segments.blurs * pose.scale
+    blurs = np.sqrt(np.maximum(blurs**2 + widened, MIN_BLUR_PX**2))
+    if first is not None:
+        blurs = np.full_like(blurs, first)
+    count = len(segments.halves)
+    # a blur moves a bent edge towards its middle, by its variance over the diameter
+    bent = np.where(np.abs(segments.bends) >= MIN_BEND, segments.bends, 0.0)
+    moved = 0.5 * bent * widened / pose.scale
+    across = across * pose.scale - moved[pixels.owners]
+    return fit_bands(across, blurs[pixels.owners], pixels, count), blurs
+
+
+def _widened(widened: float, growth: float, blur: float) -> float:
+    """Return the variance that the picture's blur has beyond that of the taught picture."""
+    grown = blur * (1 + min(max(growth, -0.3), 0.3))
+    widened += min(grown, MAX_BLUR_PX) ** 2 - blur**2
+    return min(max(widened, -(blur**2)), MAX_BLUR_PX**2)
+
+
+def _equations(
+    steps: tuple[StepFit, Array],
+    segments: Segments,
+    pose: PixelPose,
+    use: FineSettings,
+    number: int,
+) -> tuple[Array, Array, float, NDArray[np.bool_]]:
+    """Return the rows (N, 4) and weights (N,) of the steps, the noise, and which are edges."""
+    fit, blurs = steps
+    edges, noise = _edges(fit, use)
+    cos, sin = math.cos(pose.angle), math.sin(pose.angle)
+    turn = np.array([[cos, sin], [-sin, cos]])
+    normals = segments.normals @ turn
+    arms = pose.scale * segments.middles @ turn
+    crossed = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
+    rows = np.column_stack([normals, crossed, (normals * arms).sum(axis=1)])
+    sigmas = _sigmas(fit, segments, pose, noise, blurs)
+    weights = np.where(edges & np.isfinite(sigmas), 1 / np.maximum(sigmas, 1e-6) ** 2, 0.0)
+    if number < 3:  # before the pose is near, what is noisy says as much as what is not
+        weights = (weights > 0).astype(np.float64)
+    return rows, weights, noise, edges
+
+
+def _edges(fit: StepFit, use: FineSettings) -> tuple[NDArray[np.bool_], float]:
+    """Return a mask of the steps that are edges (N,), and the noise of their pixels."""
+    there = np.isfinite(fit.sigmas)
+    noise = _noise(fit, there)
+    heights = np.abs(fit.heights) if use.any_polarity else fit.heights
+    tall = heights >= np.maximum(use.contrast, EDGE_SIGNIFICANCE * noise * fit.height_sigmas)
+    return there & tall & (_misfits(fit, use) <= 1), noise
+
+
+def _misfits(fit: StepFit, use: FineSettings) -> Array:
+    """Return the rms about each step beyond the noise, in parts of what an edge may have."""
+    # by chance a band's pixels stray more or less than others
+    noise = use.noise**2 * (1 + 3 * np.sqrt(2 / fit.freedoms))
+    beyond = np.sqrt(np.maximum(fit.variances - noise, 0.0))
+    misfits: Array = beyond / np.maximum(MAX_MISFIT * np.abs(fit.heights), 1e-6)
+    return misfits
+
+
+def _noise(fit: StepFit, there: NDArray[np.bool_]) -> float:
+    """Return the standard deviation of the bands' pixels; most of the bands have nothing else."""
+    if not there.any():
+        return ROUNDING
+    freedom = float(np.median(fit.freedoms[there]))
+    median = float(np.median(fit.variances[there])) / (1 - 2 / (9 * freedom)) ** 3
+    return max(math.sqrt(median), ROUNDING)
+
+
+def _sigmas(fit: StepFit, segments: Segments, pose: PixelPose, noise: float, blurs: Array) -> Array:
+    """Return the standard deviation of each shift: of both pictures' noise, and of a misfit."""
+    # a band whose pixels stray more than by chance from a step has more than noise in it
+    beyond = fit.variances > noise**2 * (1 + 2.5 * np.sqrt(2 / fit.freedoms))
+    own = np.where(beyond, fit.variances, noise**2)
+    # and what it has may move the edge, by as much as it is at the steepest place
+    steepest = np.maximum(np.abs(fit.heights), 1e-6) / (math.sqrt(2 * math.pi) * blurs)
+    misfit = np.where(beyond, fit.variances - noise**2, 0.0) / steepest**2
+    return np.sqrt(own * fit.sigmas**2 + misfit + (pose.scale * segments.sigmas) ** 2)
+
+
+def _solve(
+    rows: Array, shifts: Array, weights: Array, free: NDArray[np.bool_]
+) -> tuple[Array, Array] | None:
+    """Return the robust solution (4,) and its covariance (4, 4); None: too little is seen."""
+    used = weights > 0
+    if np.count_nonzero(used) < MIN_SEEN:
+        return None
+    a, y, w = rows[used], shifts[used].clip(-MAX_SHIFT_PX, MAX_SHIFT_PX), weights[used]
+    robust = np.ones_like(w)
+    for _ in range(4):
+        solved = _least_squares(a, y, w * robust, free)
+        if solved is None:
+            return None
+        scaled = (y - a @ solved[0]) * np.sqrt(w)
+        spread = max(1.4826 * float(np.median(np.abs(scaled))), 0.5)
+        robust = np.maximum(1 - (scaled / (CUT * 1.5 * spread)) ** 2, 0.0) ** 2
+    return _least_squares(a, y, w * robust, free)
+
+
+def _least_squares(
+    rows: Array, values: Array, weights: Array, free: NDArray[np.bool_]
+) -> tuple[Array, Array] | None:
+    a = rows[:, free] * np.sqrt(weights)[:, None]
+    square = a.T @ a
+    scale = np.sqrt(np.maximum(np.diag(square), 1e-30))
+    unit = square / np.outer(scale, scale)
+    try:
+        inverse = np.linalg.inv(unit)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.abs(inverse).max() < MAX_INVERSE:
+        return None
+    inverse = inverse / np.outer(scale, scale)
+    found, covariance = np.zeros(4), np.zeros((4, 4))
+    found[free] = inverse @ (a.T @ (values * np.sqrt(weights)))
+    covariance[np.ix_(free, free)] = inverse
+    return found, covariance
+
+
+def _result(
+    pixels: BandPixels,
+    segments: Segments,
+    pose: PixelPose,
+    widened: float,
+    use: FineSettings,
+    free: NDArray[np.bool_],
+) -> FinePose | None:
+    """Return the pose with what the steps at it say."""
+    fit, blurs = _steps(pixels, segments, pose, widened, None)
+    rows, weights, noise, edges = _equations((fit, blurs), segments, pose, use, MAX_STEPS)
+    off = np.abs(fit.shifts)
+    sigmas = np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 1e-12)), np.inf)
+    seen = edges & (off <= SEEN_PX + CUT * np.minimum(sigmas, 1.0))
+    spread = 1.0
+    for _ in range(3):
+        kept = seen & (off <= CUT * spread * sigmas)
+        if np.count_nonzero(kept) < MIN_SEEN:
+            return None
+        freedom = max(np.count_nonzero(kept) - np.count_nonzero(free), 1)
+        chi_square = float(((off[kept] / sigmas[kept]) ** 2).sum()) / freedom
+        spread = max(math.sqrt(chi_square), 1.0)
+    solved = _least_squares(rows[kept], fit.shifts[kept], weights[kept], free)
+    if solved is None:
+        return None
+    move, covariance = solved
+    pose = _moved(pose, move)
+    if chi_square > 1 + 4 * math.sqrt(2 / freedom):  # the part is not quite the taught one
+        covariance = covariance * chi_square
+    covariance[3] *= pose.scale
+    covariance[:, 3] *= pose.scale
+    if not use.turned:
+        covariance[2, 2] = UNKNOWN_ANGLE**2
+    # as much of each edge counts as it is where it should be, and a step
+    beside = off / (SEEN_PX + CUT * np.minimum(sigmas, 1.0))
+    alike = (1 - beside**2) * (1 - _misfits(fit, use) ** 2)
+    lengths = segments.halves / segments.halves.sum()
+    wrong = (fit.heights < -use.contrast) & (not use.any_polarity)
+    return FinePose(
+        pose._replace(angle=math.remainder(pose.angle, 2 * math.pi)),
+        covariance,
+        float((lengths * alike)[seen].sum()),
+        seen,
+        kept,
+        noise,
+        chi_square,
+        float(lengths[wrong].sum()),
+        float(np.median(blurs)),
+    )

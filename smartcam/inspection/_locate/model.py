@@ -1,0 +1,470 @@
+"""Models of taught parts: made of a picture and a region, kept in small files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from smartcam._arguments import check_path, check_text, wrong_argument
+from smartcam._extras import load
+from smartcam._forks import cached_property
+from smartcam._whole_files import replace_file
+from smartcam.exceptions import ConfigurationError
+from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
+from smartcam.inspection._locate.edges import edge_points, fit_segments, segments_of
+from smartcam.inspection._locate.fine import FineSettings, fit_pose
+from smartcam.inspection._locate.segments import Bands, Segments, make_bands
+from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
+from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
+from smartcam.inspection._measure.edges import noise_of
+from smartcam.inspection._picture import Picture
+from smartcam.inspection._places import PixelPose, place
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from smartcam.frames import Frame
+    from smartcam.geometry._inside import Array
+    from smartcam.inspection._places import Region
+
+VERSION: Final = 1
+"""Version of the files of models."""
+
+MAX_FILE_BYTES: Final = 1 << 21
+"""Bytes of a model's file at most."""
+
+MAX_SEGMENTS: Final = 400
+"""Segments of a model at most, evenly chosen; more of them cost time and tell little more."""
+
+MAX_REGION_PX: Final = 25_000_000
+"""Pixels of a region that is taught, at most."""
+
+MIN_SEGMENTS: Final = 12
+"""Segments whose place is told to a fraction of a pixel that a part has at least."""
+
+MIN_TOP_POINTS: Final = 16
+"""Points of a part at the smallest level of the pyramid at least."""
+
+BORDER_PX: Final = 3.0
+"""Pixels from the region's border within which an edge is left out."""
+
+MAX_BORDER_SHARE: Final = 0.1
+"""Part of the edges that may lie at the region's border."""
+
+MIN_ACROSS: Final = 0.02
+"""Part of the edges, by their directions, that tells a place along the others at least."""
+
+LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
+"""Cosine of the angle up to which a level's gradient has the direction of a point of the part."""
+
+ROUND_TURNS: Final = 8
+"""Turns at which a round part is located in its own picture."""
+
+MIN_SELF_CONTRAST: Final = 1.0
+"""Grey levels of an edge of a part that is located in its own picture, at least."""
+
+LEVEL_RESPONSE: Final = 0.8
+"""Response of Sobel's operator to a part's edge of one grey level at a level, at least."""
+
+NOISES: Final = 6.0
+"""Standard deviations of the noise that a taught edge's contrast has at least."""
+
+DEFAULT_CONTRAST: Final = 12.0
+"""Grey levels of 255 of a taught edge at least, where nothing else is said."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartModel:
+    """A taught part: its edges, with their places to a fraction of a pixel.
+
+    ::
+
+        model = PartModel.teach(Picture.read("bolt.png"), region, name="bolt")
+        model.symmetry.text(), model.predicted_sigma()
+        model.write("bolt.model")
+
+    Attributes:
+        name: name of the part, the ``feature_id`` of its localizations.
+        segments: pieces of its edges that poses follow from; places from the reference.
+        outline: places of all of its edges, (M, 2), pixels from the reference.
+        levels: indices of the segments that can be seen at each level of the pyramid.
+        symmetry: turns at which it looks like itself.
+        reference: place of the reference in the picture that was taught, pixels.
+        border: part of the edges that was left out at the region's border.
+        noise: standard deviation of the noise of the picture that was taught, levels of 255.
+    """
+
+    name: str
+    segments: Segments
+    outline: Array = field(repr=False)
+    levels: tuple[NDArray[np.intp], ...] = field(repr=False)
+    symmetry: Symmetry
+    reference: tuple[float, float]
+    border: float = 0.0
+    noise: float = 0.0
+
+    @classmethod
+    def teach(
+        cls,
+        picture: Frame | Picture | NDArray[Any],
+        region: Region | NDArray[np.bool_] | None = None,
+        *,
+        name: str = "part",
+        contrast: float | None = None,
+    ) -> PartModel:
+        """Return the model of a part in a picture.
+
+        Args:
+            picture: the picture, with the part as it shall be found: sharp, without shadows.
+            region: region with the part and nothing else, or a mask (H, W) of its pixels; None:
+                the whole picture.
+            name: name of the part.
+            contrast: grey levels of 255 of an edge at least; None: what stands out from the noise.
+
+        Raises:
+            TeachingError: the part cannot be taught; its ``why`` says the reason.
+            FrameFormatError: it is no picture.
+            MissingExtraError: the extra ``inspection`` is not installed.
+        """
+        name = check_text(name, "name", "PartModel.teach")
+        return _taught(Picture.of(picture), region, name, contrast)
+
+    @classmethod
+    def read(cls, path: str | Path) -> PartModel:
+        """Return the model in a file.
+
+        Raises:
+            ConfigurationError: the file cannot be read, or is no model of this version.
+        """
+        path = check_path(path, "path", "PartModel.read")
+        try:
+            with path.open("rb") as file:
+                data = file.read(MAX_FILE_BYTES + 1)
+        except OSError as exc:
+            raise ConfigurationError(f"model {path}: {exc}") from exc
+        if len(data) > MAX_FILE_BYTES:
+            raise ConfigurationError(f"model {path}: expected {MAX_FILE_BYTES} bytes at most")
+        try:
+            return _ModelFile.model_validate_json(data).model()
+        except ValidationError as exc:
+            first = exc.errors(include_url=False)[0]
+            place = ".".join(map(str, first["loc"])) or "model"
+            text = first["msg"].removeprefix("Value error, ")
+            raise ConfigurationError(
+                f"model {path}: {place}: {text}; expected a file that "
+                "PartModel.write made of this version"
+            ) from exc
+
+    def write(self, path: str | Path) -> None:
+        """Write the model into a file; one that is there is replaced.
+
+        Raises:
+            ConfigurationError: the file cannot be written.
+        """
+        path = check_path(path, "path", "PartModel.write")
+        try:
+            replace_file(path, _ModelFile.of(self).model_dump_json().encode())
+        except OSError as exc:
+            raise ConfigurationError(f"model {path} cannot be written: {exc}") from exc
+
+    @property
+    def radius(self) -> float:
+        """Distance of the farthest edge from the reference, pixels."""
+        return float(np.linalg.norm(self.outline, axis=1).max())
+
+    def predicted_sigma(self, noise: float | None = None) -> tuple[float, float]:
+        """Return the error that a pose has in a picture like the taught one.
+
+        Args:
+            noise: standard deviation of the picture's noise, grey levels of 255; None: as in the
+                picture that was taught.
+
+        Returns:
+            Standard deviations of the place along its worst direction, pixels, and of the angle,
+            radians.
+        """
+        part = 1.0 if noise is None else math.hypot(1.0, noise / max(self.noise, 0.01))
+        sigmas = self.segments.sigmas * (math.sqrt(2) if noise is None else part)
+        arms, normals = self.segments.middles, self.segments.normals
+        turned = arms[:, 0] * normals[:, 1] - arms[:, 1] * normals[:, 0]
+        rows = np.column_stack([normals, turned]) / sigmas[:, None]
+        used = 2 if self.symmetry.fold == 0 else 3
+        covariance = np.linalg.inv(rows[:, :used].T @ rows[:, :used])
+        worst = math.sqrt(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+        return worst, math.sqrt(float(covariance[2, 2])) if used == 3 else math.nan
+
+    @cached_property
+    def coarse(self) -> CoarseModel:
+        """The points that are looked for first."""
+        some = [self.segments.some(one) for one in self.levels]
+        return CoarseModel(tuple(one.middles for one in some), tuple(one.normals for one in some))
+
+    @cached_property
+    def bands(self) -> Bands:
+        """The pixels beside the segments."""
+        return make_bands(self.segments, self.outline)
+
+    @cached_property
+    def hull(self) -> Array:
+        """The convex hull of the outline, (K, 2)."""
+        cv2 = load("cv2", "inspection needs")
+        found: Array = cv2.convexHull(self.outline.astype(np.float32))[:, 0].astype(np.float64)
+        return found
+
+
+# ---------------------------------------------------------------------- teaching
+
+
+def _taught(
+    picture: Picture,
+    region: Region | NDArray[np.bool_] | None,
+    name: str,
+    contrast: float | None,
+) -> PartModel:
+    mask, corner = _mask(region, picture)
+    rows, columns = (
+        slice(at, at + size) for at, size in zip(corner[::-1], mask.shape, strict=True)
+    )
+    grey, levels = picture.grey[rows, columns], picture.levels[rows, columns]
+    top = float(2**picture.depth - 1)
+    noise = noise_of(levels) * 255 / top
+    least = max(DEFAULT_CONTRAST, NOISES * noise) if contrast is None else contrast
+    found = edge_points(grey, least)
+    kept, border = _inside(found.points, mask)
+    found = type(found)(*(one[kept] for one in found))
+    if border > MAX_BORDER_SHARE:
+        raise TeachingError(
+            TeachingTrouble.BORDER,
+            f"{100 * border:.0f} % of the edges lie at the border of the region: expected a region "
+            "that goes around the part, some pixels away from it",
+        )
+    rough = segments_of(found)
+    edges = fit_segments(levels, rough, found.points, top) if len(rough.halves) else None
+    exact = np.zeros(0, int) if edges is None else np.flatnonzero(edges.exact)
+    if edges is None or len(exact) < MIN_SEGMENTS:
+        raise TeachingError(
+            TeachingTrouble.FEW_EDGES,
+            f"{len(exact)} pieces of edges whose place can be told, expected {MIN_SEGMENTS} or "
+            f"more, of {least:.0f} grey levels at least: is the part sharp and in the region?",
+        )
+    segments = edges.segments.some(exact)
+    _check_directions(segments)
+    centre = found.points.mean(axis=0)
+    segments = _ordered(segments._replace(middles=segments.middles - centre))
+    symmetry, off = find_symmetry(segments, found.points - centre, found.normals)
+    segments, centre = segments._replace(middles=segments.middles - off), centre + off
+    off = _off_middle(segments, found.points - centre, symmetry.fold, (levels, centre, noise))
+    segments, centre = segments._replace(middles=segments.middles - off), centre + off
+    return PartModel(
+        name=name,
+        segments=segments,
+        outline=found.points - centre,
+        levels=_levels(segments, grey, centre),
+        symmetry=symmetry,
+        reference=(float(centre[0]) + corner[0], float(centre[1]) + corner[1]),
+        border=border,
+        noise=noise,
+    )
+
+
+def _off_middle(
+    segments: Segments, outline: Array, fold: int, taught: tuple[NDArray[Any], Array, float]
+) -> Array:
+    """Return the place that a part turns about exactly, (2,), from the reference.
+
+    ``taught``: the picture, the reference in it, and its noise. The part is located in its own
+    picture at each of the turns; where it lies then tells its middle.
+    """
+    levels, (x, y), noise = taught
+    turns, bands = fold or ROUND_TURNS, make_bands(segments, outline)
+    use = FineSettings(MIN_SELF_CONTRAST, noise, turned=fold != 0)
+    found = []
+    for number in range(turns if fold != 1 else 0):
+        start = PixelPose(float(x), float(y), 2 * math.pi * number / turns)
+        fine = fit_pose(levels, segments, bands, start, use)
+        if fine is None:
+            return np.zeros(2)
+        found.append((fine.pose.x - x, fine.pose.y - y))
+    return np.mean(found, axis=0) if found else np.zeros(2)
+
+
+def _mask(
+    region: Region | NDArray[np.bool_] | None, picture: Picture
+) -> tuple[NDArray[np.bool_], tuple[int, int]]:
+    """Return the pixels that are taught, as a mask (H, W), and its corner in the picture."""
+    if isinstance(region, np.ndarray):
+        if region.dtype != np.bool_ or region.shape != picture.size[::-1]:
+            raise wrong_argument(
+                "region", f"a mask of bool of the shape {picture.size[::-1]}", region
+            )
+        mask, corner = region, (0, 0)
+    else:
+        placed = place(region, None, picture.size)
+        if placed.is_empty:
+            raise TeachingError(
+                TeachingTrouble.EMPTY,
+                f"the region has no pixel in the picture of {picture.size[0]} x {picture.size[1]}",
+            )
+        mask, corner = placed.mask() > 0, (placed.left, placed.top)
+    if not mask.any():
+        raise TeachingError(TeachingTrouble.EMPTY, "the region has no pixel in the picture")
+    if mask.size > MAX_REGION_PX:
+        raise TeachingError(
+            TeachingTrouble.TOO_LARGE,
+            f"the region has {mask.size} pixels, {MAX_REGION_PX} can be taught",
+        )
+    return mask, corner
+
+
+def _inside(points: Array, mask: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], float]:
+    """Return a mask of the edges that are taught, and the part of them that lies at the border."""
+    cv2 = load("cv2", "inspection needs")
+    padded = np.pad(mask, 1).astype(np.uint8)
+    depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
+    at = np.rint(points).astype(int)
+    at = at.clip(0, np.array(mask.shape[::-1]) - 1)
+    inside = depth[at[:, 1], at[:, 0]]
+    kept = inside > BORDER_PX
+    touching = int(np.count_nonzero((inside > 0) & ~kept))
+    return kept, touching / max(touching + int(np.count_nonzero(kept)), 1)
+
+
+def _ordered(segments: Segments) -> Segments:
+    """Return segments around the reference, some of them if there are too many."""
+    order = np.argsort(np.arctan2(segments.middles[:, 1], segments.middles[:, 0]), kind="stable")
+    if len(order) > MAX_SEGMENTS:
+        order = order[np.linspace(0, len(order) - 1, MAX_SEGMENTS).round().astype(int)]
+    return segments.some(order)
+
+
+def _check_directions(segments: Segments) -> None:
+    """Raise where the edges' directions leave a place open."""
+    weights = segments.halves / segments.halves.sum()
+    square = (segments.normals * weights[:, None]).T @ segments.normals
+    if float(np.linalg.eigvalsh(square)[0]) < MIN_ACROSS:
+        raise TeachingError(
+            TeachingTrouble.OPEN,
+            "all edges run in one direction, so nothing tells the place along them: expected a "
+            "region with edges of other directions, too",
+        )
+
+
+def _levels(
+    segments: Segments, grey: NDArray[np.uint8], centre: Array
+) -> tuple[NDArray[np.intp], ...]:
+    """Return the segments that can be seen at each level of the pyramid, from 0."""
+    cv2 = load("cv2", "inspection needs")
+    found = [np.arange(len(segments.halves))]
+    radius = float(np.linalg.norm(segments.middles, axis=1).max())
+    for level in range(1, MAX_LEVELS):
+        grey = cv2.pyrDown(grey)
+        seen = _seen_at(segments, grey, centre, level)
+        if len(seen) < MIN_TOP_POINTS or radius / 2**level < MIN_RADIUS_PX:
+            break
+        found.append(seen)
+    return tuple(found)
+
+
+def _seen_at(
+    segments: Segments, grey: NDArray[np.uint8], centre: Array, level: int
+) -> NDArray[np.intp]:
+    """Return the segments whose direction a level shows, one for each of its pixels."""
+    cv2 = load("cv2", "inspection needs")
+    across, down = (cv2.Sobel(grey, cv2.CV_32F, *way) for way in ((1, 0), (0, 1)))
+    exact = (segments.middles + centre) / 2**level
+    limit = np.array(grey.shape[::-1]) - 1
+    agreed = np.zeros(len(exact), dtype=np.bool_)
+    for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):  # the search looks at neighbours, too
+        x, y = (np.floor(exact).astype(int) + corner).clip(0, limit).T
+        gradient = np.column_stack([across[y, x], down[y, x]])
+        size = np.maximum(np.linalg.norm(gradient, axis=1), 1e-9)
+        alike = (gradient * segments.normals).sum(axis=1) / size >= LEVEL_AGREEMENT
+        agreed |= alike & (size >= LEVEL_RESPONSE * segments.heights)
+    _, first = np.unique(np.rint(exact).astype(int) @ [1, 1 << 20], return_index=True)
+    once = np.zeros(len(exact), dtype=np.bool_)
+    once[first] = True
+    return np.flatnonzero(agreed & once)
+
+
+# ---------------------------------------------------------------------- files
+
+Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]
+Place = Annotated[float, Field(allow_inf_nan=False, ge=-20_000, le=20_000)]
+Part = Annotated[float, Field(allow_inf_nan=False, ge=-1.001, le=1.001)]
+Length = Annotated[float, Field(allow_inf_nan=False, gt=0, le=20)]
+Height = Annotated[float, Field(allow_inf_nan=False, gt=0, le=1000)]
+Row = tuple[Place, Place, Part, Part, Part, Length, Height, Length, Length]
+
+
+class _ModelFile(BaseModel):
+    """The file of a model."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(
+        extra="forbid", frozen=True, hide_input_in_errors=True
+    )
+
+    kind: Literal["smartcam part model"] = "smartcam part model"
+    version: Literal[1] = VERSION
+    name: Annotated[str, Field(min_length=1, max_length=50)]
+    reference: tuple[Number, Number]
+    border: Annotated[float, Field(ge=0, le=1)]
+    noise: Annotated[float, Field(ge=0, le=1000)]
+    fold: Annotated[int, Field(ge=0, le=1000)]
+    alike: Annotated[list[tuple[Number, Number]], Field(max_length=100)]
+    about: tuple[Number, Number]
+    segments: Annotated[list[Row], Field(min_length=MIN_SEGMENTS, max_length=MAX_SEGMENTS)]
+    levels: Annotated[list[list[Annotated[int, Field(ge=0)]]], Field(min_length=1, max_length=20)]
+    outline: Annotated[list[tuple[Place, Place]], Field(min_length=3, max_length=1_000_000)]
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> _ModelFile:
+        for number, level in enumerate(self.levels):
+            if not level or max(level) >= len(self.segments):
+                raise ValueError(f"levels.{number}: expected indices of segments")
+        places = np.array([row[:2] for row in self.segments] + self.outline)
+        if float(np.prod(np.ptp(places, axis=0))) > MAX_REGION_PX:
+            raise ValueError(f"expected a part of {MAX_REGION_PX} pixels at most")
+        if min(math.hypot(*row[2:4]) for row in self.segments) < 0.9:
+            raise ValueError("segments: expected normals of the length 1")
+        return self
+
+    @classmethod
+    def of(cls, model: PartModel) -> _ModelFile:
+        """Return the file of a model; places are rounded to a ten-thousandth of a pixel."""
+        one = model.segments
+        rows = np.column_stack(
+            [one.middles, one.normals, one.bends, one.halves, one.heights, one.blurs, one.sigmas]
+        )
+        return cls(
+            name=model.name,
+            reference=model.reference,
+            border=model.border,
+            noise=model.noise,
+            fold=model.symmetry.fold,
+            alike=list(model.symmetry.alike),
+            about=model.symmetry.about,
+            segments=[tuple(row) for row in rows.round(6).tolist()],
+            levels=[one.tolist() for one in model.levels],
+            outline=[tuple(row) for row in model.outline.round(2).tolist()],
+        )
+
+    def model(self) -> PartModel:
+        """Return the model of the file."""
+        rows = np.array(self.segments, np.float64)
+        normals = rows[:, 2:4] / np.maximum(np.linalg.norm(rows[:, 2:4], axis=1), 1e-9)[:, None]
+        return PartModel(
+            name=self.name,
+            segments=Segments(rows[:, :2], normals, *rows[:, 4:].T),
+            outline=np.array(self.outline, np.float64).reshape(-1, 2),
+            levels=tuple(np.array(one, np.intp) for one in self.levels),
+            symmetry=Symmetry(self.fold, tuple(self.alike), self.about),
+            reference=self.reference,
+            border=self.border,
+            noise=self.noise,
+        )

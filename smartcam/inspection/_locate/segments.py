@@ -1,0 +1,222 @@
+"""Segments: short straight or bent pieces of a part's edges, and their fit to a picture's pixels.
+
+A segment has a middle, a normal that points to its brighter side, a bend, and a length. Its *band*
+is made of the pixels beside it: each pixel of a picture is in the band of one segment at most. So
+the noise of segments is independent, and the error of a pose follows from theirs.
+
+A fit puts a blurred step into each band: two levels, and the place across the edge. Pixels are
+taken as they are, without interpolation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.inspection._measure.edges import ROUNDING
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+BAND_PX: Final = 4.0
+"""Pixels of a band to each side of its segment, in the picture that was taught."""
+
+MIN_BLUR_PX: Final = 0.35
+"""Least standard deviation of an edge's blur, in pixels, with the pixels' own area in it."""
+
+MIN_BAND_PIXELS: Final = 12
+"""Pixels that a band has at least; a fit of fewer says too little about its noise."""
+
+
+class Segments(NamedTuple):
+    """N segments; lengths in pixels of the picture that was taught, places from its reference."""
+
+    middles: Array  # (N, 2)
+    normals: Array  # (N, 2), of length 1, to the brighter side
+    bends: Array  # (N,), 1 over the radius; positive: the edge bends towards its brighter side
+    halves: Array  # (N,), half of the length
+    heights: Array  # (N,), grey levels of 255 from the darker to the brighter side
+    blurs: Array  # (N,), standard deviation of the step's blur
+    sigmas: Array  # (N,), standard deviation of the place across the edge
+
+    def some(self, which: NDArray[Any]) -> Segments:
+        """Return some of the segments."""
+        return Segments(*(one[which] for one in self))
+
+    @property
+    def tangents(self) -> Array:
+        """(N, 2), of length 1: the normals, turned by a quarter from x to y."""
+        return self.normals[:, ::-1] * [-1.0, 1.0]
+
+    def curve(self, step: float = 0.5) -> tuple[Array, NDArray[np.intp]]:
+        """Return points (M, 2) along all segments, and the segment of each."""
+        counts = np.maximum(np.ceil(2 * self.halves / step).astype(int), 1) + 1
+        owners = np.repeat(np.arange(len(counts)), counts)
+        first = np.cumsum(counts) - counts
+        number = np.arange(len(owners)) - first[owners]
+        t = (2 * number / (counts[owners] - 1) - 1) * self.halves[owners]
+        bend = 0.5 * self.bends[owners] * t * t
+        points = self.middles[owners] + t[:, None] * self.tangents[owners]
+        return points + bend[:, None] * self.normals[owners], owners
+
+    def places(self, points: Array, owners: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Return the places of points (P, 2) of these segments: across and along the edge."""
+        off = points - self.middles[owners]
+        nx, ny = self.normals[owners].T
+        along = nx * off[:, 1] - ny * off[:, 0]
+        return nx * off[:, 0] + ny * off[:, 1] - 0.5 * self.bends[owners] * along * along, along
+
+
+class Bands(NamedTuple):
+    """The bands of segments as a map of labels."""
+
+    labels: NDArray[np.int16]  # (H, W), index of the segment; -1: of none
+    corner: tuple[int, int]  # place of the first label, pixels from the reference
+
+
+def make_bands(segments: Segments, others: Array) -> Bands:
+    """Return the bands of segments; ``others`` (M, 2) are edges beside them, which end bands."""
+    cv2 = load("cv2", "inspection needs")
+    points, owners = segments.curve()
+    low = np.floor(points.min(axis=0) - BAND_PX - 2).astype(int)
+    size = np.ceil(points.max(axis=0) + BAND_PX + 2).astype(int) - low + 1
+    seeds = np.full((int(size[1]), int(size[0])), -2, np.int32)
+    at = np.rint(points - low).astype(int)
+    seeds[at[:, 1], at[:, 0]] = owners
+    own = cv2.dilate((seeds >= 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+    beside = np.rint(others - low).astype(int)
+    beside = beside[((beside >= 0) & (beside < size)).all(axis=1)]
+    beside = beside[own[beside[:, 1], beside[:, 0]] == 0]
+    seeds[beside[:, 1], beside[:, 0]] = -1
+    free = (seeds == -2).astype(np.uint8)
+    distance, nearest = cv2.distanceTransformWithLabels(
+        free, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    owner_of = np.full(int(nearest.max()) + 1, -1, np.int32)
+    owner_of[nearest[free == 0]] = seeds[free == 0]
+    labels = owner_of[nearest]
+    rows, columns = np.nonzero((labels >= 0) & (distance <= BAND_PX + 1))
+    mine = labels[rows, columns]
+    across, along = segments.places(np.column_stack([columns, rows]) + low, mine)
+    within = (np.abs(across) <= BAND_PX) & (np.abs(along) <= segments.halves[mine] + 0.5)
+    kept = np.full(labels.shape, -1, np.int16)
+    kept[rows[within], columns[within]] = mine[within]
+    return Bands(kept, (int(low[0]), int(low[1])))
+
+
+class BandPixels(NamedTuple):
+    """Pixels of bands in a picture."""
+
+    points: Array  # (P, 2), pixels of the picture
+    levels: Array  # (P,), grey levels
+    owners: NDArray[np.intp]  # (P,), the segments
+
+
+def pixels_in(bands: Bands, matrix: Array, levels: NDArray[Any]) -> BandPixels:
+    """Return the pixels of a picture (H, W) that lie in bands.
+
+    ``matrix`` (2, 3) leads from the segments' places to pixels of the picture.
+    """
+    cv2 = load("cv2", "inspection needs")
+    height, width = bands.labels.shape
+    corners = np.array([(0, 0), (width, 0), (width, height), (0, height)]) + bands.corner
+    box = corners @ matrix[:, :2].T + matrix[:, 2]
+    low = np.floor(box.min(axis=0)).astype(int).clip(0)
+    high = np.minimum(np.ceil(box.max(axis=0)).astype(int) + 1, levels.shape[::-1])
+    if (high <= low).any():
+        return BandPixels(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.intp))
+    way = matrix.copy()
+    way[:, 2] += matrix[:, :2] @ bands.corner - low
+    labels = cv2.warpAffine(
+        bands.labels,
+        way,
+        tuple(map(int, high - low)),
+        flags=cv2.INTER_NEAREST,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=-1,
+    )
+    rows, columns = np.nonzero(labels >= 0)
+    owners = labels[rows, columns].astype(np.intp)
+    points = np.column_stack([columns, rows]).astype(np.float64) + low
+    part = levels[low[1] : high[1], low[0] : high[0]]
+    return BandPixels(points, part[rows, columns].astype(np.float64), owners)
+
+
+class StepFit(NamedTuple):
+    """The blurred step in each of N bands; where there is none, sigma is infinite."""
+
+    shifts: Array  # (N,), where the edge lies across the segment, towards the brighter side
+    sigmas: Array  # (N,), of the shifts, for noise of one grey level
+    heights: Array  # (N,), grey levels; negative: the bright side is the other one
+    height_sigmas: Array  # (N,), for noise of one grey level
+    variances: Array  # (N,), of the pixels about the step
+    freedoms: Array  # (N,), pixels less fitted values
+    widening: float  # by how much the common blur should grow, in parts of itself
+
+
+def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> StepFit:
+    """Return the steps of ``count`` bands, linear about the places and blurs as they are.
+
+    ``across`` (P,) and ``blurs`` (P,): place of each pixel across its edge, and the step's blur,
+    both in pixels of the picture.
+    """
+    part = across / blurs
+    rise = load("scipy.special").ndtr(part)
+    slope = np.exp(-0.5 * part * part) / (blurs * math.sqrt(2 * math.pi))
+    widen = part * slope * blurs
+    owners, levels = pixels.owners, pixels.levels
+
+    def sums(*factors: Array) -> Array:
+        product = factors[0]
+        for one in factors[1:]:
+            product = product * one
+        return np.bincount(owners, product, count)
+
+    columns = (rise, slope)
+    number = np.bincount(owners, minlength=count).astype(np.float64)
+    safe = np.maximum(number, 1.0)
+    rest = sums(levels) / safe
+    means = [sums(one) / safe for one in columns]
+    # products about the means of each band: what the unknown level of its dark side leaves
+    rr, rs, ss = (
+        sums(rise, rise) - number * means[0] ** 2,
+        sums(rise, slope) - number * means[0] * means[1],
+        sums(slope, slope) - number * means[1] ** 2,
+    )
+    ry = sums(rise, levels) - number * means[0] * rest
+    sy = sums(slope, levels) - number * means[1] * rest
+    yy = sums(levels, levels) - number * rest**2
+    determinant = rr * ss - rs * rs
+    good = (number >= MIN_BAND_PIXELS) & (determinant > 1e-9 * np.maximum(rr * ss, 1e-12))
+    det = np.where(good, determinant, 1.0)
+    heights = np.where(good, (ss * ry - rs * sy) / det, 0.0)
+    moved = np.where(good, (rr * sy - rs * ry) / det, 0.0)
+    left = np.maximum(yy - heights * ry - moved * sy, 0.0)
+    freedoms = np.maximum(number - 3.0, 1.0)
+    tall = np.where(np.abs(heights) > 1e-6, heights, 1e-6)
+    infinite = np.where(good, 0.0, np.inf)
+    residuals = levels - rest[owners]
+    residuals -= heights[owners] * (rise - means[0][owners])
+    residuals -= moved[owners] * (slope - means[1][owners])
+    return StepFit(
+        -moved / tall,
+        np.sqrt(np.maximum(rr / det, 0.0)) / np.abs(tall) + infinite,
+        heights,
+        np.sqrt(np.maximum(ss / det, 0.0)) + infinite,
+        np.maximum(left / freedoms, ROUNDING**2),
+        freedoms,
+        _widening(residuals, widen, heights, owners),
+    )
+
+
+def _widening(residuals: Array, widen: Array, heights: Array, owners: NDArray[np.intp]) -> float:
+    """Return by how much the common blur should grow, by the strongest half of the edges."""
+    tall = np.abs(heights)
+    column = -widen * np.where(tall >= np.median(tall), heights, 0.0)[owners]
+    square = float(column @ column)
+    return float(column @ residuals) / square if square > 0 else 0.0

@@ -1,0 +1,110 @@
+"""Settings of the tool `locate`."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Final, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from smartcam.inspection._places import RegionSetting
+from smartcam.inspection._tool import ToolSettings
+
+MAX_PARTS: Final = 200
+"""Parts in one result."""
+
+MAX_MODELS: Final = 50
+"""Models that are looked for at once."""
+
+MAX_SECONDS: Final = 30.0
+"""Seconds that a search may take, if the settings allow for so many."""
+
+
+def _rising(given: tuple[float, float]) -> tuple[float, float]:
+    if given[0] > given[1]:
+        raise ValueError(f"expected the smaller number first, got {list(given)}")
+    return given
+
+
+Angle = Annotated[float, Field(ge=-360, le=360, allow_inf_nan=False)]
+Scale = Annotated[float, Field(ge=0.25, le=4.0, allow_inf_nan=False)]
+Number = Annotated[int, Field(ge=0, le=MAX_PARTS)]
+File = Annotated[str, Field(min_length=1)]
+
+
+class LocateSettings(ToolSettings):
+    """The models that are looked for, and the poses that they may have."""
+
+    model: File | Annotated[list[File], Field(min_length=1, max_length=MAX_MODELS)] | None = Field(
+        None,
+        description="file with a model of the part, beside this one, as PartModel.write makes it; "
+        "or a list of them",
+    )
+    taught: File | None = Field(
+        None, description="instead of a model: file with a picture of the part, beside this one"
+    )
+    part: RegionSetting | None = Field(
+        None,
+        description="where the part is in the taught picture: [x, y, width, height] or corners; "
+        "default: the whole picture",
+    )
+    angle: Annotated[tuple[Angle, Angle], AfterValidator(_rising)] = Field(
+        (-180.0, 180.0),
+        description="degrees that the part may be turned by since it was taught, from and to",
+    )
+    scale: Annotated[tuple[Scale, Scale], AfterValidator(_rising)] = Field(
+        (1.0, 1.0), description="size of the part in parts of the taught one, from and to"
+    )
+    most: int = Field(
+        1, ge=1, le=MAX_PARTS, description="parts in the result at most, of each model"
+    )
+    count: Annotated[tuple[Number, Number], AfterValidator(_rising)] | Number | None = Field(
+        None,
+        description="how many there have to be: a number, or from and to; default: one or more",
+    )
+    least_score: float = Field(
+        0.7, ge=0.3, le=1.0, description="part of its edges that has to be seen"
+    )
+    overlap: float = Field(
+        0.5, ge=0.0, le=1.0, description="part of its area that another one may cover"
+    )
+    polarity: Literal["same", "any"] = Field(
+        "same", description="any: dark and bright may be exchanged"
+    )
+    contrast: float | None = Field(
+        None,
+        ge=1,
+        le=255,
+        description="grey levels of 255 of an edge at least; default: a seventh of the taught ones",
+    )
+    sigma: float | None = Field(
+        None,
+        gt=0,
+        allow_inf_nan=False,
+        description="largest standard deviation of a place, pixels, or millimetres with a "
+        "calibration; a part that is known less well is not ok",
+    )
+    seconds: float = Field(
+        1.0, ge=0.01, le=MAX_SECONDS, description="seconds after which it looks no further"
+    )
+
+    @model_validator(mode="after")
+    def _goes_together(self) -> LocateSettings:
+        if (self.model is None) == (self.taught is None):
+            got = "neither" if self.model is None else "both"
+            raise ValueError(f"expected either a model or a taught picture, got {got}")
+        if self.part is not None and self.taught is None:
+            raise ValueError("part: expected it with a taught picture only")
+        if self.angle[1] - self.angle[0] > 360:
+            raise ValueError(f"angle: expected 360 degrees at most, got {list(self.angle)}")
+        return self
+
+    @property
+    def models(self) -> list[str]:
+        """Files of the models."""
+        return [self.model] if isinstance(self.model, str) else self.model or []
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """The angles in radians."""
+        return math.radians(self.angle[0]), math.radians(self.angle[1])

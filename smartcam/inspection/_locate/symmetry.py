@@ -1,0 +1,178 @@
+"""Find out at which turns a part looks like itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from smartcam._extras import load
+
+if TYPE_CHECKING:
+    from smartcam.geometry._inside import Array
+    from smartcam.inspection._locate.segments import Segments
+
+SAME: Final = 0.97
+"""Part of the outline that a turn brings onto itself, from which on it is the same part."""
+
+ALIKE: Final = 0.75
+"""Part of the outline from which on a turned part may be taken for one that is not turned."""
+
+MAX_FOLD: Final = 24
+"""Turns of the full circle up to which a part is told from a round one."""
+
+NEAR_PX: Final = 1.5
+"""Pixels beside the outline that a turned point may be."""
+
+MAX_TURN: Final = math.radians(20.0)
+"""Angle between the directions of a turned edge and of the one that it lies on, at most."""
+
+CENTRE_STEPS: Final = 6
+"""Steps in which the place is found that a part turns about."""
+
+CENTRE_PX: Final = 8.0
+"""Pixels between a turned segment and the one that it lies on at the first step, at most."""
+
+MIN_MET: Final = 8
+"""Segments that lie on another one when they are turned, at least."""
+
+COMMON_FOLDS: Final = (2, 3, 4, 5, 6, 8)
+"""Folds of which the middle is always looked for: a notch may move the reference off it."""
+
+MAX_POINTS: Final = 1000
+"""Edge pixels that are turned, about."""
+
+TURNS: Final = 720
+"""Turns of the full circle that are tried."""
+
+
+@dataclass(frozen=True, slots=True)
+class Symmetry:
+    """The turns at which a part looks like itself.
+
+    Attributes:
+        fold: number of turns in the full circle at which it is the same: 1 of most parts, 4 of a
+            square, 0 of a round one, which has no angle.
+        alike: other turns at which it may be taken for itself: radians, and the part of the
+            outline that is the same, the most alike first.
+        about: place that these turns are about, pixels from the reference.
+    """
+
+    fold: int = 1
+    alike: tuple[tuple[float, float], ...] = ()
+    about: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def period(self) -> float:
+        """Angle after which the part is the same, radians; an angle is told modulo this."""
+        return 2 * math.pi / max(self.fold, 1)
+
+    def text(self) -> str:
+        """Return the sentence that people are told."""
+        if self.fold == 0:
+            return "round: it has no angle"
+        said = "has one angle"
+        if self.fold > 1:
+            said = f"the same every {360 / self.fold:g} degrees: its angle is told modulo that"
+        if self.alike:
+            angle, share = self.alike[0]
+            said += (
+                f"; turned by {math.degrees(angle):.0f} degrees, {100 * share:.0f} % of it are "
+                "the same: what differs must be in sight"
+            )
+        return said
+
+
+def find_symmetry(segments: Segments, points: Array, normals: Array) -> tuple[Symmetry, Array]:
+    """Return the turns at which a part's edges lie on themselves, and the place they turn about.
+
+    ``points`` (M, 2) and ``normals`` (M, 2) are all of its edges, ``segments`` those whose place
+    is told to a fraction of a pixel.
+
+    The place (2,) is that of a part with a symmetry; else it is the reference, (0, 0).
+    """
+    shares = _shares(points, normals)
+    best, most = Symmetry(1, _alike(shares, 1)), ALIKE
+    for count in (0, *range(MAX_FOLD, 1, -1)):
+        if count not in COMMON_FOLDS and _least(shares, count) < ALIKE:
+            continue
+        centre = _centre(segments, count or MAX_FOLD)
+        again = _shares(points - centre, normals)
+        least = _least(again, count)
+        if least >= SAME:
+            return Symmetry(count, _alike(again, count) if count else ()), centre
+        if least > most and count:
+            x, y = centre.tolist()
+            best, most = Symmetry(1, _alike(again, 1), (x, y)), least
+    return best, np.zeros(2)
+
+
+def _least(shares: Array, count: int) -> float:
+    """Return the part of the outline that each turn of a fold brings onto itself at least."""
+    if count == 0:
+        return float(shares.min())
+    turns = np.rint(TURNS * np.arange(1, count) / count).astype(int)
+    around = (turns[:, None] + [-1, 0, 1]) % TURNS
+    return float(shares[around].max(axis=1).min())
+
+
+def _centre(segments: Segments, count: int) -> Array:
+    """Return the place about which turns of a fold bring segments nearest to themselves."""
+    centre = np.zeros(2)
+    index = load("scipy.spatial", "locate needs").cKDTree(segments.middles)
+    for step in range(CENTRE_STEPS):
+        near = max(CENTRE_PX * (1 - step / 4), NEAR_PX)
+        rows, values = [], []
+        for number in range(1, count):
+            angle = 2 * math.pi * number / count
+            cos, sin = math.cos(angle), math.sin(angle)
+            turn = np.array([[cos, -sin], [sin, cos]])
+            moved = (segments.middles - centre) @ turn.T + centre
+            met = index.query(moved)[1]
+            off, along = segments.places(moved, met)
+            agreed = (segments.normals @ turn.T * segments.normals[met]).sum(axis=1)
+            used = (agreed >= math.cos(MAX_TURN)) & (np.abs(off) <= near)
+            used &= np.abs(along) <= segments.halves[met] + 1
+            rows.append((segments.normals[met] @ (np.eye(2) - turn))[used])
+            values.append(-off[used])
+        if sum(map(len, values)) < MIN_MET:
+            return np.zeros(2)
+        centre = centre + np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
+    return centre
+
+
+def _shares(points: Array, normals: Array) -> Array:
+    """Return the part of the edges that each turn brings onto others, (TURNS,)."""
+    cv2 = load("cv2", "inspection needs")
+    radius = math.ceil(float(np.linalg.norm(points, axis=1).max())) + 3
+    image = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    at = np.rint(points).astype(int) + radius
+    image[at[:, 1], at[:, 0]] = 0
+    distance, nearest = cv2.distanceTransformWithLabels(
+        image, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    point_of = np.zeros(int(nearest.max()) + 1, int)
+    point_of[nearest[at[:, 1], at[:, 0]]] = np.arange(len(at))
+    step = max(1, len(points) // MAX_POINTS)
+    shares = np.empty(TURNS)
+    for number in range(TURNS):
+        angle = 2 * math.pi * number / TURNS
+        turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        columns, rows = np.rint(points[::step] @ turn).astype(int).T + radius
+        met = point_of[nearest[rows, columns]]
+        agreed = (normals[met] * (normals[::step] @ turn)).sum(axis=1) >= math.cos(MAX_TURN)
+        shares[number] = (agreed & (distance[rows, columns] <= NEAR_PX)).mean()
+    return shares
+
+
+def _alike(shares: Array, fold: int) -> tuple[tuple[float, float], ...]:
+    """Return the turns within the period at which the part may be taken for itself."""
+    period = TURNS // fold
+    inside = shares[:period]
+    before, after = np.roll(inside, 1), np.roll(inside, -1)
+    peaks = np.flatnonzero((inside >= before) & (inside > after) & (inside >= ALIKE))
+    far = peaks[(peaks > TURNS // 36) & (peaks < period - TURNS // 36)]
+    order = far[np.argsort(-inside[far], kind="stable")][:8]
+    return tuple((2 * math.pi * one / TURNS, float(shares[one])) for one in order.tolist())

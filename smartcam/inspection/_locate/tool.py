@@ -1,0 +1,243 @@
+"""The tool `locate`: taught parts, with their poses and the errors of these."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.inspection._finding import Drawing, Finding
+from smartcam.inspection._locate.find import Located, LocatedPart, Search, locate
+from smartcam.inspection._locate.model import PartModel
+from smartcam.inspection._locate.settings import MAX_PARTS, LocateSettings
+from smartcam.inspection._measure.planes import PIXELS, robot_plane_of
+from smartcam.inspection._measure.troubles import NotMeasuredError
+from smartcam.inspection._picture import Picture
+from smartcam.inspection._tool import Tool
+
+if TYPE_CHECKING:
+    from smartcam.geometry._inside import Array
+    from smartcam.inspection._finding import Role
+    from smartcam.inspection._measure.planes import Plane
+    from smartcam.inspection._tool import ToolSetup, View
+
+MAX_DRAWN: Final = 80
+"""Edges of a part that are drawn."""
+
+STEPS: Final = np.array([0.5, 0.5, 1e-3])
+"""Pixels, and radians, by which a pose is moved to see what its place in the plane does."""
+
+
+class PlanePose(NamedTuple):
+    """A part's pose in the plane: millimetres and radians, or pixels."""
+
+    values: Array  # (3,), x, y, theta
+    covariance: Array  # (3, 3)
+
+    def fields(self, si: float) -> dict[str, float]:
+        """Return the fields of a result, in SI units by the metres of a length's unit."""
+        units = np.array([si, si, 1.0])
+        x, y, theta = (self.values * units).tolist()
+        sigmas = np.sqrt(np.diag(self.covariance))
+        safe = np.maximum(sigmas, 1e-300)
+        correlation = self.covariance / np.outer(safe, safe)
+        sigma_x, sigma_y, sigma_theta = (sigmas * units).tolist()
+        return {
+            "x": x,
+            "y": y,
+            "theta": theta,
+            "sigma_x": sigma_x,
+            "sigma_y": sigma_y,
+            "sigma_theta": sigma_theta,
+            "correlation_xy": float(correlation[0, 1]),
+            "correlation_xt": float(correlation[0, 2]),
+            "correlation_yt": float(correlation[1, 2]),
+        }
+
+
+class Locate(Tool[LocateSettings]):
+    """Taught parts in a region."""
+
+    settings_model = LocateSettings
+    needs_whole_region = False
+
+    def __init__(self, settings: LocateSettings, setup: ToolSetup) -> None:
+        super().__init__(settings, setup)
+        load("scipy.special", "locate needs")  # now, so that the first picture need not wait
+        self.models = [PartModel.read(setup.folder / one) for one in settings.models]
+        if settings.taught is not None:
+            file = setup.folder / settings.taught
+            model = PartModel.teach(Picture.read(file), settings.part, name=file.stem)
+            self.models.append(model)
+        for model in self.models:  # worked out now, for the same reason
+            _ = model.bands, model.coarse
+        kind = getattr(setup.calibration, "kind", None)
+        calibrated = kind in {"plane", "sheet"}
+        self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS
+        self._search = Search(
+            angles=settings.angles,
+            scales=settings.scale,
+            most=settings.most,
+            least_score=settings.least_score,
+            overlap=settings.overlap,
+            any_polarity=settings.polarity == "any",
+            contrast=settings.contrast,
+            seconds=settings.seconds,
+        )
+        count = settings.count
+        self._wanted = (1, MAX_PARTS * len(self.models))
+        if count is not None:
+            self._wanted = count if isinstance(count, tuple) else (count, count)
+
+    @property
+    def fields(self) -> str:
+        """The number of parts, and the score of the best one, found or refused."""
+        return "count: uint16, best_score: real32"
+
+    @property
+    def records(self) -> str:
+        """Each part, as a localization with its errors."""
+        unit = self._plane.unit
+        lengths = ", ".join(f"{name}: real32 {unit}" for name in ("sigma_x", "sigma_y"))
+        return (
+            f"feature_id: string[50], quality: real32, x: real32 {unit}, y: real32 {unit}, "
+            f"theta: real32 deg, scale: real32, {lengths}, sigma_theta: real32 deg, "
+            "correlation_xy: real32, correlation_xt: real32, correlation_yt: real32"
+        )
+
+    def inspect(self, view: View) -> Finding:
+        """Return the parts, the best first."""
+        region = view.region
+        box = (region.left, region.top, region.right, region.below)
+        whole = self.settings.region is None
+        found = locate(
+            view.picture,
+            self.models,
+            self._search,
+            box=None if whole else box,
+            allowed=None if whole else region.contains,
+        )
+        try:
+            poses = [in_plane(part, self._plane) for part in found.parts]
+        except NotMeasuredError as trouble:
+            return Finding(
+                ok=False,
+                reason=f"{trouble.why.value}: {trouble.text}",
+                values=_values(found),
+                drawings=self._drawn(view, found, wrong=True),
+                details=found,
+            )
+        reason = self._complaint(found, poses)
+        return Finding(
+            ok=not reason,
+            reason=reason,
+            values=_values(found),
+            records=[
+                _record(part, pose, self._plane.unit)
+                for part, pose in zip(found.parts, poses, strict=True)
+            ],
+            drawings=self._drawn(view, found, wrong=bool(reason)),
+            reference=found.parts[0].pose if found.parts else None,
+            details=found,
+        )
+
+    def _complaint(self, found: Located, poses: list[PlanePose]) -> str:
+        """Return why what was found is not ok; "" where it is."""
+        least, most = self._wanted
+        count, nearest = len(found.parts), found.nearest
+        if not least <= count <= most:
+            wanted = f"{least}" if least == most else f"{least} to {most}"
+            wanted = f"{least} or more" if self.settings.count is None else wanted
+            text = f"{count} found, expected {wanted}"
+            if count < least:
+                text += _near(nearest, len(self.models) > 1)
+            return text
+        for part, pose in zip(found.parts, poses, strict=True):
+            if part.doubt:
+                return f"{part.name}: {part.doubt}"
+            sigma = math.sqrt(float(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1]))
+            limit = self.settings.sigma
+            if limit is not None and sigma > limit:
+                unit = self._plane.unit
+                return f"{part.name}: sigma is {sigma:.3g} {unit}, {limit:g} {unit} are allowed"
+        return ""
+
+    def _drawn(self, view: View, found: Located, *, wrong: bool) -> list[Drawing]:
+        marks = [Drawing("polygon", _points(view.region.corners), "region")]
+        for part in found.parts:
+            marks += _marks(part, "wrong" if wrong else "found")
+        if not found.parts and found.nearest is not None:
+            near = found.nearest
+            text = f"{near.name}: {100 * near.score:.0f} %"
+            marks.append(Drawing("polygon", _points(near.hull), "hint", text))
+        return marks
+
+
+def in_plane(part: LocatedPart, plane: Plane) -> PlanePose:
+    """Return a part's pose in a plane, with the picture's and the plane's own errors."""
+    start = np.array([part.pose.x, part.pose.y, part.pose.angle])
+    values = _pose_in(start, plane)
+    columns = []
+    for way in np.diag(STEPS):
+        off = _pose_in(start + way, plane) - _pose_in(start - way, plane)
+        off[2] = math.remainder(off[2], 2 * math.pi)
+        columns.append(off / (2 * way.max()))
+    slopes = np.column_stack(columns)
+    covariance = slopes @ part.covariance[:3, :3] @ slopes.T
+    for variant in plane.variants:
+        off = _pose_in(start, plane._replace(map=variant, variants=())) - values
+        off[2] = math.remainder(off[2], 2 * math.pi)
+        covariance = covariance + np.outer(off, off)
+    return PlanePose(values, covariance)
+
+
+def _pose_in(pose: Array, plane: Plane) -> Array:
+    if plane is PIXELS:
+        return pose
+    at = pose[None, :2]
+    ahead = plane.slopes(at)[0] @ [math.cos(pose[2]), math.sin(pose[2])]
+    return np.array([*plane.points(at)[0], math.atan2(ahead[1], ahead[0])])
+
+
+def _record(part: LocatedPart, pose: PlanePose, unit: str) -> dict[str, Any]:
+    return {
+        "feature_id": part.name,
+        "quality": part.score,
+        "scale": part.pose.scale,
+        **pose.fields(1e-3 if unit == "mm" else 1.0),
+    }
+
+
+def _values(found: Located) -> dict[str, Any]:
+    best = found.parts[0].score if found.parts else None
+    if best is None and found.nearest is not None:
+        best = found.nearest.score
+    return {"count": len(found.parts), "best_score": 0.0 if best is None else best}
+
+
+def _near(nearest: LocatedPart | None, named: bool) -> str:
+    if nearest is None:
+        return "; nothing is like it"
+    name = f"{nearest.name} " if named else ""
+    return f"; {name}at {nearest.pose.x:.0f}, {nearest.pose.y:.0f}: {nearest.refusal}"
+
+
+def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
+    """Return the drawings of a part: its hull, its axes, its edges, and those not seen."""
+    pose = part.pose
+    reach = 0.25 * float(np.linalg.norm(part.hull - (pose.x, pose.y), axis=1).max()) / pose.scale
+    axes = pose.to_picture([(2 * reach, 0), (0, 0), (0, reach)])
+    text = f"{part.name} {100 * part.score:.0f} %"
+    marks = [Drawing("polygon", _points(part.hull), role, text)]
+    marks.append(Drawing("line", _points(axes), role))
+    for places, which in ((part.edges, role), (part.missing, "hint")):
+        if len(places):
+            kept = np.linspace(0, len(places) - 1, min(len(places), MAX_DRAWN)).round().astype(int)
+            marks.append(Drawing("points", _points(places[kept]), which))
+    return marks
+
+
+def _points(places: Array) -> tuple[tuple[float, float], ...]:
+    return tuple((float(x), float(y)) for x, y in places)

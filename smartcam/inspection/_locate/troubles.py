@@ -1,0 +1,38 @@
+"""Say why a part cannot be taught."""
+
+from __future__ import annotations
+
+import enum
+
+from smartcam.exceptions import ConfigurationError
+
+
+class TeachingTrouble(enum.Enum):
+    """A reason why a part cannot be taught."""
+
+    EMPTY = "empty"
+    """The region has no pixel in the picture."""
+    FEW_EDGES = "few edges"
+    """Too few edges whose place can be told to a fraction of a pixel."""
+    BORDER = "border"
+    """Too many of the edges lie at the border of the region: it cuts the part."""
+    OPEN = "open"
+    """All edges run in one direction, so nothing tells the place along them."""
+    TOO_LARGE = "too large"
+    """The region has more pixels than are taught."""
+
+
+class TeachingError(ConfigurationError):
+    """A part cannot be taught.
+
+    Args:
+        why: reason for programs.
+        text: reason for people.
+
+    Attributes:
+        why: reason for programs.
+    """
+
+    def __init__(self, why: TeachingTrouble, text: str) -> None:
+        super().__init__(f"{why.value}: {text}")
+        self.why: TeachingTrouble = why
