@@ -81,6 +81,7 @@ class Outlets(Server):
         folder = check_path(folder, "folder", "Outlets")
         check_callable(columns, "columns", "Outlets")
         check_callable(tell, "tell", "Outlets")
+        check_callable(cameras, "cameras", "Outlets")
         if command is not None:
             check_callable(command, "command", "Outlets")
         for place, text in mistakes_of(section):

@@ -373,7 +373,7 @@ class Kinless(Machine):
 class Sharing(Machine):
     def events(self) -> Any:
         shared = self.__dict__.setdefault("shared", [])
-        shared[:] = super().events()
+        shared += super().events()
         return shared
 
 
