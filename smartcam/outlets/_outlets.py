@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._arguments import check_callable, check_kind, check_path
 from smartcam._json import object_text
 from smartcam._server import Server
+from smartcam._short_turns import leave_turns, shorten_turns
 from smartcam._user_code import ENDS_PROGRAM, text_of
 from smartcam.exceptions import ConfigurationError, SmartCamError
 from smartcam.interpreters._inside import LocalizationsInterpreter
@@ -111,7 +111,7 @@ class Outlets(Server):
         """
         if self._started:
             return
-        _turns.shorten(self)
+        shorten_turns(self, MAX_TURN_SECONDS)
         try:
             for pump in self._pumps.values():
                 try:
@@ -130,7 +130,7 @@ class Outlets(Server):
         while self._started:
             await self._started[-1].stop()
             self._started.pop()
-        _turns.leave(self)
+        leave_turns(self)
 
     @property
     def states(self) -> dict[str, OutletState]:
@@ -193,31 +193,6 @@ class Outlets(Server):
             found = [one for one in pumps if one.outlet.settings.chooses(camera)]
             self._chosen[camera] = found
         return found
-
-
-class _ShortTurns:
-    """Shortens the turns of Python's threads as long as anybody wants that."""
-
-    def __init__(self) -> None:
-        self._wanted: set[int] = set()
-        self._before = 0.0
-
-    def shorten(self, who: Outlets) -> None:
-        """Have short turns from now on."""
-        if not self._wanted:
-            self._before = sys.getswitchinterval()
-            sys.setswitchinterval(min(self._before, MAX_TURN_SECONDS))
-        self._wanted.add(id(who))
-
-    def leave(self, who: Outlets) -> None:
-        """Have turns as before, unless others want short ones. Harmless when done twice."""
-        if id(who) in self._wanted:
-            self._wanted.discard(id(who))
-            if not self._wanted:
-                sys.setswitchinterval(self._before)
-
-
-_turns = _ShortTurns()
 
 
 def _result(

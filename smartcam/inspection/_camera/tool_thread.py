@@ -3,46 +3,18 @@
 from __future__ import annotations
 
 import collections
-import sys
 import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any, Final
 
+from smartcam._short_turns import short_turns
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-SWITCH_INTERVAL: Final = 0.001
+MAX_TURN_SECONDS: Final = 0.001
 """Seconds that a tool's Python goes on while the event loop waits for its turn. Python's own 5 ms
 were all that a loop may be held; NumPy, OpenCV and zxing-cpp let the loop run meanwhile."""
-
-
-def _switch_after(seconds: float) -> None:
-    sys.setswitchinterval(seconds + 5e-7)  # it cuts off to microseconds, as it gives them back
-
-
-class _TurnTaking:
-    """Has this process' threads take turns more often while tools are at work."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._at_work = 0
-        self._before = 0.0  # seconds, when no tool was at work
-
-    def __enter__(self) -> None:
-        with self._lock:
-            if not self._at_work:
-                self._before = sys.getswitchinterval()
-                _switch_after(min(self._before, SWITCH_INTERVAL))
-            self._at_work += 1
-
-    def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._at_work -= 1
-            if not self._at_work:
-                _switch_after(self._before)
-
-
-_TURNS: Final = _TurnTaking()
 
 
 class ToolThread:
@@ -97,7 +69,7 @@ class ToolThread:
             self._at_work = False
             return
         try:
-            with _TURNS:
+            with short_turns(MAX_TURN_SECONDS):
                 result = do()
         except BaseException as exc:  # noqa: BLE001 - it is whose who waits for it
             self._at_work = False
