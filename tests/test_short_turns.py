@@ -10,7 +10,7 @@ import pytest
 from smartcam._short_turns import leave_turns, short_turns, shorten_turns
 
 
-@pytest.mark.parametrize("order", itertools.permutations(("half", "one", "slow")))
+@pytest.mark.parametrize("order", [*itertools.permutations(("half", "one", "slow"))])
 def test_shortest_wanted_turn_holds_and_the_first_comes_back(order: tuple[str, ...]) -> None:
     before = sys.getswitchinterval()
     wanted = {"half": 0.0005, "one": 0.001, "slow": 1.0}
