@@ -1,7 +1,7 @@
 """Let Python's threads take turns more often, as long as somebody in the process wants that.
 
 A thread that works in Python keeps the others waiting for the interpreter's switch interval, by
-default 5 ms. An event loop beside such a thread is as late as that. The interval belongs to the process,
+default 5 ms, and an event loop beside it is as late as that. The interval belongs to the process,
 so all who want a shorter one share this module: the shortest of the wanted ones holds, and the one
 from before comes back when nobody wants one any more.
 """

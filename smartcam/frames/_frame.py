@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import operator
 import time
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -152,9 +153,11 @@ def changed(frame: Frame, **changes: object) -> Frame:
     """Return a frame with some attributes changed, in half the time of ``dataclasses.replace``.
 
     Args:
-        frame: frame that stays as it is.
+        frame: frame that stays as it is; one of a derived class keeps its class, in the usual time.
         **changes: new values by the names of the attributes.
     """
+    if type(frame) is not Frame:
+        return dataclasses.replace(frame, **cast("Any", changes))
     made = object.__new__(Frame)
     for put, value in zip(_setters, _values_of(frame), strict=True):
         put(made, value)

@@ -105,6 +105,7 @@ OTHERS: dict[str, str] = {
     "frames._v4l2": "structures of the kernel",
     "frames._video.frames": "pictures that FFmpeg has decoded",
     "inspection._picture": "files that OpenCV decodes",
+    "outlets._opcua.system": "entries that this program wrote, and groups of its files",
     "outlets._spool": "entries that this program wrote",
     "outlets._store": "entries that this program wrote",
     "inspection._teaching": "files that the reader of YAML has read before",

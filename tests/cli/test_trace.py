@@ -105,6 +105,7 @@ def test_trace_short_body_is_shown_with_its_error(tmp_path: Path) -> None:
     assert (error["direction"], error["hex"]) == ("!", "80020000")
 
 
+@pytest.mark.long
 def test_trace_probe_has_the_frames_of_every_try(tmp_path: Path) -> None:
     path = tmp_path / "trace.jsonl"
     with Peer() as peer:

@@ -117,7 +117,6 @@ async def test_all_pictures_are_in_files_that_follow_each_other_within_their_bou
     monkeypatch.setattr(folder_files, "STEP", 1)
     async with NumberedCamera() as box:
         options: dict[str, Any] = {
-            "source": "synthetic://",
             "pictures": "all",
             "size": 20_000.0,
             "keep": 60_000.0,

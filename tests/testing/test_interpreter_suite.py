@@ -269,7 +269,7 @@ MISTAKES: list[tuple[str, Any, ContainerSample, str]] = [
     ("test_longer_container_is_a_value_or_told", impatient, FOUR, "got KeyError"),
     ("test_longer_container_is_a_value_or_told", chatty, FOUR, "a text of"),
     ("test_any_bytes_are_a_value_or_told", trusting, FOUR, "got ValueError"),
-    ("test_numbers_that_are_none_are_in_no_pose", pose, POSE, "a pose that is none"),
+    ("test_poses_are_of_finite_numbers", pose, POSE, "a pose that is not finite"),
     ("test_any_context_is_borne", proud, FOUR, "got ZeroDivisionError"),
     ("test_containers_of_a_burst_are_read_as_one_by_one", Bursting, FOUR, "read_all() 0.25"),
     ("test_containers_of_a_burst_are_read_as_one_by_one", Short, FOUR, "gave 1 values"),

@@ -211,7 +211,7 @@ class VisionSystem:
         for text, names in ((external, self.settings.recipes), (internal, {})):
             if text in names:
                 found.add(names[text])
-            elif text.isascii() and text.isdecimal() and int(text) <= 0xFFFFFFFF:
+            elif text.isascii() and text.isdecimal() and int(text[:11]) <= 0xFFFFFFFF:
                 found.add(int(text))
             elif text:
                 known = ", ".join(self.settings.recipes) or "no names"

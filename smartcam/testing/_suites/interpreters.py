@@ -238,7 +238,7 @@ class InterpreterSuite(SaysWhatWasExpected):
 
         strategies.each_drawn(check)
 
-    def test_numbers_that_are_none_are_in_no_pose(self, sample: ContainerSample) -> None:
+    def test_poses_are_of_finite_numbers(self, sample: ContainerSample) -> None:
         """NaN or infinity, wherever they come, are an error where a robot would move to them."""
         interpreter = self.make(sample.layout)
         size = len(sample.data)
