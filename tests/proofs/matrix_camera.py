@@ -120,6 +120,12 @@ WITHHELD = frozenset(
 EVIDENCE = frozenset({"QueryAnswer", "StatusReport"})
 """What shows that the camera took a trigger, where its status has to be asked for."""
 
+CONFUSES = WITHHELD | {"TriggerAnswer before", "TriggerAnswer after"}
+"""What is done to evidence so that it cannot be told whose a result is."""
+
+ASKS_EVIDENCE = frozenset({"Query", "GetStatus"})
+"""Questions whose answers are evidence; one that the camera does not hear withholds it."""
+
 
 class _Mangling(NamedTuple):
     """What is done to a frame of the camera."""
@@ -270,7 +276,7 @@ def frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Cel
                 lost = world.transport == "udp" and family == "frame"
                 status = place.frame.message == "StatusReport"
                 allowed = (*SILENT, *one.allowed) if lost else one.allowed
-                if world.is_asked and place.frame.message in EVIDENCE and one.name in WITHHELD:
+                if world.is_asked and place.frame.message in EVIDENCE and one.name in CONFUSES:
                     allowed = (*allowed, e.OvertriggeredError)  # it cannot be told whose it is
                 fault = by_camera(
                     one.faults,
@@ -319,6 +325,8 @@ def request_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[C
         for label, (faults, allowed, harmless) in asked.items():
             # what breaks one frame may cost the next, and then an inspection has no input
             starved = (e.InputContainerError,) if name == "input" and not harmless else NONE
+            if world.is_asked and place.frame.message in ASKS_EVIDENCE and label in WITHHELD:
+                allowed = (*allowed, e.OvertriggeredError)  # it cannot be told whose it is
             held = sum(one.seconds for one in faults if isinstance(one, f.Delay)) if udp else 0.0
             fault = by_camera(
                 faults,
