@@ -22,7 +22,7 @@ from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
 from smartcam.inspection._measure.edges import noise_of
 from smartcam.inspection._picture import Picture
-from smartcam.inspection._places import PixelPose, place
+from smartcam.inspection._places import PixelPose, Region, place
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -305,6 +305,8 @@ def _mask(
             )
         mask, corner = region, (0, 0)
     else:
+        if region is not None:
+            check_kind(region, Region, "region", "a Region, a mask or None", "PartModel.teach")
         placed = place(region, None, picture.size)
         if placed.is_empty:
             raise TeachingError(
