@@ -48,6 +48,8 @@ if TYPE_CHECKING:
 
     from smartcam.inspection._locate.find import LocatedPart
 
+__all__ = ["Search", "locate"]
+
 SIDE = 260
 """Width and height of a scene, pixels."""
 
@@ -281,12 +283,12 @@ class Row(NamedTuple):
     scenes: int
     found: int
     false: int
-    median_px: float
-    rms_px: float
-    rms_degrees: float
-    ratio: float  # predicted over observed
-    over_bound: float  # observed over the bound
-    milliseconds: float
+    median_px: float = math.nan
+    rms_px: float = math.nan
+    rms_degrees: float = math.nan
+    ratio: float = math.nan  # predicted over observed
+    over_bound: float = math.nan  # observed over the bound
+    milliseconds: float = math.nan
 
     @property
     def good(self) -> bool:
@@ -343,7 +345,7 @@ def _row(
     model: PartModel,
 ) -> Row:
     if not trials:
-        return Row(kind, scenes, 0, false, *[math.nan] * 5, math.nan)
+        return Row(kind, scenes, 0, false)
     errors, sigmas = (np.array([one[which] for one in trials]) for which in (0, 1))
     fitted = [True, True, model.symmetry.fold != 0, kind.scales[1] > kind.scales[0]]
     ratio = 1 / math.sqrt(float(np.mean((errors[:, fitted] / sigmas[:, fitted]) ** 2)))

@@ -373,4 +373,5 @@ def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:
     cv2 = load("cv2", "inspection needs")
     hulls = [np.asarray(hull - one[0], np.float32) for hull in (one, other)]
     common, _ = cv2.intersectConvexConvex(*hulls)
-    return float(common) / max(min(cv2.contourArea(hull) for hull in hulls), 1e-6)
+    least = min(float(cv2.contourArea(hull)) for hull in hulls)
+    return float(common) / max(least, 1e-6)
