@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.inspection import Picture
-from smartcam.inspection._locate.find import Search, locate
+from smartcam.inspection._locate.find import PartSearch, locate
 from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.segments import pixels_in
 from tests.inspection.drawn_parts import (
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from smartcam.inspection._locate.find import LocatedPart
 
-__all__ = ["Search", "locate"]
+__all__ = ["PartSearch", "locate"]
 
 SIDE = 260
 """Width and height of a scene, pixels."""
@@ -103,10 +103,10 @@ class Kind:
     any_polarity: bool = False
 
     @property
-    def search(self) -> Search:
+    def search(self) -> PartSearch:
         """What is looked for."""
         least = 0.7 - self.covered
-        return Search(
+        return PartSearch(
             scales=self.scales, least_score=least, any_polarity=self.any_polarity, seconds=30.0
         )
 
@@ -378,7 +378,7 @@ def photographs(folder: Path, seed: int) -> tuple[int, list[str]]:
     files = sorted(one for one in folder.rglob("*") if one.suffix.lower() in {".jpg", ".png"})
     found = []
     for file in files:
-        parts = locate(Picture.read(file), models, Search(seconds=30.0)).parts
+        parts = locate(Picture.read(file), models, PartSearch(seconds=30.0)).parts
         found += [f"{file}: {part.name} {part.score:.2f}" for part in parts]
     return len(files), found
 
