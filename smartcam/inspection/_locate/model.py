@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from smartcam._arguments import check_number, check_path, check_text, wrong_argument
+from smartcam._arguments import check_kind, check_number, check_path, check_text, wrong_argument
 from smartcam._extras import load
 from smartcam._forks import cached_property
 from smartcam._whole_files import replace_file
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame
     from smartcam.geometry._inside import Array
-    from smartcam.inspection._places import Region
 
 VERSION: Final = 1
 """Version of the files of models."""
