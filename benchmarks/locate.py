@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.measure import Comparison, Goal, Series
 from smartcam.inspection import PartModel, Picture
-from smartcam.inspection._locate.find import Search, locate
+from smartcam.inspection._locate.find import PartSearch, locate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -98,7 +98,7 @@ def run(plan: Plan) -> Iterator[Comparison]:
 
 
 def _find(models: Sequence[PartModel], picture: NDArray[Any]) -> None:
-    locate(Picture(picture), models, Search(seconds=30.0))
+    locate(Picture(picture), models, PartSearch(seconds=30.0))
 
 
 def _took(work: Callable[[], object], count: int) -> float:

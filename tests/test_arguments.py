@@ -38,6 +38,7 @@ from smartcam.emulator import (
 from smartcam.fleet._inside import RecordSection
 from smartcam.frames import Codecs, FrameGroup, FrameSource, RateControl, RtpSender, RtspServer
 from smartcam.inspection import (
+    PartModel,
     Picture,
     Software,
     SoftwareDevice,
@@ -253,6 +254,9 @@ def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], 
     cell = load_cell(path)["cam"]
     camera: Any = smartcam.connect(f"software:{path}")
     program, teaching = cell.program(7), Teaching(path, "cam", 7)
+    square = np.full((80, 80), 60, np.uint8)
+    square[20:60, 20:60] = 180
+    part = PartModel.teach(square)
     software = {"software": Software.model_validate(CELL_OF_ONE)}
 
     def mistakes(name: Any = "cam", folder: Any = folder, **more: Any) -> Any:
@@ -261,6 +265,10 @@ def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], 
     return {
         "CellCamera.program": (cell.program, {}),
         "Inspection.payload": (program.inspect(frame).payload, {}),
+        "PartModel.predicted_sigma": (part.predicted_sigma, {}),
+        "PartModel.read": (PartModel.read, {}),
+        "PartModel.teach": (PartModel.teach, {"picture": square}),
+        "PartModel.write": (part.write, {}),
         "Picture.__init__": (Picture, {"pixels": np.zeros((4, 4), np.uint8)}),
         "Picture.of": (Picture.of, {}),
         "Picture.read": (Picture.read, {}),

@@ -132,7 +132,7 @@ class PlacedPart:
     size: float = field(default=70.0, compare=False)
 
 
-def shares(shape: tuple[int, int], parts: Sequence[PlacedPart], blur: float) -> Array:
+def shares(shape: tuple[int, ...], parts: Sequence[PlacedPart], blur: float) -> Array:
     """Return the light of parts (H, W), 0 for the background; exact to about 0.001 pixels."""
     canvas = np.zeros(shape)
     for part in parts:
@@ -151,7 +151,7 @@ def shares(shape: tuple[int, int], parts: Sequence[PlacedPart], blur: float) -> 
     return canvas
 
 
-def slopes(shape: tuple[int, int], part: PlacedPart, blur: float) -> Array:
+def slopes(shape: tuple[int, ...], part: PlacedPart, blur: float) -> Array:
     """Return the derivatives of a part's light (4, H, W) by its x, y, angle and scale."""
     corner, fine = _samples(part, blur)
     down, across = np.gradient(fine[..., 1].astype(float) * SAMPLES)
@@ -192,7 +192,8 @@ def _samples(part: PlacedPart, blur: float) -> tuple[tuple[int, int], NDArray[np
         share = (shape.inside(x, y) * part.scale * SAMPLES + 0.5).clip(0, 1).astype(np.float32)
         light += share * (np.float32(shape.level) - light)
         own = np.maximum(own, share)
-    return corner, cv2.GaussianBlur(np.dstack([own, light]), (0, 0), blur * SAMPLES)
+    blurred = cv2.GaussianBlur(np.dstack([own, light]), (0, 0), blur * SAMPLES)
+    return corner, np.asarray(blurred, np.float32)
 
 
 def _pixels(fine: NDArray[np.generic]) -> Array:
@@ -208,4 +209,5 @@ def photograph(light: Array, look: Look, random: np.random.Generator) -> NDArray
     top = 2**look.bits - 1
     levels = (look.dark + look.contrast * light + slope) * top / 255
     noisy = levels + random.normal(scale=max(look.noise, 1e-9) * top / 255, size=light.shape)
-    return np.rint(noisy).clip(0, top).astype(np.uint8 if look.bits == 8 else np.uint16)
+    pixels: Array = np.rint(noisy).clip(0, top)
+    return pixels.astype(np.uint8) if look.bits == 8 else pixels.astype(np.uint16)

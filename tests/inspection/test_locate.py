@@ -28,7 +28,7 @@ from smartcam.layout import Layout
 from smartcam.registry import INTERPRETERS
 from tests.inspection.cells import programs
 from tests.inspection.drawn_parts import PARTS, Look, PlacedPart, disc, photograph, shares
-from tests.proofs.locate import Search, locate
+from tests.proofs.locate import PartSearch, locate
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,6 +37,9 @@ if TYPE_CHECKING:
 
 TAUGHT = (100.3, 99.6)
 LOOK = Look(noise=2.0)
+
+LARGE = [("bracket", 1), ("hexagon", 6), ("washer", 0)]
+"""Parts that take long to teach, and the turns at which each is the same."""
 
 
 def drawn(*parts: PlacedPart, look: Look = LOOK, side: int = 200, seed: int = 1) -> Any:
@@ -60,7 +63,7 @@ def truth(name: str, part: PlacedPart) -> tuple[float, float]:
 
 def one_of(picture: NDArray[np.generic], name: str, **search: Any) -> LocatedPart:
     """Return the one part in a picture."""
-    (found,) = locate(Picture(picture), [model_of(name)], Search(seconds=30.0, **search)).parts
+    (found,) = locate(Picture(picture), [model_of(name)], PartSearch(seconds=30.0, **search)).parts
     return found
 
 
@@ -79,7 +82,11 @@ def assert_right(found: LocatedPart, name: str, part: PlacedPart) -> None:
 
 @pytest.mark.parametrize(
     ("name", "fold"),
-    [("bracket", 1), ("bolt", 1), ("square", 4), ("hexagon", 6), ("washer", 0)],
+    [
+        ("bolt", 1),
+        ("square", 4),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in LARGE),
+    ],
 )
 def test_symmetry_is_found_and_said(name: str, fold: int) -> None:
     model = model_of(name)
@@ -91,11 +98,13 @@ def test_symmetry_is_found_and_said(name: str, fold: int) -> None:
     assert math.isnan(angle) == (fold == 0)
 
 
+@pytest.mark.long
 def test_symmetric_part_turns_about_its_middle() -> None:
     for name in ("square", "hexagon", "washer"):
         assert math.dist(model_of(name).reference, TAUGHT) < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("levels", "region", "why"),
     [
@@ -128,6 +137,7 @@ def _corners(x: float, y: float, width: float, height: float) -> list[tuple[floa
     return [(x, y), (x + width, y), (x + width, y + height), (x, y + height)]
 
 
+@pytest.mark.long
 def test_mask_chooses_what_is_taught() -> None:
     picture = drawn(PlacedPart(PARTS["hexagon"], 60, 60), PlacedPart(PARTS["bolt"], 150, 150))
     mask = np.zeros(picture.shape, bool)
@@ -147,7 +157,7 @@ def test_model_is_the_same_from_its_file(tmp_path: Path) -> None:
     assert (again.name, again.symmetry) == ("bolt", Symmetry(1))
     part = PlacedPart(PARTS["bolt"], 95.2, 103.7, 1.2)
     first, second = (
-        locate(Picture(drawn(part)), [one], Search()).parts[0] for one in (model, again)
+        locate(Picture(drawn(part)), [one], PartSearch()).parts[0] for one in (model, again)
     )
     assert np.allclose(first.pose, second.pose, atol=1e-4)
 
@@ -185,7 +195,14 @@ def test_file_that_cannot_be_read_is_told(tmp_path: Path) -> None:
 # ---------------------------------------------------------------------- finding
 
 
-@pytest.mark.parametrize("name", ["bracket", "bolt", "square", "washer"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bolt",
+        "square",
+        *(pytest.param(one, marks=pytest.mark.long) for one in ("bracket", "washer")),
+    ],
+)
 @pytest.mark.parametrize("angle", [0.0, 2.1, -1.234])
 def test_pose_is_right_by_its_own_sigma(name: str, angle: float) -> None:
     part = PlacedPart(PARTS[name], 98.37, 101.81, angle)
@@ -195,6 +212,7 @@ def test_pose_is_right_by_its_own_sigma(name: str, angle: float) -> None:
     assert not found.doubt
 
 
+@pytest.mark.long
 def test_scale_is_found() -> None:
     part = PlacedPart(PARTS["tee"], 100.0, 104.4, -0.7, 1.17)
     found = one_of(drawn(part, side=220), "tee", scales=(0.8, 1.25))
@@ -202,6 +220,7 @@ def test_scale_is_found() -> None:
     assert 0 < found.sigmas[3] < 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "look",
     [
@@ -215,10 +234,11 @@ def test_scale_is_found() -> None:
 def test_light_noise_and_blur_may_change(look: Look) -> None:
     part = PlacedPart(PARTS["bracket"], 98.37, 101.81, 0.6)
     picture = Picture(drawn(part, look=look), depth=look.bits)
-    (found,) = locate(picture, [model_of("bracket")], Search(seconds=30.0)).parts
+    (found,) = locate(picture, [model_of("bracket")], PartSearch(seconds=30.0)).parts
     assert math.dist(found.pose[:2], truth("bracket", part)) < 5 * max(found.sigmas[:2])
 
 
+@pytest.mark.long
 def test_part_may_be_covered_in_part() -> None:
     part = PlacedPart(PARTS["bracket"], 98.37, 101.81, 0.6)
     picture = drawn(part)
@@ -229,30 +249,35 @@ def test_part_may_be_covered_in_part() -> None:
     assert math.dist(found.pose[:2], truth("bracket", part)) < 0.1
 
 
+@pytest.mark.long
 def test_polarity_decides_whether_the_negative_is_found() -> None:
     part = PlacedPart(PARTS["bracket"], 98.37, 101.81, 0.6)
     picture = drawn(part, look=Look(dark=200, contrast=-120))
     assert_right(one_of(picture, "bracket", any_polarity=True), "bracket", part)
-    assert not locate(Picture(picture), [model_of("bracket")], Search()).parts
+    assert not locate(Picture(picture), [model_of("bracket")], PartSearch()).parts
 
 
+@pytest.mark.long
 def test_most_and_overlap_limit_what_is_found() -> None:
     parts = [PlacedPart(PARTS["bolt"], x, y, x) for x, y in ((80, 80), (220, 90), (150, 220))]
     picture = Picture(drawn(*parts, side=300))
     for most in (1, 2, 3, 5):
-        found = locate(picture, [model_of("bolt")], Search(most=most, seconds=30.0)).parts
+        found = locate(picture, [model_of("bolt")], PartSearch(most=most, seconds=30.0)).parts
         assert len(found) == min(most, 3)
     for one in found:
         assert min(math.dist(one.pose[:2], truth("bolt", part)) for part in parts) < 0.1
 
 
+@pytest.mark.long
 def test_several_models_are_told_apart() -> None:
     parts = {
         "bolt": PlacedPart(PARTS["bolt"], 80, 80, 1),
         "tee": PlacedPart(PARTS["tee"], 200, 180),
     }
     models = [model_of(name) for name in ("bolt", "tee", "square")]
-    found = locate(Picture(drawn(*parts.values(), side=300)), models, Search(seconds=30.0)).parts
+    found = locate(
+        Picture(drawn(*parts.values(), side=300)), models, PartSearch(seconds=30.0)
+    ).parts
     assert sorted(one.name for one in found) == ["bolt", "tee"]
     for one in found:
         assert_right(one, one.name, parts[one.name])
@@ -261,22 +286,23 @@ def test_several_models_are_told_apart() -> None:
 def test_ranges_exclude_other_poses() -> None:
     picture = Picture(drawn(PlacedPart(PARTS["bolt"], 100, 100, 1.0)))
     for angles, count in (((0.8, 1.2), 1), ((-0.5, 0.5), 0), ((0.9 + 2 * math.pi, 7.5), 1)):
-        found = locate(picture, [model_of("bolt")], Search(angles=angles, seconds=30.0))
+        found = locate(picture, [model_of("bolt")], PartSearch(angles=angles, seconds=30.0))
         assert len(found.parts) == count
 
 
 def test_what_was_nearest_is_told_with_the_reason() -> None:
     picture = drawn(PlacedPart(PARTS["bolt"], 100, 100, 1.0))
     picture[100:, :] = 60
-    found = locate(Picture(picture), [model_of("bolt")], Search(seconds=30.0))
+    found = locate(Picture(picture), [model_of("bolt")], PartSearch(seconds=30.0))
     assert not found.parts
     assert found.nearest is not None
     assert "% of its edges" in found.nearest.refusal
     assert found.nearest.score < 0.7
-    nothing = locate(Picture(drawn()), [model_of("bolt")], Search())
+    nothing = locate(Picture(drawn()), [model_of("bolt")], PartSearch())
     assert (nothing.parts, nothing.nearest) == ((), None)
 
 
+@pytest.mark.long
 def test_part_that_may_be_turned_otherwise_is_in_doubt() -> None:
     shapes = (*PARTS["square"], disc(0.0, 28, 0, 6))
     taught = PartModel.teach(drawn(PlacedPart(shapes, *TAUGHT)), name="key")
@@ -284,11 +310,11 @@ def test_part_that_may_be_turned_otherwise_is_in_doubt() -> None:
     assert taught.symmetry.alike
     assert "must be in sight" in taught.symmetry.text()
     clear = drawn(PlacedPart(shapes, 98, 101, 0.3))
-    (found,) = locate(Picture(clear), [taught], Search(seconds=30.0)).parts
+    (found,) = locate(Picture(clear), [taught], PartSearch(seconds=30.0)).parts
     assert not found.doubt
     assert abs(found.pose.angle - 0.3) < 0.01
     hidden = drawn(PlacedPart(PARTS["square"], 98, 101, 0.3))
-    (found,) = locate(Picture(hidden), [taught], Search(seconds=30.0)).parts
+    (found,) = locate(Picture(hidden), [taught], PartSearch(seconds=30.0)).parts
     assert "turned by" in found.doubt
 
 
@@ -304,12 +330,12 @@ def test_part_that_may_be_turned_otherwise_is_in_doubt() -> None:
     ],
 )
 def test_picture_without_a_part_gives_none(picture: NDArray[np.generic]) -> None:
-    assert not locate(Picture(picture), [model_of("bolt")], Search(seconds=30.0)).parts
+    assert not locate(Picture(picture), [model_of("bolt")], PartSearch(seconds=30.0)).parts
 
 
 def test_part_half_outside_is_none() -> None:
     picture = drawn(PlacedPart(PARTS["bolt"], 2, 100, 1.0))
-    assert not locate(Picture(picture), [model_of("bolt")], Search(seconds=30.0)).parts
+    assert not locate(Picture(picture), [model_of("bolt")], PartSearch(seconds=30.0)).parts
 
 
 # ---------------------------------------------------------------------- the tool
@@ -346,6 +372,7 @@ def test_results_are_localizations(tmp_path: Path) -> None:
     assert reader.read(nothing.payload(), Context(camera="cam", number=2)) == []
 
 
+@pytest.mark.long
 def test_part_is_taught_from_a_picture_in_the_cell(tmp_path: Path) -> None:
     picture = drawn(
         PlacedPart(PARTS["bolt"], *TAUGHT), PlacedPart(PARTS["washer"], 250, 100), side=320
@@ -375,6 +402,7 @@ def test_mistake_in_the_settings_is_told(tmp_path: Path, said: str, text: str) -
         programs(tmp_path, f"7: {{locate: {{{said}}}}}")
 
 
+@pytest.mark.long
 def test_region_and_number_are_kept_to(tmp_path: Path) -> None:
     said = written(tmp_path, "bolt")
     picture = drawn(*(PlacedPart(PARTS["bolt"], x, 80, x) for x in (80, 220)), side=300)
@@ -386,6 +414,7 @@ def test_region_and_number_are_kept_to(tmp_path: Path) -> None:
     assert not programs(tmp_path, app % ("[3, 5]", [0, 0, 300, 300]))[7].inspect(picture).ok
 
 
+@pytest.mark.long
 def test_other_tools_follow_the_part(tmp_path: Path) -> None:
     said = written(tmp_path, "bracket")
     model = model_of("bracket")
@@ -401,6 +430,7 @@ def test_other_tools_follow_the_part(tmp_path: Path) -> None:
     assert abs(found.value.measure_diameter - 24) < 0.1
 
 
+@pytest.mark.long
 def test_calibration_leads_to_the_robots_millimetres(tmp_path: Path) -> None:
     pixels = np.array([(0, 0), (200, 0), (200, 200), (0, 200), (100, 50)], float)
     robot = np.column_stack(

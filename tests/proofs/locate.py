@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.inspection import Picture
-from smartcam.inspection._locate.find import Search, locate
+from smartcam.inspection._locate.find import PartSearch, locate
 from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.segments import pixels_in
 from tests.inspection.drawn_parts import (
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from smartcam.inspection._locate.find import LocatedPart
+
+__all__ = ["PartSearch", "locate"]
 
 SIDE = 260
 """Width and height of a scene, pixels."""
@@ -101,10 +103,10 @@ class Kind:
     any_polarity: bool = False
 
     @property
-    def search(self) -> Search:
+    def search(self) -> PartSearch:
         """What is looked for."""
         least = 0.7 - self.covered
-        return Search(
+        return PartSearch(
             scales=self.scales, least_score=least, any_polarity=self.any_polarity, seconds=30.0
         )
 
@@ -281,12 +283,12 @@ class Row(NamedTuple):
     scenes: int
     found: int
     false: int
-    median_px: float
-    rms_px: float
-    rms_degrees: float
-    ratio: float  # predicted over observed
-    over_bound: float  # observed over the bound
-    milliseconds: float
+    median_px: float = math.nan
+    rms_px: float = math.nan
+    rms_degrees: float = math.nan
+    ratio: float = math.nan  # predicted over observed
+    over_bound: float = math.nan  # observed over the bound
+    milliseconds: float = math.nan
 
     @property
     def good(self) -> bool:
@@ -343,7 +345,7 @@ def _row(
     model: PartModel,
 ) -> Row:
     if not trials:
-        return Row(kind, scenes, 0, false, *[math.nan] * 5, math.nan)
+        return Row(kind, scenes, 0, false)
     errors, sigmas = (np.array([one[which] for one in trials]) for which in (0, 1))
     fitted = [True, True, model.symmetry.fold != 0, kind.scales[1] > kind.scales[0]]
     ratio = 1 / math.sqrt(float(np.mean((errors[:, fitted] / sigmas[:, fitted]) ** 2)))
@@ -376,7 +378,7 @@ def photographs(folder: Path, seed: int) -> tuple[int, list[str]]:
     files = sorted(one for one in folder.rglob("*") if one.suffix.lower() in {".jpg", ".png"})
     found = []
     for file in files:
-        parts = locate(Picture.read(file), models, Search(seconds=30.0)).parts
+        parts = locate(Picture.read(file), models, PartSearch(seconds=30.0)).parts
         found += [f"{file}: {part.name} {part.score:.2f}" for part in parts]
     return len(files), found
 

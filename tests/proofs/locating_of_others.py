@@ -52,7 +52,8 @@ def taught_picture() -> NDArray[np.uint8]:
 
 def match_template(picture: NDArray[np.uint8]) -> Pose | None:
     """Find the part by correlation, in steps of 3 degrees at half the size, then of half one."""
-    small = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    half = cv2.resize(picture, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    small = np.asarray(half, np.uint8)
     rough = max(_correlated(small, one, 0.5) for one in np.arange(0.0, 360.0, 3.0))
     near = (_correlated(picture, rough[3] + one, 1.0) for one in np.arange(-2.0, 2.1, 0.5))
     score, x, y, degrees = max(near)
@@ -75,8 +76,8 @@ def _correlated(
 
 def _turned(degrees: float) -> NDArray[np.uint8]:
     turn = cv2.getRotationMatrix2D((MIDDLE, MIDDLE), -degrees, 1.0)
-    turned: Any = cv2.warpAffine(taught_picture(), turn, (200, 200), borderValue=60)
-    return turned
+    turned = cv2.warpAffine(taught_picture(), turn, (200, 200), borderValue=60)
+    return np.asarray(turned, np.uint8)
 
 
 def ecc(picture: NDArray[np.uint8]) -> Pose | None:
@@ -91,8 +92,9 @@ def ecc(picture: NDArray[np.uint8]) -> Pose | None:
     motion = np.array([[cos, -sin, 0.0], [sin, cos, 0.0]], np.float32)
     motion[:, 2] = np.array(start[:2]) - motion[:, :2] @ [corner, corner]
     end = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-6)
+    everywhere = np.full(picture.shape, 255, np.uint8)
     try:
-        cv2.findTransformECC(taught, picture, motion, cv2.MOTION_EUCLIDEAN, end, None, 5)
+        cv2.findTransformECC(taught, picture, motion, cv2.MOTION_EUCLIDEAN, end, everywhere, 5)
     except cv2.error:
         return start
     x, y = (motion[:, :2] @ [corner, corner] + motion[:, 2]).tolist()
@@ -151,7 +153,9 @@ def scenes(count: int, seed: int) -> Iterator[tuple[NDArray[np.uint8], PlacedPar
         yield photograph(scene.light, Look(noise=5.0), random).astype(np.uint8), scene.part
         others = [one for one in PARTS if one not in {"bracket", "tee"}]
         places = random.uniform(50, judge.SIDE - 50, (3, 2)).tolist()
-        parts = [PlacedPart(PARTS[str(random.choice(others))], *at, number) for at in places]
+        parts = [
+            PlacedPart(PARTS[str(random.choice(others))], x, y, float(number)) for x, y in places
+        ]
         light = shares((judge.SIDE, judge.SIDE), parts, 0.8)
         yield photograph(light, Look(noise=5.0), random).astype(np.uint8), None
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from tests.inspection.drawn_parts import shares, slopes
 from tests.proofs import locate
 from tests.strategies import over
 
@@ -31,15 +34,15 @@ def test_clean_scenes_are_right_to_a_fraction_of_a_pixel() -> None:
 def test_derivatives_of_the_drawing_are_right() -> None:
     random = np.random.default_rng(1)
     part = locate.scene_of(locate.KINDS[0], random).part
-    slopes = locate.slopes((locate.SIDE, locate.SIDE), part, 0.8)
+    drawn = slopes((locate.SIDE, locate.SIDE), part, 0.8)
     for number, (name, step) in enumerate((("x", 0.01), ("y", 0.01), ("angle", 1e-4))):
         after, before = (
-            locate.shares(
+            shares(
                 (locate.SIDE, locate.SIDE),
-                [locate.dataclasses.replace(part, **{name: getattr(part, name) + way})],
+                [dataclasses.replace(part, **{name: getattr(part, name) + way})],
                 0.8,
             )
             for way in (step, -step)
         )
         numeric = (after - before) / (2 * step)
-        assert np.abs(numeric - slopes[number]).max() < 0.1 * np.abs(numeric).max()
+        assert np.abs(numeric - drawn[number]).max() < 0.1 * np.abs(numeric).max()

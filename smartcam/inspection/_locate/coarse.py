@@ -64,7 +64,7 @@ NOISE_RESPONSE: Final = 12.0
 """Standard deviations of the noise in Sobel's response, above which it has a direction."""
 
 
-class Candidate(NamedTuple):
+class RoughPlace(NamedTuple):
     """A place where a part may be."""
 
     x: float  # pixels of the picture
@@ -227,14 +227,14 @@ class PicturePyramid:
 
 def find_candidates(
     pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges, most: int
-) -> tuple[list[Candidate], Candidate | None]:
+) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the places where a part may be, the best first, and the best of those refused.
 
     Each is right to about a pixel.
     """
     top = model.top
     found = list(_everywhere(pyramid, model, ranges))
-    refused: Candidate | None = None
+    refused: RoughPlace | None = None
     found, refused = _best(found, TOP_SHARE * ranges.least_score, 2.0**top, MAX_CANDIDATES, None)
     for level in range(top - 1, 0, -1):
         if not found:
@@ -246,7 +246,9 @@ def find_candidates(
     return found, refused
 
 
-def _everywhere(pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges) -> Iterator[Candidate]:
+def _everywhere(
+    pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges
+) -> Iterator[RoughPlace]:
     """Yield places at the smallest level, of all angles and scales."""
     top = model.top
     maps = pyramid.agreement(top, ranges.contrast, any_polarity=ranges.any_polarity)
@@ -264,7 +266,7 @@ def _everywhere(pyramid: PicturePyramid, model: CoarseModel, ranges: Ranges) -> 
             closes = closed and len(part) == len(angles)
             for turn, y, x, total in table.peaks(stack, least, closes=closes):
                 score = total / (4 * len(points))
-                yield Candidate(x * 2**top, y * 2**top, float(part[turn]), scale, score)
+                yield RoughPlace(x * 2**top, y * 2**top, float(part[turn]), scale, score)
 
 
 class _AgreementTable:
@@ -339,8 +341,8 @@ def _followed(
     model: CoarseModel,
     ranges: Ranges,
     level: int,
-    places: list[Candidate],
-) -> list[Candidate]:
+    places: list[RoughPlace],
+) -> list[RoughPlace]:
     """Return the best poses about places of the level above, at a level."""
     nx, ny = pyramid.units(level, ranges.contrast)
     points, normals = _thinned(model.points[level], model.normals[level], MAX_POINTS)
@@ -362,7 +364,7 @@ def _followed(
         row = number * len(ways) + way
         x, y = at[row] + OFFSETS[offset]
         found.append(
-            Candidate(
+            RoughPlace(
                 float(x) * 2**level,
                 float(y) * 2**level,
                 float(angles[row]),
@@ -408,14 +410,14 @@ def _scores(
 
 
 def _best(
-    places: list[Candidate],
+    places: list[RoughPlace],
     least: float,
     pixel: float,
     most: int,
-    refused: Candidate | None,
-) -> tuple[list[Candidate], Candidate | None]:
+    refused: RoughPlace | None,
+) -> tuple[list[RoughPlace], RoughPlace | None]:
     """Return the best places, each once, and the best of those that are too bad."""
-    kept: list[Candidate] = []
+    kept: list[RoughPlace] = []
     for one in sorted(places, key=lambda one: -one.score):
         if one.score < least:
             if refused is None or one.score > refused.score:
@@ -428,7 +430,7 @@ def _best(
     return kept, refused
 
 
-def _alike(one: Candidate, other: Candidate, pixel: float) -> bool:
+def _alike(one: RoughPlace, other: RoughPlace, pixel: float) -> bool:
     near = math.hypot(one.x - other.x, one.y - other.y) <= 2 * pixel
     turned = abs(math.remainder(one.angle - other.angle, 2 * math.pi))
     return near and turned < 0.12 and abs(math.log(one.scale / other.scale)) < 0.1

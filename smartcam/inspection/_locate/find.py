@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from smartcam.geometry._inside import Array
-    from smartcam.inspection._locate.coarse import Candidate
+    from smartcam.inspection._locate.coarse import RoughPlace
     from smartcam.inspection._locate.fine import FinePose
     from smartcam.inspection._locate.model import PartModel
     from smartcam.inspection._picture import Picture
@@ -48,7 +48,7 @@ RANGE_MARGIN: Final = math.radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Search:
+class PartSearch:
     """The poses that are looked for, and what counts as found.
 
     Attributes:
@@ -128,7 +128,7 @@ class Located:
 def locate(
     picture: Picture,
     models: Sequence[PartModel],
-    search: Search,
+    search: PartSearch,
     *,
     box: tuple[int, int, int, int] | None = None,
     allowed: Callable[[tuple[float, float]], bool] | None = None,
@@ -139,13 +139,13 @@ def locate(
     may be at a place of it.
     """
     end = time.monotonic() + search.seconds
-    looks: dict[tuple[int, int, int, int], _Look] = {}
+    looks: dict[tuple[int, int, int, int], _SearchedPicture] = {}
     parts: list[LocatedPart] = []
     refused: list[LocatedPart] = []
     for model in models:
         area = _area(picture, box, model.radius * search.scales[1])
         if area not in looks:
-            looks[area] = _Look(picture, area)
+            looks[area] = _SearchedPicture(picture, area)
         found, bad = looks[area].find(model, search, end, allowed)
         parts += found
         refused += bad
@@ -171,7 +171,7 @@ def _area(
     )
 
 
-class _Look:
+class _SearchedPicture:
     """One look at a part of a picture, for any number of models."""
 
     def __init__(self, picture: Picture, area: tuple[int, int, int, int]) -> None:
@@ -186,7 +186,7 @@ class _Look:
     def find(
         self,
         model: PartModel,
-        search: Search,
+        search: PartSearch,
         end: float,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> tuple[list[LocatedPart], list[LocatedPart]]:
@@ -210,12 +210,12 @@ class _Look:
         kept = _apart(found, search.overlap)[: search.most]
         return [self._without_doubt(model, one, search, ranges.contrast) for one in kept], bad
 
-    def _moved(self, one: Candidate) -> Candidate:
+    def _moved(self, one: RoughPlace) -> RoughPlace:
         """Return a candidate in the whole picture's pixels."""
         return one._replace(x=one.x + self._corner[0], y=one.y + self._corner[1])
 
     def _fit(
-        self, model: PartModel, start: PixelPose, search: Search, contrast: float
+        self, model: PartModel, start: PixelPose, search: PartSearch, contrast: float
     ) -> FinePose | None:
         use = FineSettings(
             contrast * self._unit,
@@ -229,8 +229,8 @@ class _Look:
     def _fitted(
         self,
         model: PartModel,
-        one: Candidate,
-        search: Search,
+        one: RoughPlace,
+        search: PartSearch,
         contrast: float,
         allowed: Callable[[tuple[float, float]], bool] | None,
     ) -> LocatedPart:
@@ -254,7 +254,7 @@ class _Look:
         return dataclasses.replace(part, refusal=refusal)
 
     def _without_doubt(
-        self, model: PartModel, part: LocatedPart, search: Search, contrast: float
+        self, model: PartModel, part: LocatedPart, search: PartSearch, contrast: float
     ) -> LocatedPart:
         """Return a part with the doubt whether it is turned otherwise."""
         for angle, share in model.symmetry.alike:
@@ -270,7 +270,7 @@ class _Look:
         return part
 
 
-def ranges_of(model: PartModel, search: Search) -> Ranges:
+def ranges_of(model: PartModel, search: PartSearch) -> Ranges:
     """Return the ranges of the coarse search for a model."""
     taught = float(np.median(model.segments.heights))
     contrast = search.contrast
@@ -315,14 +315,14 @@ def _turned(pose: PixelPose, about: tuple[float, float], angle: float) -> PixelP
     return PixelPose(float(place[0]), float(place[1]), pose.angle + angle, pose.scale)
 
 
-def _too_little(score: float, fine: FinePose, search: Search) -> str:
+def _too_little(score: float, fine: FinePose, search: PartSearch) -> str:
     text = f"{100 * score:.0f} % of its edges are seen, expected {100 * search.least_score:.0f} %"
     if fine.reversed > 0.1:
         text += f"; {100 * fine.reversed:.0f} % are there with dark and bright exchanged"
     return text
 
 
-def _unfitted(model: PartModel, one: Candidate, search: Search, why: str) -> LocatedPart:
+def _unfitted(model: PartModel, one: RoughPlace, search: PartSearch, why: str) -> LocatedPart:
     pose = PixelPose(one.x, one.y, math.remainder(one.angle, model.symmetry.period), one.scale)
     return LocatedPart(
         name=model.name,
@@ -336,7 +336,7 @@ def _unfitted(model: PartModel, one: Candidate, search: Search, why: str) -> Loc
     )
 
 
-def _in_ranges(pose: PixelPose, model: PartModel, search: Search) -> bool:
+def _in_ranges(pose: PixelPose, model: PartModel, search: PartSearch) -> bool:
     """Return True if a pose is one of those that are looked for."""
     low, high = search.angles
     if model.symmetry.fold and high - low < model.symmetry.period - 1e-9:
@@ -347,13 +347,13 @@ def _in_ranges(pose: PixelPose, model: PartModel, search: Search) -> bool:
     return least * (1 - RANGE_MARGIN) <= pose.scale <= most * (1 + RANGE_MARGIN)
 
 
-def _is_enough(found: Sequence[LocatedPart], one: Candidate, search: Search) -> bool:
+def _is_enough(found: Sequence[LocatedPart], one: RoughPlace, search: PartSearch) -> bool:
     """Return True if a place cannot be better than the parts that were found already."""
     best = sorted(part.score for part in found)[-search.most :]
     return len(best) == search.most and one.score < best[0] - SCORE_MARGIN
 
 
-def _is_near(one: Candidate, other: LocatedPart) -> bool:
+def _is_near(one: RoughPlace, other: LocatedPart) -> bool:
     """Return True if a candidate is a part that was found already."""
     turned = abs(math.remainder(one.angle - other.pose.angle, 2 * math.pi))
     return math.hypot(one.x - other.pose.x, one.y - other.pose.y) < 4 and turned < 0.1
@@ -373,4 +373,5 @@ def _covered(one: NDArray[Any], other: NDArray[Any]) -> float:
     cv2 = load("cv2", "inspection needs")
     hulls = [np.asarray(hull - one[0], np.float32) for hull in (one, other)]
     common, _ = cv2.intersectConvexConvex(*hulls)
-    return float(common) / max(min(cv2.contourArea(hull) for hull in hulls), 1e-6)
+    least = min(float(cv2.contourArea(hull)) for hull in hulls)
+    return float(common) / max(least, 1e-6)

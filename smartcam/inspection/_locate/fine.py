@@ -96,9 +96,9 @@ def fit_pose(
     ``levels`` (H, W) is the picture.
     """
     pose, free = start, np.array([True, True, use.turned, use.scaled])
-    widened, pixels = 0.0, None
+    widened, pixels = 0.0, pixels_in(bands, _matrix(start), levels)
     for number in range(MAX_STEPS):
-        if number < 4 or pixels is None:
+        if 0 < number < 4:
             pixels = pixels_in(bands, _matrix(pose), levels)
         first = FIRST_BLURS_PX[number] if number < len(FIRST_BLURS_PX) else None
         fit, blurs = _steps(pixels, segments, pose, widened, first)
@@ -269,7 +269,7 @@ def _result(
         kept = seen & (off <= CUT * spread * sigmas)
         if np.count_nonzero(kept) < MIN_SEEN:
             return None
-        freedom = max(np.count_nonzero(kept) - np.count_nonzero(free), 1)
+        freedom = max(int(kept.sum()) - int(free.sum()), 1)
         chi_square = float(((off[kept] / sigmas[kept]) ** 2).sum()) / freedom
         spread = max(math.sqrt(chi_square), 1.0)
     solved = _least_squares(rows[kept], fit.shifts[kept], weights[kept], free)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from smartcam._arguments import check_path, check_text, wrong_argument
+from smartcam._arguments import check_kind, check_number, check_path, check_text, wrong_argument
 from smartcam._extras import load
 from smartcam._forks import cached_property
 from smartcam._whole_files import replace_file
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from smartcam.frames import Frame
     from smartcam.geometry._inside import Array
-    from smartcam.inspection._places import Region
 
 VERSION: Final = 1
 """Version of the files of models."""
@@ -74,6 +73,9 @@ LEVEL_RESPONSE: Final = 0.8
 
 NOISES: Final = 6.0
 """Standard deviations of the noise that a taught edge's contrast has at least."""
+
+MAX_LEVEL: Final = 255.0
+"""Contrast or noise that may be given at most, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
 """Grey levels of 255 of a taught edge at least, where nothing else is said."""
@@ -133,6 +135,8 @@ class PartModel:
             MissingExtraError: the extra ``inspection`` is not installed.
         """
         name = check_text(name, "name", "PartModel.teach")
+        if contrast is not None:
+            contrast = check_number(contrast, "contrast", 0, MAX_LEVEL, "PartModel.teach")
         return _taught(Picture.of(picture), region, name, contrast)
 
     @classmethod
@@ -189,6 +193,8 @@ class PartModel:
             Standard deviations of the place along its worst direction, pixels, and of the angle,
             radians.
         """
+        if noise is not None:
+            noise = check_number(noise, "noise", 0, MAX_LEVEL, "PartModel.predicted_sigma")
         part = 1.0 if noise is None else math.hypot(1.0, noise / max(self.noise, 0.01))
         sigmas = self.segments.sigmas * (math.sqrt(2) if noise is None else part)
         arms, normals = self.segments.middles, self.segments.normals

@@ -175,7 +175,7 @@ def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> St
         product = factors[0]
         for one in factors[1:]:
             product = product * one
-        return np.bincount(owners, product, count)
+        return np.bincount(owners, product, count).astype(np.float64, copy=False)
 
     columns = (rise, slope)
     number = np.bincount(owners, minlength=count).astype(np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.inspection._finding import Drawing, Finding
-from smartcam.inspection._locate.find import Located, LocatedPart, Search, locate
+from smartcam.inspection._locate.find import Located, LocatedPart, PartSearch, locate
 from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.settings import MAX_PARTS, LocateSettings
 from smartcam.inspection._measure.planes import PIXELS, robot_plane_of
@@ -76,7 +76,7 @@ class Locate(Tool[LocateSettings]):
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
         self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS
-        self._search = Search(
+        self._search = PartSearch(
             angles=settings.angles,
             scales=settings.scale,
             most=settings.most,
