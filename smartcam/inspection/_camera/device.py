@@ -79,7 +79,9 @@ class SoftwareDevice(Server):
         quirks: dict[str, Any] | None = None,
         seed: int | None = None,
     ) -> None:
-        self.camera = check_kind(camera, CellCamera, "camera", "a CellCamera", "SoftwareDevice")
+        self.camera: CellCamera = check_kind(
+            camera, CellCamera, "camera", "a CellCamera", "SoftwareDevice"
+        )
         protocol = check_choice(protocol, "protocol", ("bvs", "insight"), "SoftwareDevice")
         port = check_port(port, "SoftwareDevice")
         if quirks is not None:

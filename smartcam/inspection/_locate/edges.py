@@ -170,7 +170,7 @@ def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: floa
     """
     count = len(rough.halves)
     shifted, good = rough, np.ones(count, dtype=np.bool_)
-    noise = np.full(count, ROUNDING)
+    noise, sigmas = np.full(count, ROUNDING), np.full(count, np.inf)
     identity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     for _ in range(FITS):
         pixels = pixels_in(make_bands(shifted, points), identity, levels)

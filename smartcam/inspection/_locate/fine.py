@@ -264,7 +264,7 @@ def _result(
     off = np.abs(fit.shifts)
     sigmas = np.where(weights > 0, 1 / np.sqrt(np.maximum(weights, 1e-12)), np.inf)
     seen = edges & (off <= SEEN_PX + CUT * np.minimum(sigmas, 1.0))
-    spread = 1.0
+    kept, freedom, chi_square, spread = seen, 1, 1.0, 1.0
     for _ in range(3):
         kept = seen & (off <= CUT * spread * sigmas)
         if np.count_nonzero(kept) < MIN_SEEN:

@@ -101,7 +101,7 @@ def make_bands(segments: Segments, others: Array) -> Bands:
     owner_of[nearest[free == 0]] = seeds[free == 0]
     labels = owner_of[nearest]
     rows, columns = np.nonzero((labels >= 0) & (distance <= BAND_PX + 1))
-    mine = labels[rows, columns]
+    mine = labels[rows, columns].astype(np.intp)
     across, along = segments.places(np.column_stack([columns, rows]) + low, mine)
     within = (np.abs(across) <= BAND_PX) & (np.abs(along) <= segments.halves[mine] + 0.5)
     kept = np.full(labels.shape, -1, np.int16)

@@ -113,8 +113,8 @@ def _least(shares: Array, count: int) -> float:
     """Return the part of the outline that each turn of a fold brings onto itself at least."""
     if count == 0:
         return float(shares.min())
-    turns = np.rint(TURNS * np.arange(1, count) / count).astype(int)
-    around = (turns[:, None] + [-1, 0, 1]) % TURNS
+    turns = np.rint(TURNS * np.arange(1, count) / count).astype(np.intp)
+    around = np.mod(turns[:, None] + np.arange(-1, 2, dtype=np.intp), TURNS)
     return float(shares[around].max(axis=1).min())
 
 

@@ -232,7 +232,8 @@ def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
     text = f"{part.name} {100 * part.score:.0f} %"
     marks = [Drawing("polygon", _points(part.hull), role, text)]
     marks.append(Drawing("line", _points(axes), role))
-    for places, which in ((part.edges, role), (part.missing, "hint")):
+    shown: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
+    for places, which in shown:
         if len(places):
             kept = np.linspace(0, len(places) - 1, min(len(places), MAX_DRAWN)).round().astype(int)
             marks.append(Drawing("points", _points(places[kept]), which))
