@@ -134,7 +134,7 @@ class PartModel:
             FrameFormatError: it is no picture.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
-        name = check_text(name, "name", "PartModel.teach")
+        name = check_text(name, "name", "PartModel.teach", least=1)
         if contrast is not None:
             contrast = check_number(contrast, "contrast", 0, MAX_LEVEL, "PartModel.teach")
         return _taught(Picture.of(picture), region, name, contrast)
