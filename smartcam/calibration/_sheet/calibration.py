@@ -113,7 +113,7 @@ class SheetCalibration(storage.SavedCalibration):
         found["sheet"] = SheetPlane(found["view"].size, matrix, covariance, found["camera"])
         return super()._read(found, context)
 
-    def _check(self, _found: Mapping[str, Any], called: str) -> None:
+    def _check(self, found: Mapping[str, Any], called: str) -> None:
         if self.lens_covariance is not None:
             _check_lens(self.lens_covariance, self.camera, called)
 
