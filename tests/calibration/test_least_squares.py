@@ -127,6 +127,8 @@ def threads() -> list[int]:
 @pytest.fixture
 def two_threads() -> Iterator[None]:
     """Have two, also where the machine has one core."""
+    if np.lib.NumpyVersion(np.__version__) < "2.0.0":
+        pytest.skip("the BLAS of this NumPy has one number for all threads")
     with load("threadpoolctl").threadpool_limits(2, "blas"):
         assert set(threads()) == {2}
         yield

@@ -117,7 +117,7 @@ def test_held_out_equals_fitting_anew(name: ModelName, weights: Array | None) ->
     for index in range(9):
         others = fit(name, pairs.without(index)).matrix
         expected = pairs.robot[index] - apply_homography(others, pairs.camera[index : index + 1])[0]
-        assert found[index] == pytest.approx(expected, abs=1e-9)  # where rounding ends it
+        assert found[index] == pytest.approx(expected, abs=1e-8)  # where rounding ends it
 
 
 def test_held_out_of_many_points_equals_fitting_anew_nearly() -> None:
