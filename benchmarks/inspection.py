@@ -186,7 +186,7 @@ async def _trigger(camera: SoftwareCamera[Any]) -> float:
 
 def _show_when_asked(camera: SoftwareCamera[Any], picture: NDArray[np.uint8]) -> None:
     """Hand the picture over as soon as a run waits for a frame."""
-    eyes = camera._device.eyes  # noqa: SLF001 - the moment is nobody else's business
+    eyes = camera._device.eyes  # noqa: SLF001 - no public name says when a picture is shown
     begin, loop = eyes.begin, asyncio.get_running_loop()
 
     def begin_and_show(*arguments: Any) -> None:

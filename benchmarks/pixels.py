@@ -46,14 +46,14 @@ KNOWN = {
     "BayerRG8": cv2.COLOR_BayerBG2RGB,
     "BayerRG16": cv2.COLOR_BayerBG2RGB,
 }
-"""What OpenCV makes RGB of, by itself."""
+"""The formats that OpenCV converts to RGB by itself."""
 
 BY_MATRIX = (
     *("YCbCr422_8", "YCbCr709_422_8", "YUV422_8_709_full", "NV12_709", "NV12_full", "I420_709"),
     *("I420_2020", "I422", "I422_709", "I444", "I444_709_full"),
     *("I420_10", "I422_12_709", "I444_16_2020"),
 )
-"""What it makes RGB of with a matrix."""
+"""The formats that OpenCV converts to RGB with a matrix."""
 
 GREYS = {
     "RGB8": cv2.COLOR_RGB2GRAY,

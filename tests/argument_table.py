@@ -136,7 +136,7 @@ KINDS: dict[str, frozenset[str]] = {
     | {"-1", "-0.5", "empty text", "True", "numpy truth", "broken integer"},
     "not judged": _ALL,
 }
-"""Which odd values may be given; those others are refused."""
+"""The odd values that each kind admits; all others are refused."""
 
 _TIMEOUT = {"timeout": "seconds"}
 _USUAL = {"timeout": "seconds or default"}

@@ -26,7 +26,7 @@ CALLS = {
     "TCPServer",
     "UDPServer",
 }
-"""What makes a port, or waits at one."""
+"""Calls that make a port, or wait at one."""
 
 KNOWN = {
     # connections: rows of tests.accepting.servers

@@ -1,4 +1,4 @@
-"""Who may stay at a port: no socket, no clock."""
+"""The places at a port and who keeps one, without sockets and clocks."""
 
 from __future__ import annotations
 

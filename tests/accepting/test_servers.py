@@ -25,10 +25,10 @@ TLS_HELLO = bytes.fromhex("1603010200010001fc0303") + bytes(500)
 """The begin of a TLS handshake."""
 
 GARBAGE = random.Random(1).randbytes(1 << 14)  # noqa: S311 - no secret
-"""What a stranger says again and again; some of it looks like ends of lines."""
+"""Bytes that a stranger says again and again; some look like ends of lines."""
 
 FLOOD = b"a" * (1 << 18)
-"""What a stranger says of which nothing ever ends."""
+"""Bytes of a stranger whose request never ends."""
 
 MAX_BYTES = 1 << 19
 """Bytes of memory that a connection without a session may take: what one read of asyncio takes, and

@@ -156,7 +156,7 @@ class SheetCalibration(storage.SavedCalibration):
 
     @cached_property
     def chain(self) -> Chain:
-        """This calibration as a chain of solvers; it takes localizations with y turned up."""
+        """The calibration as a chain of solvers, for localizations with y turned up."""
         chain = Chain(
             [self.sheet],
             frame=self.robot_frame,
