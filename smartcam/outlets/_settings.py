@@ -150,8 +150,10 @@ def mistakes_of(section: Section) -> Iterator[tuple[Sequence[int | str], str]]:
         try:
             outlet_class(name, given).settings_class.model_validate(given)
         except PluginError as exc:
-            place = ("outlets", name, "kind") if "kind" in given else ("outlets", name)
-            yield place, str(exc)
+            if "kind" in given:
+                yield ("outlets", name, "kind"), str(exc)
+            else:
+                yield ("outlets", name), f"{exc}; an outlet of another name says its `kind:`"
         except ValidationError as exc:
             for item in exc.errors(include_url=False, include_input=False):
                 text = item["msg"].removeprefix("Value error, ")

@@ -275,3 +275,8 @@ async def test_threads_have_short_turns_as_long_as_outlets_run(far: FarEnd, tmp_
 
 def test_an_id_says_camera_epoch_and_number() -> None:
     assert OutletEntry("a/b", 7, 3, "result", 1, 0.0, "{}").id == "a/b/7/3"
+
+
+def test_an_outlet_whose_name_is_no_kind_is_told_how_to_say_it(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"outlets\.plc: .*'plc' is unknown.*`kind:`"):
+        Outlets({"plc": {"type": "mqtt"}}, tmp_path)
