@@ -247,7 +247,7 @@ class LoopThread:
 
         # a daemon, so that a program that is killed does not wait for it
         self._thread = threading.Thread(
-            target=lambda: asyncio.run(live()), name=self._name, daemon=True
+            target=_run_loop, args=(live,), name=self._name, daemon=True
         )
         self._thread.start()
         if not ready.wait(CALL_TIMEOUT):
@@ -350,3 +350,14 @@ class LoopThread:
 
     def _not_running(self) -> ConfigurationError:
         return ConfigurationError(f"the thread {self._name} does not run: not started, or ended")
+
+
+def _run_loop(live: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """Run a coroutine in a loop of its own until it ends, also while the interpreter ends."""
+    try:
+        asyncio.run(live())
+    except RuntimeError:
+        # asyncio starts a thread to end its executor, and from Python 3.12 on an interpreter that
+        # ends starts none; the loop is closed all the same
+        if threading.main_thread().is_alive():
+            raise

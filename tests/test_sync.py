@@ -329,8 +329,10 @@ print(camera.query_application())
 """
 
 
-def test_program_that_ends_closes_its_cameras(emulator: ThreadedCamera) -> None:
-    ended = python(LEFT_OPEN, emulator.url)
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"], ids=["address", "name"])
+def test_program_that_ends_closes_its_cameras(emulator: ThreadedCamera, host: str) -> None:
+    # a name is looked up in a thread, which the loop has to end while no thread can be started
+    ended = python(LEFT_OPEN, emulator.url.replace("127.0.0.1", host))
     assert (ended.stdout, ended.stderr, ended.returncode) == ("21\n", "", 0)
     emulator.log.expect("Disconnect", timeout=PATIENCE)
 
