@@ -7,7 +7,7 @@
 Each input is read in callgrind (valgrind), which counts the processor's instructions; memory is
 counted without it. A line is printed for each parser; what grows by more than the input, or takes
 more than its budget, is told, and the exit code is 1. ``--write`` puts budgets of three times the
-instructions and twice the memory that were counted into ``docs/architecture/limits.md``.
+instructions and twice the memory that were counted into ``results/budgets.md``.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ def _write(rows: dict[str, str]) -> None:
         if re.search(pattern, text):
             text = re.sub(pattern, line.replace("\\", r"\\"), text)
         else:
-            text = text.replace("\n\n(budgets-end)=", f"\n{line}\n\n(budgets-end)=", 1)
+            text = f"{text.rstrip()}\n{line}\n"
     PAGE.write_text(text, encoding="utf-8")
 
 
@@ -188,7 +188,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("parsers", nargs="*", metavar="PARSER", help="default: all of them")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--worst", action="store_true", help="of each parser the worst input only")
-    parser.add_argument("--write", action="store_true", help="write the budgets into limits.md")
+    parser.add_argument("--write", action="store_true", help=f"write them into {PAGE.name}")
     options: Any = parser.parse_args(arguments)
     if shutil.which("valgrind") is None:
         parser.error("valgrind is not installed: apt-get install valgrind")

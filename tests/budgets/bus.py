@@ -212,7 +212,7 @@ _BODIES: dict[str, Make] = {
 
 
 class _Transport:
-    """What a connection asks of its transport."""
+    """A transport, as far as a connection asks it."""
 
     def get_extra_info(self, name: str) -> Any:
         return None

@@ -20,7 +20,7 @@ from tests.budgets.parser import Make, Parser, size_of
 
 
 class Growth(NamedTuple):
-    """What was counted for an input, and for ones of twice and four times its size.
+    """Counts for an input, and for inputs of twice and four times its size.
 
     Attributes:
         sizes: bytes of the inputs.
@@ -32,26 +32,26 @@ class Growth(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """How much more the second doubling adds than the first; 0 where it adds nothing."""
+        """The second doubling's cost as a multiple of the first's; 0 where it adds nothing."""
         first, second, third = self.counts
         return max(0, third - second) / max(1, second - first)
 
     @property
     def added(self) -> int:
-        """What the second doubling adds."""
+        """The cost that the second doubling adds."""
         return self.counts[2] - self.counts[1]
 
     @property
     def per_byte(self) -> float:
-        """What the second doubling adds for each byte that it adds."""
+        """The cost that the second doubling adds for each byte that it adds."""
         return self.added / max(1, self.sizes[2] - self.sizes[1])
 
 
 MAX_FACTOR = 2.3
-"""What the second doubling may add, as a multiple of the first: 2 and some for sorting."""
+"""The most that the second doubling may add, as a multiple of the first: 2 and some for sorting."""
 
 STEADY_FACTOR = 2.1
-"""What the doubling before that adds then at least: work of n + b n² with 2.3 has 2.16 there."""
+"""The least that the doubling before that adds then: work of n + b n² with 2.3 has 2.16 there."""
 
 
 def grow(parser: Parser, make: Make, count: Callable[[Parser, Any], int], size: int) -> Growth:

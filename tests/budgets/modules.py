@@ -1,4 +1,4 @@
-"""Which parser of the table each module belongs to that reads bytes or text."""
+"""Parsers of the table by the modules that read bytes or text."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ READS = re.compile(
     r"|\.unpack(?:_from)?\(|iter_unpack|from_bytes\(|fromhex\(|b64decode|frombuffer|unhexlify"
     r"|decode_jpeg|\.recv\("
 )
-"""What a module is known by that reads bytes or text."""
+"""The pattern by which a module that reads bytes or text is known."""
 
 PARSERS_OF: dict[str, str] = {
     "calibration._files.store": "calibrations",

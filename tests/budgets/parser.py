@@ -1,4 +1,4 @@
-"""What a row of the table of parsers is, and how bytes of a stream are handed over."""
+"""A row of the table of parsers, and the ways to hand over bytes of a stream."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Parser(NamedTuple):
     """A parser of foreign bytes.
 
     Attributes:
-        name: as the table in ``limits.md`` calls it.
+        name: as the table in ``results/budgets.md`` calls it.
         parse: reads an input.
         inputs: makers of hostile inputs, by what is hostile in them.
         largest: bytes of the largest input that is accepted.

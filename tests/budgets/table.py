@@ -1,4 +1,4 @@
-"""All parsers, and their budgets as ``docs/architecture/limits.md`` has them."""
+"""All parsers, and their budgets as ``results/budgets.md`` has them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ EXAMPLE = Parser(
     size=1 << 18,
 )
 
-PAGE = ROOT / "docs" / "architecture" / "limits.md"
+PAGE = ROOT / "results" / "budgets.md"
 
 SPEED = 2_000_000_000
 """Instructions a second of a processor that is not new."""
