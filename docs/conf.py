@@ -58,6 +58,7 @@ from smartcam.web import _clouds as cloud_page
 from smartcam.web import _colours as colour_page
 from smartcam.web import _emulator as emulator_page
 from smartcam.web import _fleet as fleet_page
+from smartcam.web import _frames as frames_page
 from smartcam.web import _live as live_page
 from smartcam.web import _wizard as wizard_page
 
@@ -633,6 +634,11 @@ def calls_live() -> str:
     return _calls(live_page.CALLS)
 
 
+def calls_frames() -> str:
+    """Return the calls of the page of pictures."""
+    return _calls(frames_page.CALLS)
+
+
 def calls_fleet() -> str:
     """Return the calls of the page of a fleet, without those of one camera."""
     return _calls(one for one in fleet_page.CALLS if "{camera}" not in one.path)
@@ -758,7 +764,7 @@ GENERATED: dict[str, Callable[[], str]] = {
         *(fleet_file, fleet_camera, fleet_emulated, fleet_frames, fleet_reconnect, fleet_history),
         *(fleet_operations, fleet_record, fleet_standby, fleet_ros2, fleet_ros2_camera),
         *(access_rights, calls_emulator, calls_colours, calls_cloud),
-        *(calls_wizard, calls_live, calls_fleet),
+        *(calls_wizard, calls_live, calls_frames, calls_fleet),
     )
 }
 """What ``{generated}`` knows."""
