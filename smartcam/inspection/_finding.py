@@ -46,8 +46,8 @@ class Finding:
     Attributes:
         ok: the tool's verdict.
         reason: why it is not ok, in one sentence for people; "" where it is.
-        values: by the names of the tool's fields, in SI units (metres, radians, pixels). A field
-            that is left out has no value: 0, False, "" or NaN on the wire.
+        values: what was found, by the names of the tool's fields, in SI units (metres, radians,
+            pixels). A field that is left out has no value: 0, False, "" or NaN on the wire.
         records: values of each thing found, by the names of the tool's records.
         drawings: marks for people.
         reference: frame of reference that later tools may follow; None: there is none.

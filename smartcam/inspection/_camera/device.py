@@ -56,7 +56,7 @@ class SoftwareDevice(Server):
         transport: ``"tcp"`` or ``"udp"``, of ``bvs``; default ``"tcp"``.
         dialect: name of the dialect of ``bvs``; default ``handbook``.
         quirks: options of the emulated camera for what is not known of real ones.
-        seed: of the emulated camera's chance.
+        seed: the start of the emulated camera's random numbers.
 
     Raises:
         ConfigurationError: something of it cannot work.

@@ -47,7 +47,7 @@ class ToolThread:
         return future
 
     def close(self) -> None:
-        """Have it end after what waits; does not wait for it."""
+        """Have the thread end after the work that waits, and return at once."""
         with self._changed:
             self._closing = True
             self._changed.notify()

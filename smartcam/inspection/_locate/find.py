@@ -87,7 +87,7 @@ class LocatedPart:
         noise: standard deviation of the picture's noise, grey levels.
         blur: standard deviation of the edges' blur, pixels.
         chi_square: squared residuals of the edges in parts of what the noise explains.
-        refusal: why it is none; "" for one that was found.
+        refusal: why the part counts as not found; "" for one that was found.
         doubt: why it may be turned otherwise; mostly "".
         hull: convex hull of the part, (K, 2), pixels of the picture.
     """
