@@ -193,7 +193,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         return self.application.processing_time
 
     def evaluated(self, call: LineClient | None, part: Mapping[str, Any]) -> None:
-        """Answer with the result, and tell it to who has results switched on."""
+        """Answer with the result, and send it to all clients that have results switched on."""
         self.values = part
         self.results += 1
         self.good += bool(part.get("passed", True))

@@ -275,8 +275,8 @@ class PcicDialect(TicketedDialect):
         """Return a command of one's own.
 
         Raises:
-            ConfigurationError: it is none, or would end the session: one that sets the version or
-                another layout than the session's.
+            ConfigurationError: the line is no command, or would end the session, as one that sets
+                the version or another layout than the session's.
             UnsupportedError: its answer needs a length.
         """
         if line[:1] in {"I", "H"} and not self.digits:

@@ -116,7 +116,7 @@ def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
 
     Args:
         described: the layout.
-        values: by the ids of elements; records are lists of such mappings.
+        values: values of the elements by their ids; records are lists of such mappings.
     """
     default = described.get("format", {})
     return b"".join(_encode(described["elements"], values, default))

@@ -48,7 +48,7 @@ CODES = {
 
 
 def read_result(line: str) -> m.ResultContainer:
-    """Return the result of ``RT,count,OK|NG[,tool,OK|NG,rate]...``; ValueError: it is none."""
+    """Return the result that ``RT,count,OK|NG[,tool,OK|NG,rate]...`` tells, else ValueError."""
     word, count, judged, *tools = line.split(",")
     if word != "RT":
         raise ValueError(line)
