@@ -46,10 +46,10 @@ Column = tuple[str, str, str]
 class Outlet(ABC, Generic[SettingsT]):
     """A way of results out of a cell; derive from it, and name the class in an entry point.
 
-    An outlet only delivers. What waits, what is counted and what is tried again is the work of who
-    calls it: :meth:`open` first, then :meth:`deliver` for one batch after the other, in order. An
-    exception of any of them means that the far end is away: :meth:`close` follows, and after a
-    delay :meth:`open` again, with the same batch.
+    An outlet only delivers. What waits, what is counted and what is tried again is the work of the
+    code that calls it: :meth:`open` first, then :meth:`deliver` for one batch after the other, in
+    order. An exception of any of them means that the far end is away: :meth:`close` follows, and
+    after a delay :meth:`open` again, with the same batch.
 
     Args:
         name: name of the outlet.
