@@ -111,7 +111,7 @@ def test_bound_is_in_proportion_to_the_pixels_of_an_exact_robot() -> None:
 
 @pytest.mark.parametrize("setup", SETUPS)
 def test_bound_of_exact_pixels_is_that_of_the_robot_alone(setup: Setup) -> None:
-    """Where the views are exact, errors are in proportion to the robot's noise."""
+    """Errors are in proportion to the robot's noise where the views are exact."""
     truth = scene(setup)
     one = truth.bound(pixel_sigma=1e-3, robot_sigmas=RobotSigmas(1e-4, 1e-4))
     two = truth.bound(pixel_sigma=1e-3, robot_sigmas=RobotSigmas(2e-4, 2e-4))

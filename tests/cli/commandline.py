@@ -42,7 +42,7 @@ DIE = b"die"
 """As an answer: reset the connection."""
 
 SESSION: Mapping[bytes, bytes] = {CONNECT: CONNECTED + WAITING, QUERY: ACTIVE_21}
-"""What a camera in application 21 says until it is triggered."""
+"""Frames that a camera in application 21 sends until it is triggered."""
 
 SCENARIO = """\
 applications:
@@ -165,7 +165,7 @@ class Peer:
 
     @property
     def host_and_port(self) -> str:
-        """Where it listens."""
+        """The address on which the process listens."""
         return f"127.0.0.1:{self._listener.getsockname()[1]}"
 
     @property

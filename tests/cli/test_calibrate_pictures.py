@@ -42,7 +42,7 @@ CAMERA = CameraModel(
 )
 SEEN = Transform("camera", "target", np.diag([1.0, -1.0, -1.0]), np.array([-0.1, 0.06, 0.5]))
 OFFSET = np.array([0.4, -0.1, 0.02])
-"""Where the origin of the sheet lies before the robot; its axes are the robot's."""
+"""Place of the sheet's origin before the robot; its axes are the robot's."""
 
 ABOUT = {"unit": "m", "side": "-z", "touch_sigma": 0.1}
 

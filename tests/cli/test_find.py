@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 QUICK = ("--timeout", "0.5", "--rate", "10000")
-"""What is silent is silent however long it is heard."""
+"""Options of a quick search: a silent camera stays silent however long it is heard."""
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ TRIED = {
     "tcp": (("b16", "bid"), ("handbook",), ("thesis",)),
     "udp": (("handbook",), ("b16", "bid"), ("thesis",)),
 }
-"""What is tried one after the other where nothing is pinned; some begin a session alike."""
+"""Dialects tried one after the other where none is pinned; some begin a session alike."""
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.real_time
 
 
 class Unit:
-    """What systemd hears of a process."""
+    """Messages of a process that systemd hears."""
 
     def __init__(self) -> None:
         self.place = f"@smartcam-serve-{os.getpid()}-{time.monotonic_ns()}"

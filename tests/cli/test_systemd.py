@@ -1,4 +1,4 @@
-"""What systemd is told, by a socket of its kind."""
+"""Messages to systemd, by a socket of its kind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What only a terminal gets, on a real pseudo-terminal: colour, and a line that counts."""
+"""Output that only a terminal gets, on a real pseudo-terminal: colour, and a line that counts."""
 
 from __future__ import annotations
 

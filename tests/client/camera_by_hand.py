@@ -37,7 +37,7 @@ def words(*values: int) -> bytes:
 
 
 class Wire(NamedTuple):
-    """What frames look like: struct code of the integers, magic, what the length counts too."""
+    """The form of frames: struct code of the integers, magic, what the length counts too."""
 
     word: str
     magic: bytes = b""

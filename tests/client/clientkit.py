@@ -1,4 +1,4 @@
-"""What the client's tests share: sessions with every camera, what cameras do, and loop steps."""
+"""Helpers of the client's tests: sessions with every camera, events of cameras, and loop steps."""
 
 from __future__ import annotations
 
@@ -132,10 +132,10 @@ SOON = 5.0
 """Seconds after which what should happen at once fails the test."""
 
 OPENING = [DISCONNECT, CONNECT, QUERY]
-"""What a client says first in a session."""
+"""Messages that a client says first in a session."""
 
 FENCED = [QUERY, TRIGGER, QUERY]
-"""What it says for a trigger over TCP, in one write."""
+"""Messages that a client says for a trigger over TCP, in one write."""
 
 
 def quiet(_: bytes) -> bytes:

@@ -23,7 +23,7 @@ LOOPS: Mapping[str, Callable[[], asyncio.AbstractEventLoop]] = {
 """Kinds of cameras, and the event loops that they are tried on."""
 
 IN_REAL_TIME = loops.LOOP == "uvloop"
-"""Whether all tests run in real time: only those that do so over Zenoh, too, at the wire."""
+"""True to run all tests in real time: only those that do so over Zenoh, too, at the wire."""
 
 _LEFT_OUT = {
     "wire": frozenset[str](),
@@ -50,13 +50,13 @@ def _kind(item: pytest.Item) -> str | None:
 
 
 def _counts_steps(item: pytest.Item) -> bool:
-    """Whether a test counts steps of the loop, or has something happen in a few milliseconds."""
+    """Return True if a test counts steps of the loop, or needs something in a few milliseconds."""
     source = inspect.getsource(cast("pytest.Function", item).function)
     return any(word in source for word in ("steps(", "sleep(0)", "SHORT", "timeout=0"))
 
 
 def _needs_its_own_time(item: pytest.Item) -> bool:
-    """Whether a test cannot run in real time, or would take long."""
+    """Return True if a test cannot run in real time, or would take long."""
     name = item.name.partition("[")[0]
     return name in _LEFT_OUT["zenoh"] or _counts_steps(item)
 

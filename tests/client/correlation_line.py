@@ -18,7 +18,7 @@ READY = Status.RUNNING | Status.WAITING_FOR_TRIGGER
 WORKING = Status.RUNNING
 
 _FAILING = Status.OVERTRIGGERED
-"""Whose rise ends a trigger; so does the fall of Running."""
+"""Bits whose rise ends a trigger; the fall of Running does, too."""
 
 
 class Line:

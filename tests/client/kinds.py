@@ -1,4 +1,4 @@
-"""Which of the client's tests hold for every kind of camera: nearly all that speak to one.
+"""The client's tests that hold for every kind of camera: nearly all that speak to one.
 
 They run at the wire, over a fleet's bus inside the process, and in the long run over Zenoh, too.
 What holds at the wire only stands in a table with its reason; ``docs/sharing-a-camera.md`` says
@@ -28,7 +28,7 @@ MODULES = frozenset(
         "test_udp",
     }
 )
-"""Whose tests hold for every kind."""
+"""Modules whose tests hold for every kind."""
 
 AT_THE_WIRE: dict[str, tuple[str, ...]] = {
     "it looks inside the client, or counts the steps of the event loop": (

@@ -58,7 +58,7 @@ LAYOUTS = {
     "int8": f"number: int8 @sequence, above: uint8, more: uint16, {REST}",
     "uint8": f"number: uint8 @sequence, above: uint8, more: uint16, {REST}",
 }
-"""What the client is told of the container, by the type of the number that it is to look at."""
+"""Layouts of the container by the type of the number that the client is to look at."""
 
 SENSOR = 0
 """In place of a trigger's count: a run that a sensor began."""
@@ -73,7 +73,7 @@ QUEUE_DEPTH = 8
 """Of the input data that waits for an inspection."""
 
 Step = tuple[float | None, int]
-"""What a run says, and the pause before it: seconds, or None for "until it is told to go on"."""
+"""A pause in seconds (None: until it is told to go on), and the word of a run behind it."""
 
 ItemT = TypeVar("ItemT")
 
@@ -111,7 +111,7 @@ class Line(Generic[ItemT]):
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is on its way."""
+        """True if nothing is on its way."""
         return not self._on_the_way
 
     def close(self) -> None:
@@ -168,7 +168,7 @@ def _no_delay() -> float:
 
 
 def _nothing_more(_: int, __: int | None) -> None:
-    """What happens around a trigger where nobody says otherwise."""
+    """Do nothing more around a trigger; the default."""
 
 
 def _never() -> bool:
@@ -252,18 +252,18 @@ class LineCamera(PortByHand):
 
     @property
     def idle(self) -> bool:
-        """Whether no run is under way and nothing is on the line, or held back by the network."""
+        """True if no run is under way and nothing is on the line, or held back by the network."""
         still = self.towards.empty and self.back.empty and not self._held
         return still and not self._under_way
 
     @property
     def takes_trigger(self) -> bool:
-        """Whether a trigger would begin a run."""
+        """True if a trigger would begin a run."""
         return self._running and self._waiting and not self._conditions & BUSY
 
     @property
     def is_running(self) -> bool:
-        """Whether an application is in run mode."""
+        """True if an application is in run mode."""
         return self._running
 
     @property

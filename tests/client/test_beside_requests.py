@@ -37,7 +37,7 @@ OUTCOMES = (
 """The errors of docs/promises.md#one-outcome."""
 
 FAMILIES = (smartcam.ResponseTimeoutError, *OUTCOMES)
-"""What any other request may end with."""
+"""Errors that any other request may end with."""
 
 STEP = 0.001
 """Seconds that a turn of the loop takes: pauses of some turns fall anywhere in a command."""
@@ -62,10 +62,10 @@ ASKS: dict[type[m.Message], tuple[Ask, ...]] = {
     m.Stop: (lambda c: c.stop(),),
     m.ReadImage: (lambda c: c.read_image(),),
 }
-"""What is asked beside triggers, where the dialect has the message."""
+"""Questions beside triggers, where the dialect has the message."""
 
 RAW: tuple[type[m.Message], ...] = (m.Query, m.GetStatus, m.GetClock, m.ResetErrors, m.Trigger)
-"""What is asked by its id, where the dialect has ids."""
+"""Questions by their ids, where the dialect has ids."""
 
 
 def bvs(dialect: str, transport: Literal["tcp", "udp"]) -> EmulatedCamera:

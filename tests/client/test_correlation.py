@@ -1,4 +1,4 @@
-"""Whose result is it: every branch by a table."""
+"""The owner of each result: every branch by a table."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_overtriggered_that_rises_ends_the_trigger(answers: int) -> None:
 
 
 def test_application_that_is_stopped_ends_the_trigger() -> None:
-    """What begins behind the next start is somebody else's."""
+    """An inspection that begins behind the next start is somebody else's."""
     line = ready()
     line.trigger()
     line.hear(STOPPED)
@@ -564,7 +564,7 @@ def test_first_status_of_a_session_tells_of_no_drop() -> None:
 
 @pytest.mark.parametrize("complete", [True, False])
 def test_second_inspection_behind_a_trigger_is_somebody_elses(*, complete: bool) -> None:
-    """Where a status may be lost nothing is told of others."""
+    """Nothing is told of others' inspections where a status may be lost."""
     line = ready(complete=complete)
     line.begin() if complete else line.send()
     line.hear(WORKING, READY, WORKING)

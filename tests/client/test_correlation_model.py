@@ -18,7 +18,7 @@ from tests.client.correlation_line import READY, WORKING, Line
 
 STOPPED = Status(0)
 SENSOR = 0
-"""Whose container it is that somebody else's trigger gave; triggers of ours count from 1."""
+"""Owner of a container that somebody else's trigger gave; triggers of ours count from 1."""
 
 MAX_MOVES = 1000
 """After which nothing will be as it is awaited."""
@@ -28,7 +28,7 @@ Kind = Literal["plain", "number", "perhaps"]
 
 
 class Word(NamedTuple):
-    """What the client says."""
+    """A message of the client."""
 
     what: Literal["query", "status", "number", "trigger", "reset", "stop", "start"]
     whose: int = 0  # the trigger that it was written with
@@ -46,7 +46,7 @@ class Container:
 
 
 Said = Status | Container | Literal["answer", "taken", "refused"]
-"""What is on its way to the client; an answer to a Query, or to a trigger."""
+"""A message on its way to the client; an answer to a Query, or to a trigger."""
 
 
 @dataclass
@@ -205,7 +205,7 @@ class CameraAndClient(RuleBasedStateMachine):
             self.trigger(data)
 
     def draw_left(self, data: st.DataObject) -> list[Status | None]:
-        """What a run will say, in which order."""
+        """Return the messages that a run will say, in their order."""
         results = data.draw(st.sampled_from(self.results), "results")
         place = 0 if self.camera.polled else data.draw(st.integers(0, results), "place of Waiting")
         left: list[Status | None] = [None] * results
@@ -224,7 +224,7 @@ class CameraAndClient(RuleBasedStateMachine):
 
     @property
     def owes(self) -> bool:
-        """Whether an answer to a Query is open."""
+        """True if an answer to a Query is open."""
         return self.asked or self.line.fences_open > 0
 
     def say_to_camera(self, *words: Word) -> None:
@@ -285,7 +285,7 @@ class CameraAndClient(RuleBasedStateMachine):
         self.go_on(data, lambda: not self.owes)
 
     def settle(self, data: st.DataObject) -> None:
-        """What settles a debt: a moment for what is late, then Stop, a Query, Start."""
+        """Settle a debt: wait a moment for the late result, then Stop, a Query, Start."""
         at = self.line.at
         if data.draw(st.booleans(), "grace"):
             self.go_on(data, lambda: self.line.status == READY, give_up=True)
@@ -342,7 +342,7 @@ class CameraAndClient(RuleBasedStateMachine):
     @precondition(lambda self: self.ordered)
     @rule(really=st.integers(0, 4))
     def lose_the_link(self, really: int) -> None:
-        """What is on its way is lost, in both directions."""
+        """Lose all that is on its way, in both directions."""
         if really:
             return
         if not self.idle:
@@ -366,7 +366,7 @@ class CameraAndClient(RuleBasedStateMachine):
 
     @rule(data=st.data(), ends=st.booleans())
     def all_goes_on(self, data: st.DataObject, *, ends: bool) -> None:
-        """What is on its way comes; perhaps an inspection ends meanwhile."""
+        """Deliver what is on its way; perhaps an inspection ends meanwhile."""
         camera = self.camera
         while camera.heard or camera.said or (ends and camera.left):
             for what in ("take", "say", "deliver") if ends else ("take", "deliver"):
@@ -457,7 +457,7 @@ class CameraAndClient(RuleBasedStateMachine):
     # -- what must hold
 
     def look_at(self, container: Container, fate: str, *, own: bool) -> None:
-        """What is not the trigger's may be taken until it is known better, what is its own is."""
+        """Allow a stranger's container until it is known better, and demand the trigger's own."""
         if own and self.gives:
             assert self.line.pending is not None
             readable = self.number is None or container.number in {None, self.number}

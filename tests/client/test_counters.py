@@ -1,4 +1,4 @@
-"""What a client counts: times in bins, and wire counters over sessions."""
+"""Counters of a client: times in bins, and wire counters over sessions."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Loop(asyncio.SelectorEventLoop):
 
     @property
     def waiting(self) -> list[float]:
-        """When the timers go off that have not."""
+        """The times at which the remaining timers go off."""
         return [one.when() for one in self.timers if not one.cancelled() and one.when() > self.now]
 
 

@@ -57,7 +57,7 @@ async def through_proxy(
 
 
 class Work:
-    """What comes from the client's socket, and the memory the client takes for it."""
+    """Bytes from the client's socket, and the memory that the client takes for them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.sizes: list[int] = []  # bytes of each delivery

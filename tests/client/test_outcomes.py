@@ -125,7 +125,7 @@ async def after_it_was_taken(box: HandmadeCamera, camera: Camera) -> object:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a trigger ends."""
+    """The end of a trigger."""
 
     error: type[SmartCamError]  # with what
     text: str  # what its text says

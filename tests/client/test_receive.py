@@ -241,7 +241,7 @@ async def test_flood_is_worked_off_in_smaller_pieces_where_others_share_the_loop
 async def test_flood_gives_way_again_while_others_are_at_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Who shares the loop and takes more than a piece of time has four turns to one of a flood."""
+    """Other links that take more than a piece of time have four turns to one of a flood."""
     now = 0.0
     monkeypatch.setattr(link, "thread_time", lambda: now)
     monkeypatch.setattr(link, "perf_counter", lambda: now)

@@ -1,4 +1,4 @@
-"""What a lost link leaves undone: application, run state, the way back, results that are owed."""
+"""Work that a lost link leaves undone: application, run state, the way back, owed results."""
 
 from __future__ import annotations
 

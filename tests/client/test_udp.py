@@ -93,7 +93,7 @@ async def test_dialect_over_udp_is_found_out() -> None:
 
 
 async def test_load_that_ends_while_a_session_is_made_is_asked_about_in_the_session() -> None:
-    """What came before is the handshake's, the answer to its Query among it: of the old one."""
+    """Take what came before for the old session's, the answer to its Query included."""
     async with HandmadeCamera(transport="udp") as box:
         told = iter([3])
         box.script[QUERY] = lambda _: box.said(QUERY, next(told, box.active))

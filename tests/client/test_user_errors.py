@@ -1,4 +1,4 @@
-"""What the user's own code raises inside the client is told where it belongs, and costs nothing."""
+"""Exceptions of the user's own code are told where they belong, and cost nothing."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ ERRORS: dict[str, Callable[[], BaseException]] = {
     "StopAsyncIteration": StopAsyncIteration,
     "without a text": UntoldError,
 }
-"""What user code may raise, whatever the sense of it."""
+"""Exceptions that user code may raise, whatever the sense of it."""
 
 ANY_ERROR = pytest.mark.parametrize("error", ERRORS.values(), ids=ERRORS)
 

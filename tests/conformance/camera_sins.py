@@ -1,4 +1,4 @@
-"""What cameras do wrong: each entry makes an emulated camera fail one check."""
+"""Faults of cameras: each entry makes an emulated camera fail one check."""
 
 from __future__ import annotations
 

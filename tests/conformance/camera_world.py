@@ -72,7 +72,7 @@ SECONDS = {
     *("quiet", "timeout", "switch_timeout", "reboot_timeout"),
     *("load_time", "processing_time", "overtriggered_time", "reboot_time"),
 }
-"""What is told in seconds, of a options, an application and a camera's quirks."""
+"""Settings in seconds, of options, an application and a camera's quirks."""
 
 
 def _slowed(fields: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""How fast the tests of the judges go: on a machine that is too slow for them, slower.
+"""The pace of the judges' tests: on a machine that is too slow for them, slower.
 
 A judge of cameras or clients measures real time, and so do those it judges: "nothing comes" is a
 silence of so many seconds. All of these seconds are short first. Where a test fails then, they are
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PACES = (1.0, 8.0, 50.0)
 
 FAILURES = AssertionError, pytest.fail.Exception
-"""What a test fails with; the second one where something is not raised."""
+"""Errors that a test fails with; the second one where something is not raised."""
 
 
 class _Pace:
@@ -32,7 +32,7 @@ def slowed(seconds: float) -> float:
 
 
 def is_first() -> bool:
-    """Whether this is the fastest pace."""
+    """True if this is the fastest pace."""
     return _Pace.times == PACES[0]
 
 

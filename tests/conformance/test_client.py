@@ -144,7 +144,7 @@ SINS: dict[str, tuple[str, str]] = {
 
 
 class Convictions:
-    """What checks find of their bad clients: of all together, at a slower pace of each."""
+    """Findings of checks in their bad clients: of all together, at a slower pace of each."""
 
     def __init__(self) -> None:
         self._found = asyncio.run(self._find(*SINS))

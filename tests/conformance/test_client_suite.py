@@ -49,7 +49,7 @@ class TestMissing(ClientConformance):
 
 
 class Ended(NamedTuple):
-    """How a pytest ended."""
+    """The end of a run of pytest."""
 
     code: int
     out: str

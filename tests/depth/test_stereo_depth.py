@@ -231,7 +231,7 @@ async def test_nothing_stays_open_when_a_camera_is_not_there() -> None:
 
 @pytest.mark.real_time
 async def test_readers_of_frames_are_paired_as_sources_are() -> None:
-    """What ``camera.frames()`` gives: a reader in an ``async with``."""
+    """Readers that ``camera.frames()`` gives in an ``async with`` are paired as sources are."""
     found = ScriptedDriver(), ScriptedDriver()
     pictures = drawn()
     closed: list[str] = []

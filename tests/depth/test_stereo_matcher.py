@@ -19,7 +19,7 @@ from smartcam.exceptions import ConfigurationError, FrameFormatError
 from tests.depth.scenes import Scene, plane, step
 
 ALOE = Path("/usr/share/doc/opencv-doc/examples/data")
-"""Where Debian's package opencv-doc has the pair."""
+"""Place of the pair in Debian's package opencv-doc."""
 
 
 def matcher(**other: Any) -> StereoMatcher:

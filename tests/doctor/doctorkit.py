@@ -1,4 +1,4 @@
-"""What the doctor's tests share: a whole examination, and picking its findings."""
+"""Helpers of the doctor's tests: a whole examination, and picking its findings."""
 
 from __future__ import annotations
 

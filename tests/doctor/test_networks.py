@@ -1,4 +1,4 @@
-"""What texts mean addresses, and sets of them."""
+"""Texts that mean addresses, and sets of them."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ TIMEOUT = 5.0
 
 
 class Place(Protocol):
-    """Where an emulated camera listens."""
+    """The address on which an emulated camera listens."""
 
     @property
     def host(self) -> str: ...

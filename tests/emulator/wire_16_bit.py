@@ -39,7 +39,7 @@ HELLO_WORLD = frame(  # published: B-4
 
 
 class Client(Protocol):
-    """What both plain clients can do."""
+    """The common methods of both plain clients."""
 
     def send(self, *frames: bytes) -> None: ...
 

@@ -1,4 +1,4 @@
-"""What tests of the fleet share: a numbered camera, its agent, programs that use it."""
+"""Helpers of the fleet's tests: a numbered camera, its agent, programs that use it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tests of a fleet's frames share: a device that does what a test says, at an agent."""
+"""Helpers of the tests of a fleet's frames: a device that does what a test says, at an agent."""
 
 from __future__ import annotations
 

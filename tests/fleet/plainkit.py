@@ -45,7 +45,7 @@ def applications() -> list[Application]:
 
 
 class Client:
-    """What a program without smartcam does; :class:`InProcess` and :class:`OverZenoh` do it."""
+    """A program without smartcam; :class:`InProcess` and :class:`OverZenoh` are its two kinds."""
 
     async def ask_raw(self, key: str, payload: bytes) -> list[tuple[str, bytes]]:
         raise NotImplementedError
@@ -81,7 +81,7 @@ class Client:
 
 
 class Heard:
-    """What came under a pattern."""
+    """The messages that came under a pattern."""
 
     def __init__(self) -> None:
         self._came: asyncio.Queue[tuple[str, dict[str, Any]]] = asyncio.Queue()
@@ -210,7 +210,7 @@ def zenoh_session(port: int) -> Any:
 
 
 def is_virtual() -> bool:
-    """Whether time is virtual here, so that the bus is the one inside the process."""
+    """True if time is virtual here, so that the bus is the one inside the process."""
     return isinstance(asyncio.get_running_loop(), TimedLoop)
 
 

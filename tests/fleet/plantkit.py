@@ -1,4 +1,4 @@
-"""What tests of access share: an authority, and ends of a bus that show its certificates."""
+"""Helpers of the tests of access: an authority, and ends of a bus that show its certificates."""
 
 from __future__ import annotations
 

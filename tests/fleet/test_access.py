@@ -1,4 +1,4 @@
-"""Who may what: each role, each kind of message, each key, by the engine's own rules."""
+"""Rights: each role, each kind of message, each key, by the engine's own rules."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def keys_of(does: str) -> list[str]:
 
 
 def allowed(role: str, does: str, key: str) -> bool:
-    """Whether the table has it."""
+    """Return True if the table has the right."""
     if role == "router":
         return True
     return any(
@@ -322,7 +322,7 @@ MINE = "operator-robot.secret"
 
 
 def covered(role: str, does: str, pattern: str) -> bool:
-    """Whether the table allows all that a pattern means."""
+    """Return True if the table allows all that a pattern means."""
     expression: Any = importlib.import_module("zenoh").KeyExpr
     return any(
         expression(one).includes(expression(pattern))
@@ -334,7 +334,7 @@ def covered(role: str, does: str, pattern: str) -> bool:
 
 @pytest.mark.parametrize("ends", ROLES[:3], indirect=True)  # a router passes everything on
 async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends: Ends) -> None:
-    """Who says, answers, or is present under a pattern would be heard by all who mean a part."""
+    """Do nothing for a pattern: messages under it would be heard by all who mean a part of it."""
     role, end, guard = ends
     said, asked, present = Seen(), Seen(), Seen()
 

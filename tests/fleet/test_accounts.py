@@ -245,7 +245,7 @@ async def test_who_does_not_read_harms_nobody() -> None:
 
 
 async def test_results_of_many_come_to_a_fleet_in_the_same_way() -> None:
-    """What a fleet gives of all its cameras has an account for each."""
+    """Streams of all cameras of a fleet have an account for each camera."""
     bus = LossyBus()
     async with sending(bus) as sender:
         fleet = Fleet(bus.end(), None, "plant", None, 10.0, {"interpret_as": "raw"})
@@ -281,7 +281,7 @@ def free_memory(camera: FleetCamera[Any]) -> int:
 
 
 async def test_what_a_program_holds_back_is_bounded() -> None:
-    """Where an agent does not answer for what is missing, nothing grows for ever."""
+    """Nothing grows for ever where an agent does not answer for what is missing."""
     bus = LossyBus()
     async with sending(bus) as sender, sender.plant.cameras(1) as (camera,):
         reader = Reader(camera)

@@ -1,4 +1,4 @@
-"""What comes over the bus from other people's programs: checked as what users give is."""
+"""Values over the bus from other people's programs are checked as users' values are."""
 
 from __future__ import annotations
 

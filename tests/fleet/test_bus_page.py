@@ -50,7 +50,7 @@ from tests.fleet.plainkit import (
 PAGE = (ROOT / "docs" / "bus.md").read_text(encoding="utf-8")
 
 MANY = ("CAMERA", "TOPIC", "...")
-"""What stands for several parts of a key."""
+"""Words that stand for several parts of a key."""
 
 
 def section(title: str) -> str:

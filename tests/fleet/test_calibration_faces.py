@@ -94,7 +94,7 @@ def transform_of(transform: Transform, utc: float) -> dict[str, Any]:
 
 
 WORLD = Transform("world", "base_link", np.eye(3), np.array([10.0, 0.0, 1.0]))
-"""Where the robot stands in the hall: a static transform."""
+"""Place of the robot in the hall: a static transform."""
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""What ``smartcam fleet certificates`` makes, and what a fleet file says of who may use it."""
+"""Files that ``smartcam fleet certificates`` makes, and the users whom a fleet file lets in."""
 
 from __future__ import annotations
 

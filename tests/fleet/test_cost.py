@@ -1,4 +1,4 @@
-"""What a call costs on the bus, counted in messages."""
+"""The cost of a call on the bus, counted in messages."""
 
 from __future__ import annotations
 

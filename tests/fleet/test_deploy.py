@@ -1,4 +1,4 @@
-"""What ``deploy/`` holds: the unit, the containers, what Prometheus is told."""
+"""The files of ``deploy/``: the unit, the containers, the settings of Prometheus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fleet file says of frames."""
+"""Frames in a fleet file."""
 
 from __future__ import annotations
 

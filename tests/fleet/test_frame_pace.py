@@ -1,4 +1,4 @@
-"""When a stream is given which frame: at sources and links of any pace, in no time at all."""
+"""Frames that a stream is given, and when: at sources and links of any pace, in no time at all."""
 
 from __future__ import annotations
 

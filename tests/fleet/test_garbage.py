@@ -1,4 +1,4 @@
-"""What of a fleet was opened and not closed says so when nobody has it any more.
+"""Objects of a fleet that were opened and not closed say so when nobody has them any more.
 
 Its bus has it until the event loop is gone; the engine of a bus between processes has it for good.
 """

@@ -1,4 +1,4 @@
-"""Whose commands may pass: in order, nobody between, and nothing is left behind."""
+"""Commands that may pass: in order, nobody between, and nothing is left behind."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which pattern means which key."""
+"""The keys that each pattern means."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PATTERNS = st.lists(st.sampled_from(CHUNKS), min_size=1, max_size=4).map("/".joi
 
 
 def means(pattern: list[str], name: list[str]) -> bool:
-    """Whether a name is meant, tried in every way."""
+    """Return True if a name is meant, tried in every way."""
     if not pattern:
         return not name
     if pattern[0] == "**":
@@ -38,7 +38,7 @@ MEANT = {
 
 @pytest.mark.parametrize("one", SHORT)
 def test_patterns_meet_where_a_name_is_meant_by_both(one: str) -> None:
-    """What two patterns of three chunks have in common has four at most."""
+    """Two patterns of three chunks have at most four patterns in common."""
     for other in SHORT:
         common = MEANT[one] & MEANT[other]
         assert meets(one, other) == bool(common), (one, other)

@@ -1,4 +1,4 @@
-"""What an agent keeps, and how a program puts in order what it hears: each number once."""
+"""The messages that an agent keeps, and their order at a program: each number once."""
 
 from __future__ import annotations
 

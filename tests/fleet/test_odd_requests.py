@@ -27,7 +27,7 @@ BASE: dict[str, dict[str, Any]] = {
     "execute_feature": {"name": "UserSetLoad"},
     "ChangeApplication": {"application_id": 1},
 }
-"""What a request says beside the odd field."""
+"""Fields of a request beside the odd one."""
 
 REFUSALS = {"ConfigurationError", "LayoutError", "PluginError"}
 
@@ -35,7 +35,7 @@ ELSEWISE = {
     "epoch": {"ConnectionLostError"},  # of another start of the agent
     "deadline": {"TriggerTimeoutError", "ResponseTimeoutError"},  # which is over
 }
-"""What is an answer, too, for some fields."""
+"""Errors that are right answers, too, for some fields."""
 
 MAX_ANSWER = 2000
 """Bytes of a refusal, however large what it refuses."""

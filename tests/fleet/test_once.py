@@ -279,7 +279,7 @@ async def test_start_of_an_agent_that_nobody_saw_is_seen_by_who_only_listens() -
 
 
 async def test_as_many_calls_at_once_as_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a program may have under way grows with the cameras: a whole fleet is triggered."""
+    """The bound of calls under way grows with the cameras: a whole fleet is triggered."""
     monkeypatch.setattr("smartcam.fleet._agent.agent.MAX_CALLS_PER_PROGRAM", 2)
     file = FleetFile.model_validate({"cameras": {"line1/**": {"emulated": {"count": 5}}}})
     async with fleet.open(file) as plant:

@@ -1,4 +1,4 @@
-"""What programs without smartcam hear of a fleet: the list of its cameras, and topics of JSON."""
+"""The fleet as programs without smartcam hear it: the list of its cameras, and topics of JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``record:`` in a fleet file says."""
+"""The section ``record:`` of a fleet file."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ SOON = 1.0
 
 
 ENDS = (LinkError, TriggerTimeoutError)
-"""What a call ends with whose agent goes."""
+"""Errors that a call ends with when its agent goes."""
 
 
 class Pair:

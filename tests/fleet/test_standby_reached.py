@@ -1,4 +1,4 @@
-"""Whether an end is on the bus is known before it is told that the others are gone."""
+"""An end knows that it is on the bus before it is told that the others are gone."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ async def test_two_agents_and_a_router_between(folder: Path) -> None:
 
 
 async def test_cancelling_under_the_name_of_another() -> None:
-    """Who may only ask cannot cancel another's command, or make it count as done already."""
+    """A role that may only ask cannot cancel another's command, or make it count as done."""
     async with (
         Plant(NumberedCamera(time=0.2)) as plant,
         plant.camera() as robot,

@@ -58,7 +58,7 @@ VIEWER_DOES: dict[str, set[str]] = {
     "thesis": set(),
     "thesis_topic": {"hear"},
 }
-"""What a viewer may do with each key of the bus as it is for an operator. Nothing that is said or
+"""Rights of a viewer to each key of the bus as it is for an operator. Nothing that is said or
 answered there, nobody's presence: those have keys of a viewer's own."""
 
 ARGUMENTS = {

@@ -1,4 +1,4 @@
-"""What the ends of a fleet say to each other, as bytes: there and back, and what is broken."""
+"""Messages between the ends of a fleet as bytes: there and back, and broken ones."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def runs(draw: st.DrawFn) -> ResultRun:
 
 
 def same(one: ResultRun, other: ResultRun) -> bool:
-    """Whether two runs are equal; NaN is NaN here."""
+    """Return True if two runs are equal; NaN is NaN here."""
     return repr(one) == repr(other)
 
 

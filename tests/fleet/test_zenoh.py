@@ -60,7 +60,7 @@ async def two_ends(**more: Any) -> AsyncIterator[tuple[ZenohEnd, ZenohEnd]]:
 
 
 class Heard:
-    """What came under a pattern."""
+    """The messages that came under a pattern."""
 
     def __init__(self) -> None:
         self.payloads: list[bytes] = []

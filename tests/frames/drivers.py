@@ -122,4 +122,4 @@ def scripted(**options: Any) -> tuple[ScriptedDriver, FrameSource]:
 
 
 class GoneError(FrameSourceError):
-    """What a test's device ends with."""
+    """The error that a test's device ends with."""

@@ -1,4 +1,4 @@
-"""What a camera or a file says leads nowhere: neither to another port nor to a file of ours.
+"""A camera or a file leads nowhere else: neither to another port nor to a file of ours.
 
 Whatever opens a URL stands here: FFmpeg over HTTP, RTSP and on files, a GigE camera's description,
 and the WebSocket to a rosbridge. A listener counts who comes to it, and the file that must not be

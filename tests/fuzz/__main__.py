@@ -46,7 +46,7 @@ MERGE_TIME = 600
 
 
 class Outcome(NamedTuple):
-    """What a run of one target gave."""
+    """The outcome of a run of one target."""
 
     executions: int
     seconds: float
@@ -59,7 +59,7 @@ class Outcome(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether it ran to its end and found nothing."""
+        """True if the run came to its end and found nothing."""
         return self.code == 0 and not self.findings
 
 

@@ -48,7 +48,7 @@ ENDIANS = (0, 1, 7)
 LIMIT = 256
 DROPS = Policy(fatal=(), exact_length=False)
 BY_ITSELF = (m.StatusReport, m.ResultContainer, m.DisconnectAnswer, m.UnknownMessage)
-"""What a client hears that has asked nothing."""
+"""Messages that a client hears without having asked."""
 
 
 class Camera:

@@ -69,7 +69,7 @@ def check_cell_file(data: bytes) -> None:
 
 
 def check_teaching(name: str, number: int, program: Program) -> None:
-    """What is saved as it was read means the same, or is refused and nothing is changed."""
+    """Assert that a saved file means the same as before, or is refused and changes nothing."""
     path = scratch()
     before = path.read_bytes()
     try:

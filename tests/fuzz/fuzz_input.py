@@ -1,4 +1,4 @@
-"""How a target reads its input: small choices from the front, what they are about behind them."""
+"""Reading of a target's input: small choices from the front, the bytes for them from behind."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def text_of(data: bytes) -> str:
 
 
 class Body(NamedTuple):
-    """What a message's body must be: bytes at least, and whether more of them mean something."""
+    """The body of a message: its least size, and whether more bytes mean something."""
 
     size: int
     open_end: bool

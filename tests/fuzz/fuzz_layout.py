@@ -18,7 +18,7 @@ from tests.fuzz.fuzz_input import Choices, text_of
 
 
 class Turn(enum.IntFlag):
-    """What is done beside parsing."""
+    """Uses of a layout beside parsing."""
 
     LENIENT = 1
     BIG = 2
@@ -81,7 +81,7 @@ def check_refusal(error: LayoutError, text: str) -> None:
 
 
 def check_text(layout: Layout, text: str) -> None:
-    """What was read prints, and reads again as the same."""
+    """Assert that a layout that was read prints, and reads again as the same."""
     assert "\n" not in layout.text
     again = Layout(layout.text, lenient=layout.lenient)
     assert again == layout
@@ -145,7 +145,7 @@ def check_payload(layout: Layout, payload: bytes, order: ByteOrder, turn: Turn) 
 
 
 def check_misfit(error: InterpretationError, layout: Layout, payload: bytes) -> None:
-    """What does not fit has its place in the payload, and a field's name or none."""
+    """Assert that an error has its place in the payload, and a field's name or none."""
     assert 0 <= error.offset <= len(payload)
     names = {field.name for field in (*layout.head, *layout.fields)}
     assert error.field in names | {""}
@@ -202,7 +202,7 @@ def check_table(layout: Layout, payload: bytes, order: ByteOrder, records: list[
 
 
 def check_building(layout: Layout, payload: bytes, order: ByteOrder, value: Any) -> None:
-    """What was parsed can be built, and the same is parsed from that."""
+    """Assert that a parsed value can be built, and that the same is parsed from its bytes."""
     if not all(buildable(field, item) for field, item in flat(layout, value)):
         return
     head_field = layout.sequence_field if layout.sequence_field in layout.head else None
@@ -232,14 +232,14 @@ def flat(layout: Layout, value: Any) -> list[tuple[Field, Any]]:
 
 
 def buildable(field: Field, value: Any) -> bool:
-    """Whether the value can go back: a large integer with a unit was rounded as a float."""
+    """Return True if the value can go back: a large integer with a unit was rounded as a float."""
     if field.unit is None or not field.wire.is_integer:
         return True
     return field.size < 8 or abs(value) < EXACT / 1_000_000
 
 
 def exact(field: Field, value: Any) -> bool:
-    """Whether the same bytes must be built: some bytes mean no more than others."""
+    """Return True if the same bytes must be built: some bytes mean no more than others."""
     if field.type == "string":
         return False  # what stands behind the first zero is lost
     if not isinstance(value, float):

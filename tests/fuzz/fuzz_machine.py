@@ -117,7 +117,7 @@ class Link:
         assert machine.counters.long_bodies == self.long_bodies
 
     def takes(self, frame: Frame) -> bool:
-        """Whether a frame may come now; if so, it has come."""
+        """Return True if a frame may come now; then it counts as having come."""
         dialect, sender = self.machine.dialect, self.machine.role.receives
         message = check_decoding(dialect, sender, frame)
         surplus = dialect.surplus(sender, frame)  # less than 0 where a code comes alone

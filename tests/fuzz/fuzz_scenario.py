@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from smartcam.emulator.faults import Fault
 
 GREEDY = (b"slots", b"&")
-"""What can make much of little; only with these is memory measured, which takes time."""
+"""Words that can make much of little; only with these is memory measured, which takes time."""
 
 MEMORY = 16 << 20
 """Bytes that loading a file may take: a container has 64 KiB, an input here far less."""

@@ -43,7 +43,7 @@ ODD_YAML = (
     'applications:\n  - {id: 5, layout: "x: real32", generator: tangram, parameters: {pieces: 5}}',
     'applications:\n  - {id: 5, layout: "n: int8", generator: sequence, rate: 1000}\nrunning: true',
 )
-"""What YAML can say and nobody writes."""
+"""Texts that YAML allows and nobody writes."""
 
 WRONG_LAYOUTS = (
     "x: int8, x: int8",

@@ -117,7 +117,7 @@ OPEN_FINDINGS = {
 @pytest.mark.long
 @pytest.mark.parametrize(("target", "name"), OPEN_FINDINGS, ids="-".join)
 def test_known_finding_is_still_there(target: str, name: str) -> None:
-    """Where this fails the mistake is mended: delete its row of ``KNOWN``, keep the input."""
+    """Fail when the mistake is mended: delete its row of ``KNOWN`` then, and keep the input."""
     with pytest.raises(Exception) as caught:  # noqa: PT011 - the row says which
         TARGETS[target].load()(OPEN_FINDINGS[target, name])
     assert known(target, caught.value) is not None, describe(caught.value)

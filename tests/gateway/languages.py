@@ -131,7 +131,7 @@ def _krl_line(line: str) -> list[str]:
 
 _OUTPUTS = {"MSG_CONNECT": 1, "MSG_DISCO": 1, "BYTES_AHEAD": 2, "GET_REG": 4, "CNV_STR_REAL": 1}
 _OUTPUTS |= {"CNV_STR_CONF": 2, "SET_INT_REG": 1, "SET_POS_REG": 1}
-"""How many of a built-in's arguments, the last ones, come back."""
+"""Number of a built-in's arguments, the last ones, that come back."""
 
 _KAREL = [
     Block(r"IF (?P<c>.*) THEN", "if {c}:", after=1),

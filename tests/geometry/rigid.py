@@ -91,7 +91,7 @@ def transforms(draw: st.DrawFn, target: str = "base", source: str = "part") -> T
 
 
 def close(first: Transform, second: Transform, tolerance: float = 1e-12) -> bool:
-    """Whether two transforms are the same one."""
+    """Return True if two transforms are the same one."""
     return (
         (first.target, first.source, first.at) == (second.target, second.source, second.at)
         and np.allclose(first.rotation, second.rotation, rtol=0, atol=tolerance)

@@ -22,7 +22,7 @@ ROOM_PX = 24
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How a camera sees a code.
+    """The way in which a camera sees a code.
 
     Attributes:
         px: pixels of a module.

@@ -101,7 +101,7 @@ PARTS: dict[str, tuple[Shape, ...]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How a scene is lit and photographed.
+    """Light and photography of a scene.
 
     Attributes:
         dark: level of the background, 0 to 255.

@@ -143,7 +143,7 @@ class Gate:
 
 
 class LevelSettings(ToolSettings):
-    """How bright it may be."""
+    """The range of brightness."""
 
     most: int = Field(255, description="the brightest that is good")
     gate: str | None = Field(None, description="the gate to wait at")

@@ -1,4 +1,4 @@
-"""What ``interpret_as`` takes, and the interpreters of every kind of data."""
+"""Values that ``interpret_as`` takes, and the interpreters of every kind of data."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ TEXT = "n: int32, (x: real32 mm, y: real32 mm)[n]"
 
 @pytest.fixture
 def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Field, ...]]:
-    """Whose codecs were made."""
+    """Collect the fields whose codecs are made."""
     found: list[tuple[Field, ...]] = []
 
     class Counted(RecordCodec):

@@ -81,7 +81,7 @@ def arrows() -> dict[int, Arrow]:
 
 
 class Books:
-    """What clients have asked for, and what they were answered."""
+    """Questions of clients, and their answers."""
 
     def __init__(self) -> None:
         self.done: collections.Counter[str] = collections.Counter()

@@ -45,7 +45,7 @@ FAST = smartcam.Backoff(initial=0.001, factor=2, maximum=0.01, jitter=0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Adversary(Variant):
-    """What is done to a camera."""
+    """Deeds done to a camera."""
 
     line: tuple[float, float] = (0.0, 0.01)
     # sensor, operator: they are there

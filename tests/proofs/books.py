@@ -1,4 +1,4 @@
-"""What proofs about the client share: who keeps book of its camera, and who hears what it is told.
+"""Helpers of proofs about the client: the keeper of a camera's book, and the client's listeners.
 
 Each container of a :class:`BookKeeper` says which run it is of, and the camera knows of each run
 when it began and by which Trigger message. A :class:`ClientEar` counts what came to one client.
@@ -40,7 +40,7 @@ TRIGGER_OUTCOMES: tuple[type[exceptions.SmartCamError], ...] = (
     exceptions.UnsupportedError,
     *LINK_LOST,
 )
-"""What a trigger may end with beside a result; the list is closed."""
+"""Errors that a trigger may end with in place of a result; the list is closed."""
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
@@ -317,7 +317,7 @@ def _run_told(entry: TraceEntry) -> int:
 # ---------------------------------------------------------------------- both sides
 
 STRANGER = "second client"
-"""Whose log entries are on no link of ours."""
+"""The peer whose log entries are on no link of ours."""
 
 
 class Ledger:

@@ -47,7 +47,7 @@ STEP = 1e-3
 
 
 class Light(NamedTuple):
-    """How a scene is lit and photographed."""
+    """Light and photography of a scene."""
 
     contrast: float = 150.0
     noise: float = 2.0

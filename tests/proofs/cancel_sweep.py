@@ -50,7 +50,7 @@ HOME, AWAY, PAIRS = 7, 3, 5
 
 
 class Wire(NamedTuple):
-    """How client and camera speak."""
+    """The protocol and the options of client and camera."""
 
     transport: Literal["tcp", "udp"] = "tcp"  # of the camera
     dialect: str = "handbook"  # of the camera
@@ -94,7 +94,7 @@ class Bench(NamedTuple):
 
     @property
     def layout(self) -> str:
-        """What the client reads results with."""
+        """The layout with which the client reads results."""
         return NUMBERED if self.wire.numbered else PLAIN
 
 
@@ -376,7 +376,7 @@ def _coroutines(kind: type) -> Iterator[str]:
 
 
 class Sweep(NamedTuple):
-    """What came of cancelling one call at every step: how often, and how the calls ended."""
+    """The outcome of cancelling one call at every step: number of steps, and the calls' ends."""
 
     steps: int
     ends: Counter[str]

@@ -1,4 +1,4 @@
-"""What the soak does to a camera: one table of faults, each with its share of the chance."""
+"""Faults that the soak does to a camera: one table, each with its share of the chance."""
 
 from __future__ import annotations
 

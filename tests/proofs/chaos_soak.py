@@ -26,7 +26,7 @@ from tests.proofs.chaos_faults import TCP_FAULTS, UDP_FAULTS
 from tests.proofs.chaos_station import Station, Watch
 
 SAMPLES = 40
-"""How often memory and tasks are looked at."""
+"""Number of looks at memory and tasks in a run."""
 
 GROWTH = 16.0
 """MB that the last quarter may have more than the first; caches fill, and the heap has holes."""
@@ -40,7 +40,7 @@ MORE_TASKS = 1.2
 
 @dataclass(slots=True)
 class Soak:
-    """What came of it."""
+    """The outcome of the soak."""
 
     cameras: int
     seconds: float

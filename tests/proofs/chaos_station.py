@@ -53,11 +53,11 @@ RECENT, RECENT_WIDTH = 40, 120
 
 LINKS = (*LINK_LOST, exceptions.ConnectFailedError)
 EXPECTED = (*TRIGGER_OUTCOMES, *LINKS, exceptions.ResponseTimeoutError)
-"""What any call may end with here."""
+"""Errors that any call may end with here."""
 
 
 class Watch:
-    """What all stations report to."""
+    """The watch to which all stations report."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()  # how often things happened

@@ -1,4 +1,4 @@
-"""What `read` reads: drawn codes, public pictures, and photographs without a code.
+"""Measure what `read` reads: drawn codes, public pictures, and photographs without a code.
 
 ``python -m tests.proofs.codes [--seeds N] [--public FOLDER] [--photographs FOLDER]``
 
@@ -68,7 +68,7 @@ LOOKS = {
     "4 px, contrast 8": Look(px=4, levels=(100, 108)),
     "4 px, shade": Look(px=4, levels=(60, 110), shade=120),
 }
-"""How drawn codes are seen."""
+"""Ways in which drawn codes are seen."""
 
 PUBLIC = {
     "QRCode": [f"qrcode-{n}" for n in range(1, 7)],

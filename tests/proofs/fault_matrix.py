@@ -88,7 +88,7 @@ MISLED = tuple(
     for one in TRIGGER_OUTCOMES
     if one not in {e.ConnectionTakenError, e.ConnectionClosedError, e.UnsupportedError}
 )
-"""What a trigger may end with whose client was told wrong of the camera's state."""
+"""Errors that a trigger may end with if its client was told wrong of the camera's state."""
 
 NUMBERED = ("handbook", "thesis", "b16")
 TCP = (*(World(d, "tcp", n) for d in NUMBERED for n in (True, False)), World("bid", "tcp", False))
@@ -141,7 +141,7 @@ def is_apart(cell: Cell) -> bool:
 
 @dataclass(slots=True)
 class Verdict:
-    """What came of a cell."""
+    """The outcome of a cell."""
 
     cell: Cell
     outcome: str = "none"  # of the command: ``value``, or the error's name
@@ -158,7 +158,7 @@ class Verdict:
 
     @property
     def passed(self) -> bool:
-        """Whether nothing was wrong."""
+        """True if nothing was wrong."""
         return not self.wrong and not self.known
 
 

@@ -48,7 +48,7 @@ WITH_INPUT = 2
 
 @dataclass
 class Figures:
-    """What came of a storm."""
+    """The outcome of a storm."""
 
     name: str
     outcomes: Counter[str] = field(default_factory=Counter)

@@ -80,7 +80,7 @@ class Container(NamedTuple):
 
 _SHARED: dict[int, object] = {}
 _PARTS: dict[type, Any] = dict(copyreg.dispatch_table)
-"""How objects are taken to pieces, by their class."""
+"""Functions that take objects to pieces, by the class."""
 
 
 def share(one: Shared) -> Shared:
@@ -238,7 +238,7 @@ class Client:
 
     @property
     def correlation(self) -> Correlation:
-        """What says whose each container is."""
+        """The part that says whose each container is."""
         return self.results.correlation
 
     @property
@@ -321,7 +321,7 @@ class Client:
 
     @property
     def returned(self) -> list[Container] | None:
-        """What the caller of the trigger is given when it is woken, None where it is none."""
+        """The value that wakes the caller of the trigger, or None."""
         outcome = self.pending.outcome if self.pending is not None else None
         if outcome is None or not outcome.done() or outcome.cancelled() or outcome.exception():
             return None

@@ -49,7 +49,7 @@ WAITING, RUNNING, OVERTRIGGERED = (
     Status.OVERTRIGGERED,
 )
 SENSOR = 0
-"""Whose run it is that a sensor began; triggers of ours count from 1."""
+"""The owner of a run that a sensor began; triggers of ours count from 1."""
 
 GIVEN_NUMBER = 41
 """Sequence number that the user sets by hand."""
@@ -64,7 +64,7 @@ KINDS: tuple[Kind, ...] = ("own", "fresh", "older")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """Which camera, which line, and what may happen.
+    """A variant: the camera, the line, and the events that may happen.
 
     Attributes:
         name: for people.
@@ -463,7 +463,7 @@ class World:
 
 @dataclass(slots=True)
 class Visited:
-    """What was found in a variant.
+    """The findings of a variant.
 
     Attributes:
         states: that were visited.

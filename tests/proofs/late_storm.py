@@ -37,7 +37,7 @@ PATIENCE = (0.005, 0.02)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LateVariant(Variant):
-    """How a camera is late. Shares are 0 to 1, times seconds."""
+    """The ways in which a camera is late. Shares are 0 to 1, times seconds."""
 
     exact: bool = True  # each container's fate is known beforehand, so the counts must agree
     # share of the runs whose Waiting for Trigger rises before their results

@@ -104,7 +104,7 @@ class Kind:
 
     @property
     def search(self) -> PartSearch:
-        """What is looked for."""
+        """The search for the part."""
         least = 0.7 - self.covered
         return PartSearch(
             scales=self.scales, least_score=least, any_polarity=self.any_polarity, seconds=30.0
@@ -292,7 +292,7 @@ class Row(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Whether the kind is as it should be, but for chance."""
+        """True if the kind is as it should be, but for chance."""
         values = max(1, self.found) * 3
         chance = 3 / math.sqrt(2 * values)
         return (

@@ -448,7 +448,7 @@ async def cells(makes: Iterable[str] = MAKES) -> list[Cell]:
 
 
 class Tally:
-    """How cells ended, and what was wrong with them."""
+    """Outcomes of cells, and the faults found in them."""
 
     def __init__(self) -> None:
         self.ends: Counter[tuple[str, str]] = Counter()

@@ -115,20 +115,20 @@ WITHHELD = frozenset(
     | {f"{what} instead" for what in ("status", "warm status", "container", "foreign container")}
     | {f"{what} instead" for what in ANSWERS}
 )
-"""What withholds a status if it is done to one."""
+"""Deeds that withhold a status if they are done to one."""
 
 EVIDENCE = frozenset({"QueryAnswer", "StatusReport"})
-"""What shows that the camera took a trigger, where its status has to be asked for."""
+"""Messages that show that the camera took a trigger, where its status has to be asked for."""
 
 CONFUSES = WITHHELD | {"TriggerAnswer before", "TriggerAnswer after"}
-"""What is done to evidence so that it cannot be told whose a result is."""
+"""Deeds done to evidence so that nobody can tell whose a result is."""
 
 ASKS_EVIDENCE = frozenset({"Query", "GetStatus"})
 """Questions whose answers are evidence; one that the camera does not hear withholds it."""
 
 
 class _Mangling(NamedTuple):
-    """What is done to a frame of the camera."""
+    """A deed done to a frame of the camera."""
 
     name: str
     faults: list[f.Fault]

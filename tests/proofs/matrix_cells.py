@@ -41,7 +41,7 @@ CLOCK: Errors = (e.InterpretationError, *REQUEST)
 SWITCH: Errors = (e.CommandRejectedError, *REQUEST)
 HALFWAY: Errors = (e.NotRunningError, e.WrongApplicationError)
 REFUSED: Errors = (e.CommandRejectedError, e.UnsupportedError)
-"""What any answer may say in a dialect with result codes."""
+"""Errors that any answer may lead to in a dialect with result codes."""
 
 
 class Heard(NamedTuple):
@@ -237,7 +237,7 @@ AT_ONCE = 0.5
 
 @dataclass(frozen=True)
 class Fault:
-    """What is done to a bench, and what may come of it.
+    """A deed done to a bench, and its possible outcomes.
 
     ``arm``, ``fired`` and ``heal`` take the kind of bench that their cells have.
     """
@@ -400,7 +400,7 @@ def _frame_cells(world: World, name: str, found: Sequence[Place]) -> Iterator[Ce
 
 
 TWICE: Mapping[str, Errors] = {"Trigger": (e.OvertriggeredError,)}
-"""What a command may end with if the camera hears a request of it twice."""
+"""Errors that a command may end with if the camera hears a request of it twice."""
 
 LONG_OPS = frozenset({"elsewhere", "visit", "open stopped"})
 """Commands whose messages are those of others: not every byte of them is tried."""

@@ -41,7 +41,7 @@ STARTING = 30.0
 """Seconds that the command has to come up."""
 
 SIGNALS = hasattr(signal, "SIGKILL") and hasattr(signal, "SIGSTOP")
-"""Whether the system has what these cells need."""
+"""True if the system has what these cells need."""
 
 
 class ProcessCamera:
@@ -173,7 +173,7 @@ class ProcessBench(BenchBase):
         await self.camera.get_clock()
 
     def really_active(self) -> int:
-        """What the client was told."""
+        """Return the active application as the client was told it."""
         return self.camera.active_application or 0
 
     async def mend(self) -> None:

@@ -1,4 +1,4 @@
-"""What a cell of the fault matrix happens in: a camera that keeps books, a link, and a client.
+"""The world of a cell of the fault matrix: a camera that keeps books, a link, and a client.
 
 The camera knows when each of its runs began. So a result belongs to its own trigger if its run
 began after ``trigger()`` was called and, where the layout has a number, carries the number that the
@@ -39,7 +39,7 @@ SETTLING = 1.5
 
 
 class World(NamedTuple):
-    """What is spoken, over what, and whether containers have a number."""
+    """The dialect, the transport, and whether containers have a number."""
 
     dialect: str
     transport: Literal["tcp", "udp"]
@@ -64,17 +64,17 @@ class World(NamedTuple):
 
     @property
     def has_magic(self) -> bool:
-        """Whether a frame shows where it begins."""
+        """True if a frame shows where it begins."""
         return bool(self.spoken.header.magic)
 
     @property
     def is_asked(self) -> bool:
-        """Whether the status comes when it is asked for, and not by itself."""
+        """True if the status comes when it is asked for, and not by itself."""
         return not self.spoken.status_by_itself
 
     @property
     def layout(self) -> str:
-        """How containers are read."""
+        """The layout with which containers are read."""
         return layout_of(self.numbered)
 
 
@@ -90,10 +90,10 @@ class Bounds(NamedTuple):
 
 
 PATIENT = Bounds(request=3, switch=4, connect=6, close=0.5, liveness=6, trigger=4)
-"""Where no timeout is meant to fire."""
+"""Bounds where no timeout is meant to fire."""
 
 SHORT = Bounds(request=0.15, switch=0.4, connect=1.0, close=0.1, liveness=0.3, trigger=0.4)
-"""Where timeouts are meant to fire."""
+"""Bounds where timeouts are meant to fire."""
 
 
 # ---------------------------------------------------------------------- tasks

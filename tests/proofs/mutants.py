@@ -29,7 +29,7 @@ from typing import NamedTuple
 from tests import ROOT
 
 TAKEN = ("smartcam", "tests", "examples", "docs", "results", "pyproject.toml", "README.md")
-"""What a copy of the tree has."""
+"""Files and folders that a copy of the tree has."""
 
 LONGEST = 200.0
 """Seconds that the tests of one mutant may take: one that hangs is noticed."""
@@ -137,7 +137,7 @@ class Mutant(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What ``--only`` takes."""
+        """The mutant as ``--only`` takes it."""
         return f"{self.room}:{self.module}:{self.place}"
 
     def text(self) -> tuple[str, str]:

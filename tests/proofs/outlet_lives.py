@@ -173,7 +173,7 @@ def live(number: int, life: Life, section: dict[str, Any], folder: Path, say: in
 
 
 class _Told:
-    """What a life says of itself; the pipe keeps it also when the life ends at once."""
+    """Report of a life; the pipe keeps it also when the life ends at once."""
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe

@@ -93,7 +93,7 @@ def plan(seed: int, number: int) -> Cell:
 
 @dataclass
 class Lived:
-    """What a life said of itself.
+    """Report of a life.
 
     Attributes:
         offers: cameras of the results that were offered, in order.

@@ -1,4 +1,4 @@
-"""What happens to a plant: faults, each for a while, by a plan or by chance."""
+"""Events that happen to a plant: faults, each for a while, by a plan or by chance."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SEEN = Limit(MARGIN, LEASE_TIME)
 
 @dataclass
 class Fault:
-    """What may happen.
+    """A kind of event.
 
     Attributes:
         act: does it to a host, for so many seconds.
@@ -69,7 +69,7 @@ class Happening:
 
     @property
     def fault(self) -> Fault:
-        """What it is."""
+        """The kind of fault."""
         return FAULTS[self.name]
 
     @property

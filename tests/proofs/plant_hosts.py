@@ -30,7 +30,7 @@ NETWORK = "10.79.0."
 MAX_PACKETS = 10_000
 LARGEST = 1 << 16
 SOURCE, TARGET = 15, 19
-"""Where the last byte of an address is in a packet."""
+"""Offsets of the last bytes of a packet's addresses: that of its source, that of its target."""
 
 
 class NoNamespacesError(Exception):

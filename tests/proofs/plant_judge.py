@@ -1,4 +1,4 @@
-"""What came of a plant: its figures, and what must not be."""
+"""The outcome of a plant: its figures, and the things that must not be."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MIN_SAMPLES = 30
 
 @dataclass
 class Storm:
-    """What was done to a plant, and what came of it.
+    """The deeds done to a plant, and their outcome.
 
     Attributes:
         figures: of its calls, and violations.

@@ -1,4 +1,4 @@
-"""How fast this computer is just now: a deadline may be missed by what others do here, not by luck.
+"""The present speed of this computer: a deadline may be missed by what others do here, not by luck.
 
 A piece of work whose time is known is done again and again. What is a wait by design, such as the
 lease, takes as long as ever; what is work takes as much longer as the piece does.
@@ -28,7 +28,7 @@ MOST = 10.0
 
 
 class Limit(NamedTuple):
-    """How long something may take.
+    """The time that something may take.
 
     Attributes:
         work: seconds of it that are work, which others may hold up.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tests.proofs.plant_judge import Storm
 
 Told = dict[int, dict[str, int]]
-"""How often the program of each host was told that a camera of the pair was lost."""
+"""Numbers of losses of each camera of the pair that the program of each host was told."""
 
 PAIR = (1, 2)
 """Hosts of the two agents."""
@@ -65,7 +65,7 @@ class Pair:
         return [host for at, host in self._turns[name] if at >= since]
 
     def agreed(self, seen: Mapping[str, Sequence[str]]) -> bool:
-        """Whether exactly one agent has each camera, and is seen: ``seen`` are those by camera."""
+        """Return True if one agent has each camera, and is ``seen`` there, by camera."""
         return all(
             self._now[name] is not None and [*seen.get(name, ())] == [f"host{self._now[name]}"]
             for name in PAIRED
@@ -106,7 +106,7 @@ class PairWatch:
         return (other, hit[0]) if hit else None
 
     def has_taken(self, host: int, camera: str) -> bool:
-        """Whether a host's agent has taken a camera over."""
+        """Return True if a host's agent has taken a camera over."""
         return host in self._pair.moves(camera, self.begun)
 
     def most_moves(self, camera: str) -> int:

@@ -54,7 +54,7 @@ LATELY = 5.0
 """Seconds for which this computer's pace is asked."""
 
 RESERVING = 0.15
-"""How often a program reserves a camera, of all that it does."""
+"""Share of a program's calls that are reservations."""
 
 LAST = 30.0
 """Seconds of a call at the end, when nothing is wrong any more."""
@@ -135,7 +135,7 @@ async def router(place: str, certificates: str) -> None:
 
 @dataclass
 class Heard:
-    """What a program has read of a camera's results."""
+    """The results of a camera that a program has read."""
 
     first: int | None = None  # run
     last: int | None = None

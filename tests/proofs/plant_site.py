@@ -1,4 +1,4 @@
-"""Who is there: the hosts of a plant, their processes, and what these say."""
+"""The hosts of a plant, their processes, and the reports of these."""
 
 from __future__ import annotations
 

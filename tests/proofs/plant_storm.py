@@ -79,7 +79,7 @@ async def weather(site: Site, happening: Sequence[Happening]) -> None:
 
 
 async def taken_over(site: Site, watch: PairWatch, camera: str) -> None:
-    """Who stands by has a camera of the pair as soon as the agent that had it is gone."""
+    """Complain unless a standby agent has the camera of the pair as soon as its agent is gone."""
     found = watch.successor(camera)
     if found is None:
         return

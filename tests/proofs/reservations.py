@@ -39,7 +39,7 @@ ONE, OTHER = "one", "other"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """What may happen, and how often.
+    """Events that may happen, and their number.
 
     Attributes:
         name: for people.
@@ -454,7 +454,7 @@ class World:
 
 @dataclass(slots=True)
 class Visited:
-    """What was found in a variant.
+    """The findings of a variant.
 
     Attributes:
         states, steps: that were visited, and moves that were tried.
@@ -544,7 +544,7 @@ VARIANTS = (
     Variant(name="and agents die", **TAKES_OVER, cuts=1, deaths=1, depth=14),
     Variant(name="both reserve, another agent takes over", **BOTH, **TAKES_OVER, cuts=1, depth=14),
 )
-"""What is visited in the long form, all of it or up to a depth."""
+"""Variants visited in the long form, all of each or up to a depth."""
 
 
 def main() -> int:

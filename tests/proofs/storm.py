@@ -1,4 +1,4 @@
-"""What the two storms share: a camera that knows whose each result is, callers, and the judge.
+"""Helpers of the two storms: a camera that knows whose each result is, callers, and the judge.
 
 A storm triggers a camera again and again, in tasks that may be cancelled, and asks of each result
 whether it is of the Trigger message that its call has sent. What else is done to the camera, and
@@ -62,7 +62,7 @@ USUAL = ("result", "TriggerTimeoutError", "cancelled", "OvertriggeredError")
 
 @dataclass(slots=True)
 class Figures:
-    """What came of a storm."""
+    """The outcome of a storm."""
 
     variant: Variant
     calls: int = 0

@@ -1,4 +1,4 @@
-"""What programs do in the task sweep: a short life of each public object that has tasks."""
+"""Scenes of the task sweep: a short life of each public object that has tasks."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ async def rtsp(program: Any) -> None:
 
 
 async def rtsp_played(program: Any) -> None:
-    """Who plays a stream of a server over its own connection."""
+    """Play a stream of a server over its own connection."""
     drawn = frames.open("synthetic://?size=256x64&fps=50")
     async with program.entered(drawn) as source:
         if source is None:

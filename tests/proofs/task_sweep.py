@@ -40,7 +40,7 @@ PACKAGE = str(Path(smartcam.__file__).parent)
 
 
 class Aim(NamedTuple):
-    """Which task is cancelled, and when.
+    """The task that is cancelled, and the moment.
 
     Attributes:
         task: its number among those that the package made, from 0.
@@ -130,7 +130,7 @@ def _made_by_the_package() -> bool:
 
 
 class Program:
-    """What a scene uses to call: each call is bounded.
+    """A scene's calls: each of them is bounded.
 
     Args:
         strict: a call that fails ends the scene; else whatever it raises is as good as a result.

@@ -90,7 +90,7 @@ def test_visit_finds_what_goes_wrong_where_an_assumption_does() -> None:
 
 @pytest.mark.long
 def test_order_that_nobody_can_see_changes_nothing() -> None:
-    """What is left out unless ``exact`` is asked for."""
+    """The states that are left out unless ``exact`` is asked for change no outcome."""
     some = Variant(name="", sensors=1, triggers=1, results=(0, 1), depth=60)
     few, all_of_it = visit(some), visit(replace(some, exact=True))
     assert few.whole

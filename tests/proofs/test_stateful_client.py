@@ -50,7 +50,7 @@ applications = st.sampled_from([LINE, OTHER, FED, FREE])
 
 
 class ClientMachine(ClientJudge, RuleBasedStateMachine):
-    """What may happen to client and camera."""
+    """Events that may happen to client and camera."""
 
     dialects: ClassVar[tuple[str, ...]] = ("handbook", "thesis", "b16", "bid")
 

@@ -79,7 +79,7 @@ _SC_SILENT = frozenset({0x02, 0x33, 0x34, 0x35, 0x40, 0x41, 0x42, 0x43})
 
 
 class Wire(NamedTuple):
-    """What frames look like, and what is in them."""
+    """The form of frames, and their content."""
 
     magic: bytes  # the magic number's bytes
     counted: int  # how many bytes beside the body the length field counts
@@ -216,7 +216,7 @@ def meaning(wire: Wire, sender: m.Sender, frame: Frame) -> m.Message:
 
 
 class Reading(NamedTuple):
-    """What a stream says so far."""
+    """The state of a stream so far."""
 
     frames: list[Frame]  # the whole frames
     # how many of them stand before the first broken place; None: nothing is broken
@@ -287,7 +287,7 @@ ENDED = ("closed", "failed")
 
 
 class _End:
-    """What both ends have: bytes that came, and what must have been counted."""
+    """State of both ends: bytes that came, and the counts that must follow."""
 
     hears: m.Sender
 
@@ -331,7 +331,7 @@ class _End:
         return reading.frames[self.frames_received :], intact
 
     def fits(self, message: m.Message) -> bool:
-        """Whether the wire has such a message, and room for its values."""
+        """Return True if the wire has such a message, and room for its values."""
         raw = isinstance(message, (m.UnknownMessage, m.MalformedMessage))
         try:
             packed(self.wire, framed(self.wire, message))
@@ -360,7 +360,7 @@ class ClientEnd(_End):
         self.unknown = self.unasked = self.long = 0
 
     def may_say(self, message: m.Message, answered: bool | None = None) -> bool:
-        """Whether the session allows it and no answer of its id is owed."""
+        """Return True if the session allows the message and no answer of its id is owed."""
         if self.phase in ENDED or not self.fits(message):
             return False
         in_session = self.phase in {"connecting", "connected"}
@@ -461,7 +461,7 @@ class CameraEnd(_End):
         return self._count_sent(message)
 
     def may_say(self, message: m.Message) -> bool:
-        """Whether there is a session for it."""
+        """Return True if there is a session for the message."""
         if not self.fits(message):
             return False
         if isinstance(message, m.DisconnectAnswer):

@@ -76,7 +76,7 @@ class Line:
         self.renew_camera_end()
 
     def renew_camera_end(self) -> None:
-        """Where the camera has forgotten an address, its next datagram meets a new machine."""
+        """Give the camera a new machine, as for a datagram of an address that it has forgotten."""
         datagrams = self.transport is Transport.UDP
         policy = dataclasses.replace(POLICIES[Role.CAMERA, self.transport], tells=self.tells)
         self.camera = Machine(
@@ -86,7 +86,7 @@ class Line:
 
     @property
     def clean(self) -> bool:
-        """Whether its wires carried what was said and nothing else, in order."""
+        """True if the wires carried what was said and nothing else, in order."""
         stream = self.transport is Transport.TCP
         return stream and not any(pipe.disturbed for pipe in self.pipes.values())
 
@@ -267,7 +267,7 @@ class Station:
             self._drop(line)
 
     def collect(self) -> None:
-        """What the device says is what the model says; put it on the wire."""
+        """Compare the device's messages with the model's, and put them on the wire."""
         said = self.device.take_output()
         assert said == self.model.take()
         assert self.served is not None or not said

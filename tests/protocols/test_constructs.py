@@ -104,7 +104,7 @@ def test_view_fields_any_bytes_are_a_frame_for_both_readings_or_for_none(
 
 
 def is_whole(dialect: FramedDialect, sender: m.Sender, data: bytes) -> bool:
-    """Whether the framer and the codecs take it as one frame."""
+    """Return True if the framer and the codecs take the bytes as one frame."""
     framer = Framer(dialect.header)
     framer.feed(data)
     try:

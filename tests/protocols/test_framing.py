@@ -303,7 +303,7 @@ def test_resync_without_magic_drops_everything(data: bytes) -> None:
 
 
 def followers(framer: Framer, dialect: FramedDialect, size: int) -> tuple[list[bytes], bytes]:
-    """What :meth:`Framer.following` gives behind the first frame, and what it leaves."""
+    """Return what :meth:`Framer.following` gives behind the first frame, and the rest."""
     found = framer.cut()
     assert found is not None
     like = found[1] - dialect.header.size

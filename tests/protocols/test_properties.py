@@ -1,4 +1,4 @@
-"""What holds for any message, any bytes and any way of cutting them."""
+"""Properties of any message, any bytes and any way of cutting them."""
 
 from __future__ import annotations
 

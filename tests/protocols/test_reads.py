@@ -230,7 +230,7 @@ def test_unfinished_large_frame_is_dropped_and_the_next_comes(drop: str, write: 
 
 
 def words(dialect: FramedDialect, limit: int) -> st.SearchStrategy[bytes]:
-    """What a camera that runs free says: results of two applications, other things in between."""
+    """Return messages of a camera that runs free: results of two applications, others between."""
 
     def framed(message_id: int, body: bytes) -> bytes:
         return dialect.header.pack(message_id, len(body)) + body

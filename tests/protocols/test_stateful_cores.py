@@ -73,7 +73,7 @@ KINDS = {
     "broken": BROKEN,
     "wild": OPERATED | CROWDED | BROKEN,
 }
-"""What happens in a history beside a client that asks and a camera that answers."""
+"""Events in a history, beside a client that asks and a camera that answers."""
 
 FAMILIES = {"magic": ("handbook", "thesis"), "b16": ("b16", "b16 with quirk code"), "bid": ("bid",)}
 """Dialects that share their tests."""
@@ -97,7 +97,7 @@ def only_with(feature: str) -> Callable[[_Rule], _Rule]:
 
 
 class Cores(RuleBasedStateMachine):
-    """What TCP and UDP share: words, operators, time, and the way from a wire to the device."""
+    """Common parts of TCP and UDP: words, operators, time, the way from a wire to the device."""
 
     transport: Transport
     features: frozenset[str]
@@ -192,7 +192,7 @@ class Cores(RuleBasedStateMachine):
             self.say(line, message, promptly, answered)
 
     def keeps_frames(self, payload: bytes) -> bool:
-        """Whether the camera finds the next frame behind this one.
+        """Return True if the camera finds the next frame behind this one.
 
         Without a magic number it does not behind one that is too long, and what it takes for
         frames then could be a Connect.
@@ -285,11 +285,11 @@ class Cores(RuleBasedStateMachine):
         raise NotImplementedError
 
     def may_connect(self, line: Line) -> bool:
-        """Whether Connect may be put on the wire now."""
+        """Return True if Connect may be put on the wire now."""
         raise NotImplementedError
 
     def harmless(self, line: Line, what: Any) -> bool:
-        """Whether it connects only where that may be, and reboots nothing that shall stay up."""
+        """Return True if the step connects only where it may, and reboots nothing by mistake."""
         allowed = {0x01: self.may_connect(line), 0x43: "reboot" in self.features}
         return all(
             may or not noise(self.wire, what).endswith(packed(self.wire, (message_id, b"")))

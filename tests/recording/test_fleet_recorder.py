@@ -57,7 +57,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Disk:
-    """What ``fsync`` does from now on.
+    """A disk whose ``fsync`` does as it is told.
 
     Attributes:
         error: it raises this; None: nothing.

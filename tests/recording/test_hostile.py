@@ -221,7 +221,7 @@ WRONG: list[object] = [
     "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59+00:00", "http://x", "insight://h", "<",
     "\ud800",
 ]  # fmt: skip
-"""What may stand where something else is expected."""
+"""Values that may stand where something else is expected."""
 
 
 def messages() -> list[tuple[int, dict[str, Any]]]:

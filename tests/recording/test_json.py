@@ -1,4 +1,4 @@
-"""What a recorder writes, character for character that of the standard library."""
+"""The recorder's JSON is that of the standard library, character for character."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a recorder writes, as other programs read it."""
+"""Files that a recorder writes, as other programs read them."""
 
 from __future__ import annotations
 

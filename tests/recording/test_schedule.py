@@ -1,4 +1,4 @@
-"""Which container belongs to which trigger, and what came by itself."""
+"""Containers by the trigger that each belongs to, and those that came by themselves."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from tests.processes import free_port
 
 
 class Gone(Exception):  # noqa: N818
-    """What a caller gets when the service is withdrawn."""
+    """The answer that a caller gets when the service is withdrawn."""
 
 
 class Served:

@@ -30,7 +30,7 @@ ABORTED = (
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What was seen in the namespace."""
+    """The messages that were seen in the namespace."""
     files = ("std_msgs/msg/Header.msg", "geometry_msgs/msg/PoseStamped.msg")
     there = Path(PYTHON).exists() and all(Path("/usr/share", one).exists() for one in files)
     imports = [PYTHON, "-c", f"import {MODULES}"]

@@ -1,4 +1,4 @@
-"""What tests of a camera's node share: a camera that numbers its parts, and a node of paper."""
+"""Helpers of the tests of a camera's node: a camera that numbers its parts, and a node of paper."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class PaperPublisher:
 
 
 class PaperNode:
-    """What the parts of a camera's node use of one, in memory."""
+    """A node in memory, as far as the parts of a camera's node use one."""
 
     def __init__(self, name: str = "cam3", namespace: str = "/line1") -> None:
         self.name, self.namespace = name, namespace

@@ -104,7 +104,7 @@ class NotedNode:
 
     @property
     def still_declared(self) -> list[str]:
-        """What was declared and is not closed."""
+        """The ends that were declared and are not closed."""
         ends: dict[str, Any] = {**self.topics, **self.services}
         return sorted(name for name, one in ends.items() if not one.closed)
 

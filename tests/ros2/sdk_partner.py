@@ -60,7 +60,7 @@ def plain(message: Any) -> Any:
 
 
 class Partner:
-    """What it does when it is told."""
+    """A partner that acts when it is told."""
 
     def __init__(self, port: int) -> None:
         self.port = {"router_port": port, "domain_id": 7}

@@ -21,7 +21,7 @@ WAYS = {
     "active": ["configure", "activate"],
     "finalized": ["shutdown"],
 }
-"""How to come to each state."""
+"""Transitions that lead to each state."""
 
 GOALS = {
     ("unconfigured", "configure"): "inactive",
@@ -42,7 +42,7 @@ STEMS = {
     "shuttingdown": "SHUTDOWN",
     "errorprocessing": "ERROR",
 }
-"""What lifecycle_msgs calls that which follows these states."""
+"""Names of lifecycle_msgs for the transitions behind these states."""
 
 LABELS = ["configure", "cleanup", "activate", "deactivate", "shutdown", "create", "destroy"]
 LABELS += ["transition_success", "transition_failure", "transition_error", "Configure", "x" * 99]
@@ -349,7 +349,7 @@ async def test_it_waits_for_a_camera_that_is_away() -> None:
 
 
 async def test_who_takes_over_has_it() -> None:
-    """What starts by itself ends where somebody asks for something."""
+    """The automatic start ends as soon as somebody asks for something."""
     async with away(20) as one:
         assert one.state == "unconfigured"
         begun = asyncio.get_running_loop().time()

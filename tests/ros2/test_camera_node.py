@@ -178,7 +178,7 @@ def _is_active(made: CameraNode) -> Callable[[], bool]:
 @pytest.mark.long
 @pytest.mark.real_time
 async def test_nodes_come_and_go_while_others_call_and_listen() -> None:
-    """What stands on the engine's threads ends whatever they are doing."""
+    """Objects on the engine's threads end, whatever they are doing."""
     place = free_place()
     status = "smartcam_msgs/msg/CameraStatus"
     async with (

@@ -1,4 +1,4 @@
-"""What two cameras see, on topics of ROS: what is heard is what was found."""
+"""Depth of two cameras on topics of ROS: subscribers get what was found."""
 
 from __future__ import annotations
 

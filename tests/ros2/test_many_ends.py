@@ -11,7 +11,7 @@ from tests.ros2.roskit import STRING, until
 pytestmark = pytest.mark.real_time
 
 MANY = 1000
-"""Whose tokens are longer together than what the engine lets wait for a link, 128 KiB."""
+"""Number of ends whose tokens together exceed what the engine lets wait for a link, 128 KiB."""
 
 
 async def test_who_comes_later_sees_all_of_many() -> None:

@@ -1,4 +1,4 @@
-"""What ROS is told of results: values, frames, stamps, and what cannot be said."""
+"""Results as ROS is told them: values, frames, stamps, and those that no message can hold."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(folder: Path) -> dict[str, Any]:
-    """What the front end saw."""
+    """Messages that the front end saw."""
     for name in ("rclpy", "smartcam_msgs", "cv2"):
         if importlib.util.find_spec(name) is None:
             pytest.skip(f"needs {name}, which the step ros_native of .ci/run installs")

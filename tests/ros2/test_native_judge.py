@@ -34,7 +34,7 @@ cameras:
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the judge found, by the name of the check."""
+    """Findings of the judge, by the name of the check."""
     folder = tmp_path_factory.mktemp("judged")
     (folder / "plant.yaml").write_text(PLANT)
     local = {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}

@@ -1,4 +1,4 @@
-"""What a node through rclpy is made of, as far as it needs no rclpy."""
+"""Parts of a node through rclpy that need no rclpy."""
 
 from __future__ import annotations
 

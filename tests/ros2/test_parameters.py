@@ -24,7 +24,7 @@ def parameters() -> RosParameters:
 
 
 class Device:
-    """What hooks set; refuses what is said to be bad, and takes its time."""
+    """A device whose hooks set values; it refuses bad ones, and takes its time."""
 
     def __init__(self) -> None:
         self.said: list[Any] = []

@@ -1,4 +1,4 @@
-"""What is logged, on ``/rosout``."""
+"""Log records on ``/rosout``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where frames are: trees, times and what is refused, with transforms of our own making."""
+"""Trees of frames, their times, and the transforms that are refused; all are of our own making."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What rmw_zenoh puts on the wire, each with its source.
+"""Bytes that rmw_zenoh puts on the wire, each with its source.
 
 The examples are those of ``docs/design.md`` of rmw_zenoh (rolling, sections on keys, "Graph Cache"
 and "Publishers"), recorded there from ``demo_nodes_cpp``.

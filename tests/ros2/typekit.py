@@ -1,4 +1,4 @@
-"""What the tests of types share: messages with values drawn, and texts for other tools."""
+"""Helpers of the tests of types: messages with values drawn, and texts for other tools."""
 
 from __future__ import annotations
 

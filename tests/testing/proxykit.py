@@ -1,4 +1,4 @@
-"""What the proxy's tests share: ends of connections that keep what comes, and a target for them."""
+"""Helpers of the proxy's tests: ends of connections that keep what comes, and a target for them."""
 
 from __future__ import annotations
 

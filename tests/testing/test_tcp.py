@@ -52,7 +52,7 @@ from tests.testing.proxykit import (
 )
 
 BEHIND = b"abc"
-"""What the camera says behind the message."""
+"""Bytes that the camera sends behind the message."""
 
 
 class Write(NamedTuple):

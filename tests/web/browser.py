@@ -27,7 +27,7 @@ if CHROMIUM is None:
     pytest.skip("needs Chromium on the path, or named by CHROMIUM", allow_module_level=True)
 
 BROWSER_MARKS = [pytest.mark.long, pytest.mark.real_time, pytest.mark.asyncio(loop_scope="module")]
-"""What marks a module that shows pages."""
+"""The mark of a module that shows pages."""
 
 PATIENCE = 60.0
 """Seconds; only what has gone wrong takes as long."""

@@ -20,7 +20,7 @@ AT = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 class MadeUpCamera:
-    """What the table asks of a camera; without a session where it is not ``connected``."""
+    """A camera as the table asks for it; without a session where it is not ``connected``."""
 
     def __init__(self, name: str) -> None:
         self.name, self.url = name, f"fleet:///{name}"
@@ -89,7 +89,7 @@ class MadeUpCamera:
 
 
 class MadeUpFleet:
-    """What the page asks of a fleet, with agents ``a`` and ``b`` that have every other camera."""
+    """A fleet as the page asks for it, with agents ``a`` and ``b`` that have every other camera."""
 
     url = "fleet://made-up"
 

@@ -1,4 +1,4 @@
-"""What the tests of the pages share: sites, calls and event streams."""
+"""Helpers of the pages' tests: sites, calls and event streams."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TOKEN = "a-token_of-24-characters"  # noqa: S105 - of the tests
 
 
 class Answer(NamedTuple):
-    """What a call was answered with."""
+    """The answer to a call."""
 
     status: int
     value: Any

@@ -54,7 +54,7 @@ def coloured(number: int, colour: tuple[int, int, int] = (20, 20, 22), **other: 
 
 
 class Look(NamedTuple):
-    """What a page gets."""
+    """An answer that a page gets."""
 
     about: dict[str, Any]
     pixels: NDArray[np.uint8]

@@ -223,7 +223,7 @@ DRAWN = """
   return { natural: c.width / c.height, width, height, left, top };
 })
 """
-"""Where pictures are on the screen, without what is empty beside them."""
+"""Places of pictures on the screen, without the empty space beside them."""
 
 
 @contextlib.asynccontextmanager

@@ -1,4 +1,4 @@
-"""Who may use a site, and what every answer carries."""
+"""The users whom a site lets in, and the headers that every answer carries."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a fleet's camera sees, on its live page: where it has frames, and while somebody looks."""
+"""Frames of a fleet's camera on its live page, where it has some and while somebody looks."""
 
 from __future__ import annotations
 

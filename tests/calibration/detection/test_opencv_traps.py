@@ -1,4 +1,4 @@
-"""What OpenCV and SciPy do without an error, and what smartcam makes of it."""
+"""Wrong results that OpenCV and SciPy give without an error, and smartcam's answer to each."""
 
 from __future__ import annotations
 

@@ -187,7 +187,7 @@ CALLS = {"open", "os.rename", "os.remove", "os.link", "os.truncate", "shutil.cop
 """Audit events of what touches a file."""
 
 _calls_left: list[int] = []
-"""How many calls there is power for; empty: for all."""
+"""Number of calls that there is power for; empty: for all."""
 
 
 def _cut(event: str, _arguments: object) -> None:

@@ -1,4 +1,4 @@
-"""Where a camera is on a robot, or beside it."""
+"""The place of a camera on a robot, or beside it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which of two ways of solving is taken."""
+"""The choice between two ways of solving."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which view comes next: by what it tells, and how it is said."""
+"""The choice of the next view by what it tells, and its text."""
 
 from __future__ import annotations
 

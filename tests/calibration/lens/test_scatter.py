@@ -1,4 +1,4 @@
-"""What a lens says of its own error, where views err as a whole: simulation with known truth."""
+"""A lens' own error where views err as a whole: simulation with known truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How sure a lens is of where it projects: against simulated calibrations."""
+"""Predicted errors of a lens' projection, against simulated calibrations."""
 
 from __future__ import annotations
 

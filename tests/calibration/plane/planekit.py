@@ -30,7 +30,7 @@ GRID = grid(3, 3)
 
 @dataclass(frozen=True)
 class Scene:
-    """Where a camera's plane lies in a robot's space.
+    """The place of a camera's plane in a robot's space.
 
     Attributes:
         turn: R_robot_camera (3, 3).

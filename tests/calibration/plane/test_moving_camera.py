@@ -189,7 +189,7 @@ def test_moved_before_the_chain_is_wrong() -> None:
 HAND_EYE = Transform(
     "flange", "camera", rotation_about(np.array([0.3, -0.2, 1]), 0.8), np.array([0.05, 0.02, 0.08])
 )
-"""Where the camera is on the flange; nothing but the simulation knows it."""
+"""Place of the camera on the flange; nothing but the simulation knows it."""
 
 GRID = np.array([(x, y, 0.0) for x in (-0.12, 0.0, 0.12) for y in (-0.1, 0.0, 0.1)])
 

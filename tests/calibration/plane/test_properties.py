@@ -1,4 +1,4 @@
-"""What holds for every plane, in all eight octants, whatever the camera's unit.
+"""Properties of every plane, in all eight octants, whatever the camera's unit.
 
 Planes are drawn with their origin up to 10 m off in each direction, any turn, normals along and
 against z and x among them, and 10^-6 to 10^3 metres for each unit of the camera. Every property has

@@ -38,7 +38,7 @@ ELSEWHERE = {
     "t21": ("test_to_robot_from_another_frame_raises", "test_transform_wrong_way_round_is_refused"),
     "t22": ("test_fit_touches_of_swapped_rays_is_mirrored", "test_to_robot_with_tool_flip_*"),
 }
-"""Where a trap's tests stand that are not in this file; ``*`` is any ending."""
+"""Places of the traps' tests that are not in this file; ``*`` is any ending."""
 
 TRAPS = [*(f"t{number}" for number in range(1, 24)), "t3b", "t5b", "t6b", "t6c", "t11b", "t15b"]
 SEEN = part(0.0, 0.0)

@@ -1,4 +1,4 @@
-"""What of a target is black, and how it becomes SVG and PDF."""
+"""The black parts of a target, and their SVG and PDF."""
 
 from __future__ import annotations
 

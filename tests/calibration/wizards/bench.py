@@ -24,7 +24,7 @@ ROTATION = np.array([[_COS, -_SIN, 0.0], [_SIN, _COS, 0.0], [0.0, 0.0, 1.0]])
 """R_robot_camera: a table that is turned under the robot."""
 
 OFFSET = np.array([0.4, -0.2, 0.05])
-"""Where the camera's origin lies in the robot's space, metres."""
+"""Place of the camera's origin in the robot's space, metres."""
 
 HELD = Quaternion(1.0, 0.0, 0.0, 0.0)
 """The tool points down."""

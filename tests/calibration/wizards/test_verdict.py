@@ -1,4 +1,4 @@
-"""What a calibration is worth: the verdict, and the choice that it makes advisable."""
+"""The verdict on a calibration, and the choice that it makes advisable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which view comes next: always the same at first, then by what the views leave open."""
+"""The next view: always the same at first, then by what the views leave open."""
 
 from __future__ import annotations
 

@@ -203,7 +203,7 @@ DESCRIPTION = """<?xml version="1.0" encoding="utf-8"?>
 
 @dataclass
 class Mischief:
-    """What happens to packets, by a seed.
+    """Faults of packets, by a seed.
 
     Attributes:
         seed: of the dice.

@@ -1,4 +1,4 @@
-"""What is cut from a client's bytes, and what is refused."""
+"""Requests that are cut from a client's bytes, and bytes that are refused."""
 
 from __future__ import annotations
 

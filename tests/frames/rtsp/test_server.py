@@ -1,4 +1,4 @@
-"""What a server answers, and when it says no."""
+"""Answers of a server, and its refusals."""
 
 from __future__ import annotations
 

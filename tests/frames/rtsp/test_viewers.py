@@ -1,4 +1,4 @@
-"""What reaches viewers: whole pictures, the newest ones, and nobody is held up for another."""
+"""Viewers get whole pictures, the newest ones, and none is held up for another."""
 
 from __future__ import annotations
 

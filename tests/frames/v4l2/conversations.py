@@ -24,7 +24,7 @@ STREAM = ("DQBUF", "QBUF")
 
 
 class Answer(NamedTuple):
-    """What was asked, and what came."""
+    """A question to the kernel, and its answer."""
 
     asked: str
     """``open``, ``close``, or an ioctl's name."""

@@ -1,4 +1,4 @@
-"""What a program does with a camera: done with the kernel's vivid and recorded, and done again."""
+"""Programs that use a camera: run with the kernel's vivid and recorded, and run again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What holds for the driver with the kernel's; runs in the machine, and writes what came of it."""
+"""Checks of the driver with the kernel's; runs in the machine, and writes their outcome."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 CACHE = Path(tempfile.gettempdir()) / "smartcam-vivid-kernel"
-"""Where the kernel is: ``vmlinuz`` and the modules that are used."""
+"""Folder of the kernel: ``vmlinuz`` and the modules that are used."""
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -1,4 +1,4 @@
-"""What frames cost, CPU time against OpenCV's in one run; in the machine with video devices::
+"""Measure frames' CPU time against OpenCV's in one run; in the machine with video devices::
 
     python -m tests.frames.vivid.machine run tests/frames/vivid/measure.py
 
