@@ -713,7 +713,7 @@ JSON_KINDS: dict[str, frozenset[str]] = {
         {"-0.5", "-1", "1.5", "2**32", "2**64", "10**400", "text", "empty text", "true"}
     ),
 }
-"""Which of these may be said, for each kind of field; those others are refused. What must be said
+"""Odd values that may be said, for each kind of field; the others are refused. What must be said
 may not be null, too."""
 
 JSON_FIELDS: dict[str, str] = {

@@ -1,4 +1,4 @@
-"""Which module imports what, as the source says it."""
+"""The imports of each module, as the source says them."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from tests.timed_loop import TimedLoop
 
 LOOP = os.environ.get("SMARTCAM_TEST_LOOP", "")
-"""Which loop all tests are to have; empty for the usual ones."""
+"""The loop that all tests are to have; empty for the usual ones."""
 
 if LOOP not in {"", "eager", "debug", "uvloop"}:
     raise ValueError(f"SMARTCAM_TEST_LOOP is eager, debug or uvloop, not {LOOP!r}")

@@ -41,7 +41,7 @@ RETURNED = frozenset(
         *("TargetPose", "TargetView", "TimeOffset"),
     }
 )
-"""What functions return: fields that nobody gives odd values, or that are read from files."""
+"""Classes that functions return, with fields that nobody gives odd values or that files hold."""
 
 
 @functools.cache

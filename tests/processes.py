@@ -46,7 +46,7 @@ LOADED = (
     *("smartcam.calibration.wizards._plane", "smartcam.recording", "smartcam.web", "mcap.writer"),
     "scipy.special",
 )
-"""What commands import, mostly when it is used."""
+"""Modules that commands import, mostly when they are used."""
 
 LARGEST = 1 << 16
 
@@ -84,7 +84,7 @@ def printed_by(python: str) -> str:
 
 
 class Outcome(NamedTuple):
-    """How a command ended."""
+    """The end of a command."""
 
     code: int
     out: str
@@ -185,7 +185,7 @@ class Process:
 
     @property
     def running(self) -> bool:
-        """Whether it has not ended."""
+        """True as long as the process has not ended."""
         return self._life.ended(0) is None
 
     def send_signal(self, number: int) -> None:

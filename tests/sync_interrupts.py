@@ -69,7 +69,7 @@ CALLS: dict[str, Call] = {
 
 
 def in_finalizer(frame: Any) -> bool:
-    """Whether it is part of a ``__del__``, from which Python lets no exception pass."""
+    """True if the frame is part of a ``__del__``, from which Python lets no exception pass."""
     while frame is not None:
         if frame.f_code.co_name == "__del__":
             return True

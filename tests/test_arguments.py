@@ -77,7 +77,7 @@ BASE: dict[str, Any] = {
     "request": {"message_id": 0x30},
     "wait_status": {"predicate": bool},
 }
-"""What a camera's method is given beside the odd value."""
+"""Arguments that a camera's method is given beside the odd value."""
 
 
 def test_every_public_argument_is_in_the_table() -> None:

@@ -1,4 +1,4 @@
-"""What an endpoint reads: one datagram, however large, and no room for more."""
+"""An endpoint reads one datagram, however large, and makes no room for more."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ LOCAL = re.compile(r"127\.0\.0\.1:\d{4,5}")
 pytestmark = pytest.mark.long
 
 OPTIONAL = ("opentelemetry.sdk", "prometheus_client")
-"""What some examples import and the tests do not demand; the extra ``dev`` has it."""
+"""Packages that some examples import and the tests do not demand; the extra ``dev`` has them."""
 
 
 class Block(NamedTuple):

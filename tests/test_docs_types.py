@@ -1,4 +1,4 @@
-"""What a page shows type-checks: the ``python`` blocks of the documents, by mypy and pyright.
+"""The pages' ``python`` blocks type-check, by mypy and pyright.
 
 Both are strict but for annotations of the pages' own functions, which readers can do without. A
 block that cannot be checked like this stands in :data:`LEFT_OUT` with the reason, and only as long

@@ -1,4 +1,4 @@
-"""What the extra brings, and which of it is refused."""
+"""Packages that the extra brings, and those of them that are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What observers see, in which order, and what becomes of one that fails."""
+"""The hooks of observers, their order, and what becomes of one that fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Windows has not: loops that watch no sockets and take no signals, and no eventfd.
+"""Features that Windows lacks: loops that watch sockets and take signals, and eventfd.
 
 The loop here refuses what asyncio's Proactor loop does not have; its own transports go on.
 """

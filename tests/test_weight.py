@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 PAGE = ROOT / "docs" / "architecture" / "rooms.md"
 BESIDE = "beside the rooms"
-"""What the table calls the modules directly in smartcam."""
+"""The table's name for the modules directly in smartcam."""
 
 
 def budgets() -> dict[str, int]:
