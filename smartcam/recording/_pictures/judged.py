@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from smartcam.frames._inside import FrameTap
 from smartcam.observers import Observer
 from smartcam.recording._judged import PictureMatcher
-from smartcam.recording._mcap.form import RecordedPicture
+from smartcam.recording._mcap.form import RecordedPicture, captured_at
 
 if TYPE_CHECKING:
     from smartcam.frames import Frame, FrameSource
@@ -54,8 +53,7 @@ class JudgedPictures(Observer):
         """
 
         def take(frame: Frame) -> bool:
-            at = datetime.fromtimestamp(max(0.0, frame.utc), UTC)
-            self._matcher.add_picture(RecordedPicture(camera, at, frame))
+            self._matcher.add_picture(RecordedPicture(camera, captured_at(frame), frame))
             self._settle(camera)
             return True
 
