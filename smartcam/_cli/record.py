@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, cast
 
 import click
 
@@ -31,12 +31,14 @@ from smartcam.exceptions import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import AsyncIterator, Coroutine
 
     from smartcam.camera import Camera
     from smartcam.fleet import FleetCamera
     from smartcam.frames import FrameSource
+    from smartcam.observers import Observer
     from smartcam.recording import BagCounts, BagRecorder, FleetReplay, Recorder, Recording
+    from smartcam.recording._inside import JudgedPictures
 
 
 def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> datetime | None:
@@ -46,6 +48,11 @@ def _time(_ctx: click.Context, _param: click.Parameter, value: str | None) -> da
     except (ValueError, OverflowError) as exc:
         raise click.BadParameter(f"{value!r} is no time such as 2026-01-02T03:04:05Z") from exc
 
+
+JUDGED: Final = "judged"
+"""Word for the pictures that results were made of."""
+
+NO_PICTURES: Final = "none"
 
 _camera = click.option(
     "--camera", metavar="NAME", help="Which camera of the recording; default all of them."
@@ -73,8 +80,10 @@ _camera = click.option(
 )
 @click.option(
     "--pictures",
-    metavar="SOURCE",
-    help="Record the pictures of a source of frames beside it, such as gige://HOST.",
+    metavar="judged|none|SOURCE",
+    help="judged: of each result the picture that it was made of, of software cameras (as usual) "
+    "and of a fleet's cameras with frames. none: no pictures. SOURCE: beside the results those of "
+    "a source of frames, such as gige://HOST.",
 )
 @click.option(
     "--read-images",
@@ -96,24 +105,28 @@ async def record(
     options: Options,
 ) -> None:
     """Record a camera."""
-    if (pictures is not None or read_images) and output is None:
+    if (pictures not in {None, NO_PICTURES} or read_images) and output is None:
         raise click.UsageError("pictures go into a recording (-o), not into a bag")
     if read_images and every is None:
         raise click.UsageError(
             "--read-images needs --every: only of a trigger that is sent from "
             "here the picture that is read is surely the result's"
         )
-    recorders = _recorders(output, bag, force=force)
+    recorders = _recorders(output, bag, force=force, pictures=pictures != NO_PICTURES)
     url = await options.located(url)
     async with contextlib.AsyncExitStack() as stack:
-        source = None
-        if pictures is not None:
+        source = judged = None
+        observers: list[Observer] = [*recorders]
+        if pictures == JUDGED:
+            judged = _judged_pictures(url, recorders[0])
+            observers += [] if judged is None else [judged]
+        elif pictures not in {None, NO_PICTURES}:
             with from_part("frames", "pictures need"):
                 from smartcam._cli.frame_sources import opened
 
             source = await stack.enter_async_context(opened(pictures, options))
-        camera = stack.enter_context(options.camera(url, observers=recorders, reconnect=Backoff()))
-        await _record(camera, recorders, _Plan(every, source, read_images), options)
+        camera = stack.enter_context(options.camera(url, observers=observers, reconnect=Backoff()))
+        await _record(camera, recorders, _Plan(every, source, judged, read_images), options)
 
 
 class _Plan(NamedTuple):
@@ -121,16 +134,39 @@ class _Plan(NamedTuple):
 
     every: float | None  # seconds between triggers; None: none are sent
     source: FrameSource | None  # whose pictures are recorded as well
+    judged: JudgedPictures | None  # finds the picture of each result among the camera's frames
     read_images: bool  # after each trigger, the camera's picture
 
 
-def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Recorder]:
+def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
+    """Return what finds the picture of each result; None where the camera tells it.
+
+    Raises UnsupportedError: nobody knows the pictures of the camera's results.
+    """
+    from smartcam.settings import is_fleet, is_software, masked
+
+    if is_software(url):
+        return None
+    if not is_fleet(url):
+        raise UnsupportedError(
+            f"--pictures judged: {masked(url)} sends no pictures with its results: expected a "
+            "software camera, or a camera with frames of a fleet; --pictures SOURCE records those "
+            "of a source of frames, and --read-images asks a camera that has any"
+        )
+    with from_part("frames", "pictures need"):
+        from smartcam.recording._inside import JudgedPictures
+    return JudgedPictures(recorder)
+
+
+def _recorders(
+    output: str | None, bag: str | None, *, force: bool, pictures: bool
+) -> list[Recorder]:
     """Return the recorders of the file and of the bag that the options ask for."""
     from smartcam.recording import Recorder
 
     recorders: list[Recorder] = []
     if output is not None:
-        recorders.append(Recorder(output, overwrite=force))
+        recorders.append(Recorder(output, overwrite=force, pictures=pictures))
     if bag is not None:
         if output is not None and Path(output).resolve().parent == Path(bag).resolve():
             raise ConfigurationError(f"--output {output}: it would be in the bag's own folder")
@@ -145,11 +181,14 @@ def _recorders(output: str | None, bag: str | None, *, force: bool) -> list[Reco
 async def _record(
     unopened: Camera, recorders: list[Recorder], plan: _Plan, options: Options
 ) -> None:
-    from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
     from smartcam.settings import is_fleet
 
     opened: list[Recorder] = []
-    facts = {name: getattr(options, name) for name in ("interpret_as", "application", "y_down")}
+    facts = {
+        "interpret_as": options.interpret_as or unopened.settings.interpret_as,
+        "application": options.application,
+        "y_down": options.y_down,
+    }
     try:
         for recorder in recorders:
             recorder.open()
@@ -166,29 +205,51 @@ async def _record(
                     f"{camera.name}: the camera sends no results by itself; to have some triggered "
                     "while it is recorded: --every SECONDS"
                 )
+            if plan.read_images and not camera.capabilities.read_image:
+                raise UnsupportedError(
+                    f"{camera.name}: this camera cannot be asked for a picture; --pictures SOURCE "
+                    "records those of a source of frames"
+                )
             paths = {_word(recorder): str(recorder.path) for recorder in recorders}
             options.show(
                 {"url": camera.url, **paths},
                 f"recording {camera.url} to {' and '.join(paths.values())}, Ctrl-C to end",
             )
-            jobs: list[Coroutine[Any, Any, None]] = [*map(_watch_disk, recorders)]
-            reads_last = plan.read_images  # then the last picture is read, too, before it ends
-            jobs.append(_count(results, recorders[0], None if reads_last else options.count))
-            images = recorders[0] if plan.read_images else None
-            if images is not None and not camera.capabilities.read_image:
-                raise UnsupportedError(
-                    f"{camera.name}: this camera cannot be asked for a picture; --pictures SOURCE "
-                    "records those of a source of frames"
-                )
-            if plan.every is not None:
-                step = options.step(DEFAULT_TRIGGER_TIMEOUT)
-                jobs.append(_trigger(camera, plan.every, step, images, options.count))
-            if plan.source is not None:
-                jobs.append(_record_pictures(plan.source, recorders[0], camera.name))
-            async with counting(camera):
+            async with _judged_source(camera, plan) as source, counting(camera):
+                jobs = _jobs(camera, recorders, plan, results, options)
+                if source is not None and plan.judged is not None:
+                    jobs.insert(0, plan.judged.record(source, camera.name))
                 await first(jobs, options.seconds)
     finally:
         await _end_all(opened, unopened, options)
+
+
+@contextlib.asynccontextmanager
+async def _judged_source(camera: Camera, plan: _Plan) -> AsyncIterator[FrameSource | None]:
+    """Give the open source of the pictures among which those of results are looked for."""
+    if plan.judged is None:
+        yield None
+        return
+    async with cast("FleetCamera[Any]", camera).frame_source() as source:
+        yield source
+
+
+def _jobs(
+    camera: Camera, recorders: list[Recorder], plan: _Plan, results: Any, options: Options
+) -> list[Coroutine[Any, Any, None]]:
+    """Return the jobs of a recording, which ends with the first of them."""
+    from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+
+    jobs: list[Coroutine[Any, Any, None]] = [*map(_watch_disk, recorders)]
+    count = options.count
+    images = recorders[0] if plan.read_images else None  # and the last one is read, too
+    jobs.append(_count(results, recorders[0], plan.judged, count if images is None else None))
+    if plan.every is not None:
+        step = options.step(DEFAULT_TRIGGER_TIMEOUT)
+        jobs.append(_trigger(camera, plan.every, step, images, count))
+    if plan.source is not None:
+        jobs.append(_record_pictures(plan.source, recorders[0], camera.name))
+    return jobs
 
 
 def _describe_shared(recorders: list[Recorder], camera: FleetCamera[Any]) -> None:
@@ -227,8 +288,10 @@ async def _watch_disk(recorder: Recorder) -> None:
     raise await recorder.wait_failed()
 
 
-async def _count(results: Any, recorder: Recorder, count: int | None) -> None:
-    """Return when there are so many results; the stream's end is the camera's."""
+async def _count(
+    results: Any, recorder: Recorder, judged: JudgedPictures | None, count: int | None
+) -> None:
+    """Return when there are so many results, and pictures of them; or at the camera's end."""
     while count is None or recorder.counts.results < count:
         try:
             await anext(results)
@@ -236,6 +299,8 @@ async def _count(results: Any, recorder: Recorder, count: int | None) -> None:
             pass  # it is recorded as an error
         except StopAsyncIteration:
             return
+    if judged is not None:
+        await judged.wait_settled()
 
 
 async def _record_pictures(source: FrameSource, recorder: Recorder, camera: str) -> None:

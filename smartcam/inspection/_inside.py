@@ -8,10 +8,12 @@ from smartcam._lazy import lazy
 
 if TYPE_CHECKING:
     from smartcam.inspection._camera.judged_frames import judged_source
+    from smartcam.inspection._camera.pairing import JudgedResults
     from smartcam.inspection._learning import learned
     from smartcam.inspection._teaching import read_settings, setting_text, tool_settings
 
 __all__ = [
+    "JudgedResults",
     "judged_source",
     "learned",
     "read_settings",
@@ -24,6 +26,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "_camera.judged_frames": "judged_source",
+            "_camera.pairing": "JudgedResults",
             "_learning": "learned",
             "_teaching": "read_settings setting_text tool_settings",
         },

@@ -9,9 +9,11 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.recording._bags.conversion import BagConversion
     from smartcam.recording._pictures.folder import file_name
+    from smartcam.recording._pictures.judged import JudgedPictures
 
 __all__ = [
     "BagConversion",
+    "JudgedPictures",
     "file_name",
 ]
 
@@ -21,5 +23,6 @@ if not TYPE_CHECKING:
         {
             "_bags.conversion": "BagConversion",
             "_pictures.folder": "file_name",
+            "_pictures.judged": "JudgedPictures",
         },
     )

@@ -107,7 +107,8 @@ class PictureMatcher:
         while self.results:
             result = self.results[0]
             picture = self._by_time(result)
-            if picture is None and not self._is_late(result):
+            findable = result.triggered_at is not None
+            if picture is None and findable and not self._is_late(result):
                 return
             self.results.popleft()
             yield JudgedResult(result, picture, False)

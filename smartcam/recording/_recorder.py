@@ -40,6 +40,7 @@ from smartcam.recording._mcap.form import (
     RecordedError,
     RecordedPicture,
     body_of,
+    captured_at,
     load_compress,
     message_of,
     nanoseconds,
@@ -324,17 +325,21 @@ class Recorder(Observer):
         Raises:
             ConfigurationError: an argument is of another kind; or it becomes a video, and the
                 picture is another camera's.
-            FrameFormatError: it becomes a video, which cannot hold the picture without loss.
+            FrameFormatError: it becomes a video, which cannot hold the picture without loss; or
+                nobody could read the picture again, such as one of more than 1,048,576 pixels
+                along a side. The recording goes on without it.
             MissingExtraError: the distribution of frames is not installed.
         """
         with from_part("frames", "pictures need"):
             from smartcam.frames import Frame
+            from smartcam.recording._pictures.messages import check_readable
 
         check_kind(frame, Frame, "frame", "a Frame", "recording")
         if result is not None:
             check_kind(result, Result, "result", "a Result, or None", "recording")
         name = check_text(camera, "camera", "recording", least=0, most=MAX_NAME) or frame.source
         made = (None, None) if result is None else (result.number, result.received_at)
+        check_readable(frame)
         if (check := getattr(self._file, "check_picture", None)) is not None:
             check(frame, name)
         size = memoryview(frame.data).nbytes
@@ -349,8 +354,7 @@ class Recorder(Observer):
                 return False
             left_out = self._left_out.pop(name, 0)
             self._counts["pictures"] += 1
-            at = datetime.fromtimestamp(max(0.0, frame.utc), UTC)
-            self._items.append(RecordedPicture(name, at, frame, left_out, *made))
+            self._items.append(RecordedPicture(name, captured_at(frame), frame, left_out, *made))
             self._waiting_pictures += size + OVERHEAD
             if not waiting or waiting < CHUNK <= self._waiting_pictures:
                 self._more.notify()
@@ -412,7 +416,8 @@ class Recorder(Observer):
         Raises:
             ConfigurationError: an argument is wrong.
             LocalProtocolError: the source is not open.
-            FrameFormatError: it becomes a video, which cannot hold the pictures without loss.
+            FrameFormatError: it becomes a video, which cannot hold the pictures without loss; or
+                one of them cannot be recorded, as :meth:`add_picture` says.
             FrameSourceError: the source is gone, or stuck; what came before is recorded.
             RecordingError: the recording ended, such as on a full disk.
             MissingExtraError: the distribution of frames is not installed.

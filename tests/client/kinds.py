@@ -148,6 +148,7 @@ IN_TIME_OF_THEIR_OWN = frozenset(
         "test_fence_that_was_cancelled_after_its_stop_is_finished_by_the_next",
         "test_switch_cancelled_in_any_phase_leaves_a_camera_that_works",
         "test_request_cancelled_in_line_sends_nothing",
+        "test_trigger_whose_turn_comes_too_late_is_not_sent",
         "test_close_while_opening_ends_the_opener",
         "test_events_tell_of_changes_that_are_asked_for",
         "test_connection_lost_again_soon_is_no_other_clients_doing",
@@ -169,4 +170,7 @@ IN_TIME_OF_THEIR_OWN = frozenset(
         "test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
     }
 )
-"""Those that count the loop's steps, measure, or take long in real time: not over Zenoh."""
+"""Those that count the loop's steps, measure, name exact times, or take long in real time.
+
+They run neither over Zenoh nor in uvloop, whose time is the real one.
+"""

@@ -86,6 +86,7 @@ class DeskDriver(FrameDriver):
         super().__init__(address)
         self._desk = Desk.all[address.host]
         self._task: asyncio.Task[None] | None = None
+        self._sink: FrameSink | None = None
 
     async def open(self) -> StreamFormat:
         if not self._desk.plugged:
@@ -95,7 +96,7 @@ class DeskDriver(FrameDriver):
     async def start(self, sink: FrameSink) -> None:
         if not self._desk.plugged:
             raise FrameSourceError("nobody there", source=self._desk.url)
-        self._desk.sink = sink
+        self._desk.sink = self._sink = sink
         self._task = asyncio.create_task(self._run())
 
     async def _run(self) -> None:
@@ -109,7 +110,8 @@ class DeskDriver(FrameDriver):
         if task is not None:
             task.cancel()
             await asyncio.wait({task})
-        self._desk.sink = None
+        if self._desk.sink is self._sink:  # nobody else looks by now
+            self._desk.sink = None
 
     async def close(self) -> None:
         await self.stop()

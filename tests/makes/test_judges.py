@@ -2,11 +2,19 @@
 
 It asks by XML-RPC what a device is before it speaks PCIC; that one question is answered here. It
 runs in a process of its own, since it waits without letting Python go on.
+
+Its futures have a race of their own (``frame_grabber_impl.hpp`` of 1.6.16): its thread fulfils a
+promise first and puts a new one in its place afterwards. Whoever calls ``wait_for_frame()`` between
+the two gets the frame before once more, and ``sw_trigger()`` gives the next trigger's future, which
+nobody fulfils, if the answer is there before it returns. So the answer waits here until the client
+has its future, and the client asks for the next frame behind the callback for the last one, which
+its thread calls after it has renewed both promises.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import platform
 import sys
 import threading
@@ -15,30 +23,40 @@ from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 import pytest
 
+from smartcam.emulator import ManualClock
+from smartcam.emulator.faults import Delay
 from smartcam.makes import EmulatedIfm, ImageChunk
+from smartcam.protocols import messages as m
 
 CONFIDENCE = 300
 """Type of the chunk of a confidence image."""
 
 LEVELS = bytes(range(8))
 COUNT = 3
+TIME = 0.01
+"""Seconds of an evaluation, and until a trigger is answered, by the sensor's clock."""
 
 CLIENT = """
+import queue
 import sys
 from ifm3dpy import buffer_id
 from ifm3dpy.device import O3D
 from ifm3dpy.framegrabber import FrameGrabber
 
 grabber = FrameGrabber(O3D("127.0.0.1", int(sys.argv[1])), int(sys.argv[2]))
+renewed = queue.Queue()
+grabber.on_new_frame(lambda frame: renewed.put(frame.frame_count()))
 assert grabber.start([buffer_id.CONFIDENCE_IMAGE]).wait_for(10_000)[0]
 for _ in range(int(sys.argv[3])):
-    frame = grabber.wait_for_frame()
-    assert grabber.sw_trigger().wait_for(10_000)[0]
+    frame, taken = grabber.wait_for_frame(), grabber.sw_trigger()
+    print("triggered", flush=True)
+    assert taken.wait_for(10_000)[0]
     came, found = frame.wait_for(10_000)
     assert came
     image = found.get_buffer(buffer_id.CONFIDENCE_IMAGE)
-    print(image.shape[:2], image.tobytes().hex(), found.frame_count())
-assert grabber.stop().wait_for(10_000)
+    print(image.shape[:2], image.tobytes().hex(), found.frame_count(), flush=True)
+    assert renewed.get(timeout=10) == found.frame_count()
+assert grabber.stop().wait_for(10_000)[0]
 """
 
 
@@ -78,19 +96,32 @@ async def test_ifms_own_client_gets_each_frame_that_it_triggers(parameters: int)
         {"confidence_image": ImageChunk(CONFIDENCE, 4, 2, number, 1.5, LEVELS).encoded}
         for number in range(1, COUNT + 1)
     ]
-    async with EmulatedIfm(applications=[{"id": 1, "parts": parts}]) as emulator:
+    clock = ManualClock()
+    async with EmulatedIfm(
+        applications=[{"id": 1, "parts": parts, "processing_time": TIME}],
+        clock=clock,
+        faults=[Delay(on=m.TriggerAnswer, times=None, seconds=TIME)],
+    ) as emulator:
         client = await asyncio.create_subprocess_exec(
             *(sys.executable, "-c", CLIENT, str(parameters), str(emulator.port), str(COUNT)),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
         )
+        lines: list[str] = []
         try:
             async with asyncio.timeout(60):
-                said, _ = await client.communicate()
+                async for said in client.stdout or ():
+                    lines.append(said.decode().strip())
+                    if lines[-1] == "triggered":
+                        asked = lines.count("triggered")
+                        await emulator.wait_received(m.Trigger, count=asked, timeout=10)
+                        clock.advance(TIME)
+                await client.wait()
         finally:
             if client.returncode is None:
                 client.kill()
                 await client.wait()
-    lines = said.decode().splitlines()
-    assert lines == [f"(2, 4) {LEVELS.hex()} {number}" for number in range(1, COUNT + 1)]
+    expected = [("triggered", f"(2, 4) {LEVELS.hex()} {number}") for number in range(1, COUNT + 1)]
+    assert lines == [*itertools.chain.from_iterable(expected)]
     assert client.returncode == 0
+    assert len(emulator.fired) == COUNT

@@ -6,6 +6,7 @@ import asyncio
 import dataclasses
 import itertools
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -211,6 +212,72 @@ def test_picture_beyond_the_bound_is_left_out_and_counted(
     found = load_recording(path)
     assert (found.counts.pictures, found.counts.left_out) == (2, 1)
     assert [one.lost for one in found.pictures()] == [0, 1]
+
+
+WIDEST_PX = 1 << 20
+UNREADABLE: dict[str, dict[str, Any]] = {
+    "too wide": {"width": WIDEST_PX + 1, "height": 1},
+    "too high": {"width": 1, "height": WIDEST_PX + 1},
+    "of no width": {"form": "MJPEG", "width": 0},
+    "too few bytes": {"data": b"few"},
+    "rows of negative bytes": {"stride": -64},
+    "no time": {"captured": math.nan},
+    "no time of day": {"utc": math.nan},
+    "a time before 1970": {"utc": -1.0},
+    "a time beyond the file's": {"utc": 2e10},
+    "an endless time of the device": {"device_time": math.inf},
+    "a negative exposure": {"duration": -0.001},
+    "an exposure of no time": {"duration": math.nan},
+    "a number of 65 bits": {"sequence": 1 << 64},
+    "fewer than none lost": {"lost": -1},
+}
+"""Pictures that nobody could read again."""
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_picture_that_nobody_could_read_is_refused_and_the_file_stays_good(
+    case: str, tmp_path: Path
+) -> None:
+    wrong = shot(2, **UNREADABLE[case])
+    path = tmp_path / "run.mcap"
+    with Recorder(path) as recorder:
+        assert recorder.add_picture(shot(1))
+        with pytest.raises(FrameFormatError, match=r"left: a picture cannot be|needs|bytes"):
+            recorder.add_picture(wrong)
+        assert recorder.add_picture(shot(3))
+    found = load_recording(path)
+    assert found.remark == ""
+    assert [one.sequence for one in found.pictures()] == [1, 3]
+
+    with RotatingRecorder(tmp_path / "folder") as folder:
+        for picture in (shot(1), wrong, shot(3)):
+            folder.add_picture(picture)
+    account = folder.accounts["left"]
+    assert (account.written, account.waiting, account.lost) == (2, 0, 1)
+    again = load_recording(tmp_path / "folder")
+    assert again.remark == ""
+    assert [one.sequence for one in again.pictures()] == [1, 3]
+    assert [one.error for one in again.errors()] == ["RecordingGap"]
+
+
+def test_widest_picture_that_is_taken_is_read_again(tmp_path: Path) -> None:
+    written = [shot(1), shot(2, width=WIDEST_PX, height=1), shot(3, width=1, height=WIDEST_PX)]
+    recording = load_recording(recorded(tmp_path / "run.mcap", *written))
+    assert recording.remark == ""
+    assert all(map(same, written, recording.pictures()))
+
+
+async def test_source_of_pictures_too_wide_ends_its_recording_with_the_reason(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    frames = [shot(1), shot(2, width=WIDEST_PX + 1, height=1), shot(3)]
+    with Recorder(path) as recorder:
+        async with FrameSource(_Burst(frames), stall=None) as source:
+            with pytest.raises(FrameFormatError, match=r"1048577x1, expected 1 to 1048576 pixels"):
+                await recorder.record(source)
+    found = load_recording(path)
+    assert (found.counts.pictures, found.remark) == (1, "")
 
 
 @has_full_disk

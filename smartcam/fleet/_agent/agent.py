@@ -334,7 +334,10 @@ class Agent:
         if frames_of is not None:
             self._frames[name] = frames_of
         found = self._frames.get(name, NO_FRAMES)
-        frames = SharedFrames(name, found.make, self._sender, self._encoder, found.url)
+        teller = found.teller
+        frames = SharedFrames(
+            name, found.make, self._sender, self._encoder, found.url, teller is not None
+        )
         events = self._on_camera_event
         host = Host(
             name,
@@ -347,7 +350,7 @@ class Agent:
             topics,
             frames,
             self._bundle,
-            self._observers,
+            self._observers if teller is None else (teller, *self._observers),
         )
         host.numbers = self._numbers_at.pop(name, host.numbers)
         host.began, host.final = host.results.following, not self.stands_by

@@ -33,6 +33,7 @@ from smartcam.fleet._security.door import Door
 from smartcam.fleet._security.renewal import RETRY_AFTER, CertificateWatch
 from smartcam.frames import FrameAddress
 from smartcam.models import CameraEvent
+from smartcam.observers import Observers
 from smartcam.settings import masked
 from smartcam.streams import Subscribers, Subscription
 
@@ -396,12 +397,19 @@ class FleetServer(Server):
         camera = await asyncio.to_thread(software_camera, planned.name, given, folder)
         with from_part("inspection", '"software:" in a fleet file needs'):
             from smartcam.inspection import SoftwareDevice
-            from smartcam.inspection._inside import judged_source
+            from smartcam.inspection._inside import JudgedResults, judged_source
         device = SoftwareDevice(camera)
         await stack.enter_async_context(device)
         drawn = bool(given.get("drawn", True))
         make = functools.partial(judged_source, device.eyes, drawn=drawn)
-        return device, FramesOf(make, masked(camera.frames))
+        observers = Observers(self.observers)
+        teller = JudgedResults(
+            device.last_sent,
+            lambda: self._hosts[planned.name].camera.statistics().received,
+            lambda result, judged: observers.picture(result, judged.frame),
+        )
+        device.eyes.viewers.add(teller.take)
+        return device, FramesOf(make, masked(camera.frames), teller)
 
     async def _emulate(self, planned: Planned, stack: contextlib.AsyncExitStack) -> str:
         """Start an emulated camera; return its URL."""

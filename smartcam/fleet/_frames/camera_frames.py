@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._frames.video import SharedVideo
     from smartcam.frames import Frame, FrameSource, SourceStatistics
     from smartcam.geometry import CameraModel
+    from smartcam.observers import Observer
 
 T = TypeVar("T")
 
@@ -63,10 +64,13 @@ class FramesOf(NamedTuple):
     Attributes:
         make: returns the source; None: there is none.
         url: address of the source, without a password; for people.
+        teller: observer of the camera's sessions that tells the others which picture each result
+            is made of; None: nobody knows it.
     """
 
     make: Callable[[], FrameSource] | None
     url: str | None
+    teller: Observer | None = None
 
 
 NO_FRAMES = FramesOf(None, None)
@@ -89,6 +93,7 @@ class SharedFrames:
         sender: sender of the frames' bytes.
         encoder: encoder that makes frames small before they are sent.
         url: address of the source, without a password; for people.
+        told: whether the camera's observers are told the picture of each result.
     """
 
     name: str
@@ -96,6 +101,7 @@ class SharedFrames:
     sender: FrameSender
     encoder: FrameEncoder
     url: str | None = None
+    told: bool = False
     _source: FrameSource | None = None
     _opening: asyncio.Task[FrameSource] | None = None
     _viewers: dict[tuple[str, int], FrameStream] = field(

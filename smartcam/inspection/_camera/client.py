@@ -78,7 +78,6 @@ class SoftwareCamera(SmartCamera[ValueT]):
         return self._device.eyes.trouble
 
     async def open(self) -> Self:
-        self._pairs.begin()
         try:
             await self._device.start()
             self._go_to(self.settings.address._replace(port=self._device.emulator.port))

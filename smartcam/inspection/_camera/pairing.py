@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from smartcam.models import Disconnected
+from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.observers import Observer
 
 if TYPE_CHECKING:
@@ -71,15 +71,12 @@ class JudgedResults(Observer):
             self._under_way[self._sent] = _SentContainer(report.result.data, judged)
             self._under_way.pop(self._sent - MAX_UNDER_WAY, None)
 
-    def begin(self) -> None:
-        """Begin to count anew, as there is no session."""
-        self._before = self._received()
-        self._under_way.clear()
-
     def on_state(self, event: CameraEvent) -> None:
-        """Begin to count anew where a session ends."""
-        if isinstance(event, Disconnected):
-            self.begin()
+        """Begin to count anew with each session, of this client or of a new one."""
+        if isinstance(event, (Connected, Reconnected)):
+            self._before = self._received()
+        elif isinstance(event, Disconnected):
+            self._under_way.clear()
 
     def on_result(self, result: Result) -> None:
         """Find the picture of a result."""

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from smartcam._user_code import ENDS_PROGRAM
+from smartcam.exceptions import FrameFormatError
 from smartcam.recording._exclusive_files import opened
 from smartcam.recording._folders.track import Gap
 from smartcam.recording._recorder import Description, RecordingFile
@@ -124,6 +125,8 @@ class FolderFiles:
         for item in items:
             try:
                 file.add(item)
+            except FrameFormatError as exc:  # which is an OSError, and not the disk's
+                track.lose_one(str(exc))
             except OSError:
                 raise
             except Exception as exc:  # noqa: BLE001 - nobody could read it back

@@ -11,7 +11,13 @@ from smartcam.backoff import Backoff
 from smartcam.exceptions import SmartCamError
 from smartcam.frames._inside import FrameTap
 from smartcam.recording._judged import PictureMatcher
-from smartcam.recording._mcap.form import MAX_PICTURE_SIZE_BYTES, RecordedError, RecordedPicture
+from smartcam.recording._mcap.form import (
+    MAX_PICTURE_SIZE_BYTES,
+    RecordedError,
+    RecordedPicture,
+    captured_at,
+)
+from smartcam.recording._pictures.judged import MAX_MATCHED_BYTES
 from smartcam.recording._recorder import MAX_WAITING_BYTES
 
 if TYPE_CHECKING:
@@ -24,9 +30,6 @@ if TYPE_CHECKING:
     from smartcam.recording._folders.writer import FolderWriter
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
-
-MAX_MATCHED_BYTES: Final = 1 << 26
-"""Bytes of a camera's last pictures that are kept until the result that was made of one comes."""
 
 MAX_BYTES_WITH_PICTURES: Final = 3 * MAX_WAITING_BYTES // 4
 """Bytes that may wait for the disk behind a picture: the rest of the room is for results."""
@@ -64,6 +67,11 @@ class FleetPictures:
             matcher.results.append(result)
             self._settle(track, matcher)
 
+    def told(self, track: CameraTrack, result: Result[Any], frame: Frame) -> None:
+        """Record the picture of which the camera says that a result was made of it."""
+        made = 0, result.number, result.received_at
+        self._put(track, RecordedPicture(track.camera, captured_at(frame), frame, *made))
+
     async def stop(self) -> None:
         """Record no more pictures.
 
@@ -81,7 +89,7 @@ class FleetPictures:
         delays, told = RETRY.delays(), ""
         while True:
             host = self._server.hosts.get(track.camera)
-            if host is None or host.frames.closed or host.frames.make is None:
+            if host is None or host.frames.closed or host.frames.make is None or host.frames.told:
                 return
             why = "they ended"
             try:
@@ -105,7 +113,7 @@ class FleetPictures:
         def take(frame: Frame) -> bool:
             nonlocal came
             came = True
-            picture = RecordedPicture(track.camera, _time_of(frame), frame)
+            picture = RecordedPicture(track.camera, captured_at(frame), frame)
             if self._all:
                 return self._put(track, picture)
             matcher.add_picture(picture)
@@ -125,7 +133,7 @@ class FleetPictures:
     def _settle(self, track: CameraTrack, matcher: PictureMatcher) -> None:
         for _, picture, _ in matcher.settled_by_time():
             if picture is not None:
-                self._put(track, RecordedPicture(track.camera, _time_of(picture), picture))
+                self._put(track, RecordedPicture(track.camera, captured_at(picture), picture))
 
     def _put(self, track: CameraTrack, picture: RecordedPicture) -> bool:
         """Have a picture written, or left out and counted where results might find no room."""
@@ -141,7 +149,3 @@ class FleetPictures:
         text = f"its pictures are not recorded: {why}"
         error = RecordedError(track.camera, datetime.now(UTC), "FrameSourceError", text, None)
         self._writer.put(track, error, len(text))
-
-
-def _time_of(frame: Frame) -> datetime:
-    return datetime.fromtimestamp(max(0.0, frame.utc), UTC)

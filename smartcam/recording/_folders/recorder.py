@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from smartcam.fleet import FleetServer
     from smartcam.fleet._inside import RecordSection
+    from smartcam.frames import Frame
     from smartcam.recording._folders.pictures import FleetPictures
     from smartcam.recording._folders.track import CameraTrack, RecordingAccount
     from smartcam.recording._mcap.form import Item
@@ -214,6 +215,12 @@ class _Hooks(Observer):
             if self._pictures is not None:
                 self._pictures.result(track, result)
 
+    def on_picture(self, result: Result, frame: Frame) -> None:
+        """Keep the picture of a result, which software cameras tell."""
+        track = self._track(result.camera)
+        if track is not None and self._pictures is not None:
+            self._pictures.told(track, result, frame)
+
     def on_error(self, camera: str, error: SmartCamError, triggered_at: datetime | None) -> None:
         """Keep an error."""
         track = self._track(camera)
@@ -228,24 +235,20 @@ class _Hooks(Observer):
         return None if host is None else host.camera.endian
 
     def _track(self, camera: str) -> CameraTrack | None:
-        try:
-            return self._tracks[camera]
-        except KeyError:
-            track = self._tracks[camera] = self._new(camera)
-            return track
+        if camera not in self._tracks and camera in self._server.hosts:
+            self._tracks[camera] = self._new(camera)
+        return self._tracks.get(camera)
 
     def _new(self, camera: str) -> CameraTrack | None:
         if not self._section.chooses(camera):
             return None
-        file = self._server.file
-        entry = next((one.entry for one in file.plan() if one.name == camera), None)
-        spec = None if entry is None else entry.interpret_as
-        y_down, lenient = (False, False) if entry is None else (entry.y_down, entry.lenient)
+        settings = self._server.hosts[camera].settings
+        spec, y_down, lenient = settings.interpret_as, settings.y_down, settings.lenient
         track = self._writer.track(camera, _SeenReading(camera, spec, y_down, lenient).items)
         said = {
-            "fleet": file.fleet,
+            "fleet": self._server.file.fleet,
             "interpret_as": spec,
-            "application": None if entry is None else entry.application,
+            "application": settings.application,
             "y_down": y_down or None,
             "lenient": lenient or None,
             "frames": None if self._section.frames else "no",

@@ -77,6 +77,9 @@ MAX_NAME = 1000
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 
+MAX_UTC = 18_446_744_073.0
+"""Seconds since 1970 of the latest capture, in 2554: times are in nanoseconds, of 64 bits."""
+
 
 class RecordedError(NamedTuple):
     """Something went wrong while it was recorded: what ``Observer.on_error`` is told.
@@ -124,6 +127,11 @@ class RecordedPicture(NamedTuple):
 
 Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError | RecordedPicture
 """Any item that a recording holds."""
+
+
+def captured_at(frame: Frame) -> datetime:
+    """Return when a picture was captured, as near as a recording can say it."""
+    return datetime.fromtimestamp(min(max(0.0, frame.utc), MAX_UTC), UTC)
 
 
 class Kind(NamedTuple):

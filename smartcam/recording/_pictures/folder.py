@@ -17,6 +17,7 @@ from smartcam.recording._mcap.form import (
     MAX_NAME,
     MAX_PICTURE_SIZE_BYTES,
     RecordedPicture,
+    captured_at,
     load_compress,
 )
 from smartcam.recording._pictures.recorder import record_frames
@@ -153,9 +154,10 @@ class RotatingRecorder:
                 )
             track = self._tracks[name] = self._writer.track(name, _itself)
         size = memoryview(frame.data).nbytes
-        at = datetime.fromtimestamp(max(0.0, frame.utc), UTC)
         return self._writer.put(
-            track, RecordedPicture(name, at, frame), size if size <= MAX_PICTURE_SIZE_BYTES else -1
+            track,
+            RecordedPicture(name, captured_at(frame), frame),
+            size if size <= MAX_PICTURE_SIZE_BYTES else -1,
         )
 
     async def record(

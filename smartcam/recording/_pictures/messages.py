@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, Moment, find_format
-from smartcam.recording._mcap.form import MAX_NAME, RecordedPicture
+from smartcam.recording._mcap.form import MAX_NAME, MAX_UTC, RecordedPicture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from smartcam.frames import PixelFormat
 
 MAX_SIDE_PX: Final = 1 << 20
-"""Pixels along a side of a picture that is read."""
+"""Pixels along a side of a picture that is written, or read."""
 
 MAX_FIELDS: Final = 1000
 """Fields of a message that is read; ours have fewer than 30."""
@@ -128,8 +128,39 @@ def schema_of(picture: RecordedPicture) -> str:
     return VIDEO if found.name == "H264" else COMPRESSED
 
 
+def check_readable(frame: Frame) -> None:
+    """See that what is written of a frame can be read again.
+
+    Raises:
+        FrameFormatError: it cannot be, and the recording would end there for those who read it.
+    """
+    said, form = "", find_format(frame.format.name)
+    if not (1 <= frame.width <= MAX_SIDE_PX and 1 <= frame.height <= MAX_SIDE_PX):
+        said = f"{frame.width}x{frame.height}, expected 1 to {MAX_SIDE_PX} pixels along each side"
+    elif not (math.isfinite(frame.captured) and math.isfinite(frame.device_time or 0.0)):
+        said = f"captured {frame.captured}, {frame.device_time} of the device, expected seconds"
+    elif not 0 <= frame.utc <= MAX_UTC:
+        said = f"captured {frame.utc} s after 1970, expected 0 to {MAX_UTC:.0f}"
+    elif not frame.duration >= 0:
+        said = f"duration {frame.duration}, expected 0 or more seconds"
+    elif not 0 <= frame.stride < 1 << 32:
+        said = f"stride {frame.stride}, expected bytes in 32 bits"
+    elif not (frame.sequence < 1 << 64 and 0 <= frame.lost < 1 << 64):
+        said = f"number {frame.sequence}, {frame.lost} lost, expected numbers of 64 bits"
+    if said:
+        raise FrameFormatError(
+            f"{frame.source}: a picture cannot be recorded: {said}", source=frame.source
+        )
+    form.check(frame.data, frame.width, frame.height, frame.stride)
+
+
 def picture_message(picture: RecordedPicture) -> bytes:
-    """Return the message of a picture."""
+    """Return the message of a picture.
+
+    Raises:
+        FrameFormatError: it could not be read again.
+    """
+    check_readable(picture.frame)
     frame, received = picture.frame, picture.result_received_at
     name = schema_of(picture)
     data = memoryview(frame.data).cast("B")

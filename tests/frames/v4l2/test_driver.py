@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import itertools
+import struct
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -15,26 +16,38 @@ from smartcam.frames import Moment
 from smartcam.frames._v4l2 import abi, discovery, stream, system
 from smartcam.frames._v4l2.device import FORMATS, CaptureDevice
 from tests.frames.v4l2 import scenarios
-from tests.frames.v4l2.conversations import WRAPPED, Replay
+from tests.frames.v4l2.conversations import WRAPPED, Answer, Replay
 
 Player = Callable[[str], Replay]
+Begin = Callable[[Replay], None]
 
 
 @pytest.fixture
-def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Player]:
-    """Have the system answer as it did; all devices and buffers are to be given back."""
+def begin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Begin]:
+    """Have a replay answer in the system's stead; devices and buffers are to be given back."""
     played: list[Replay] = []
 
-    def begin(scenario: str) -> Replay:
-        played.append(Replay(scenario))
+    def put(replay: Replay) -> None:
+        played.append(replay)
         for name in WRAPPED:
-            monkeypatch.setattr(system, name, getattr(played[-1], name))
-        return played[-1]
+            monkeypatch.setattr(system, name, getattr(replay, name))
 
-    yield begin
+    yield put
     for one in played:
         assert not one.devices, "a device is open still"
         assert not any(pages.open for pages in one.mapped), "a buffer is mapped still"
+
+
+@pytest.fixture
+def play(begin: Begin) -> Player:
+    """Have the system answer as it did."""
+
+    def play_scenario(scenario: str) -> Replay:
+        replay = Replay(scenario)
+        begin(replay)
+        return replay
+
+    return play_scenario
 
 
 def whole(replay: Replay) -> None:
@@ -335,3 +348,87 @@ def test_matrix_that_is_not_known_is_refused(colorspace: int, encoding: int) -> 
     layout = abi.BufferLayout(8, 8, code, 1, 16, 128, colorspace, abi.PRIVATE_MAGIC, 0, encoding)
     with pytest.raises(FrameFormatError, match=r"BT.601, BT.709 or BT.2020, the device has"):
         device._coloured(FORMATS[code], layout)
+
+
+# ------------------------------------------------------------------ colours, through the whole path
+
+FORMAT_FIELDS = struct.Struct("I" if abi.POINTER == 4 else "Q")
+COLOUR_FIELDS = struct.Struct("5I")
+COLOURS_AT = FORMAT_FIELDS.size + 6 * 4
+"""Byte of ``struct v4l2_format`` at which the color space stands; private, flags, encoding and
+quantization follow."""
+
+WEIGHTS = {"601": (0.299, 0.114), "709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
+"""Of red and blue in Y, from the recommendations of ITU-R."""
+
+
+class ColouredDevice(Replay):
+    """The recorded device, whose format tells other colours, and whose picture is red.
+
+    Args:
+        colours: color space, ``private``, encoding and quantization.
+        red: the four bytes of two red pixels.
+    """
+
+    def __init__(self, colours: tuple[int, int, int, int], red: bytes) -> None:
+        super().__init__("stream")
+        self._colours, self._red = colours, red
+
+    def ioctl(self, device: int, request: abi.Ioctl, argument: bytearray) -> None:
+        super().ioctl(device, request, argument)
+        if request.name in ("G_FMT", "S_FMT"):
+            space, private, encoding, quantization = self._colours
+            fields = space, private, 0, encoding, quantization
+            COLOUR_FIELDS.pack_into(argument, COLOURS_AT, *fields)
+
+    def close(self, device: int) -> None:
+        if self.left[-1].asked != "close":  # it was refused
+            self.left = [Answer("close", "", 0, "", 0)]
+        super().close(device)
+
+    def _write(self, argument: bytearray) -> None:
+        super()._write(argument)
+        for pages in self.mapped:
+            if pages.open:
+                pages.data[:] = self._red * (len(pages.data) // 4)
+
+
+def red_pixels(matrix: str, *, full: bool) -> bytes:
+    """Return two red pixels as YUYV, by the recommendations' formulas."""
+    red, blue = WEIGHTS[matrix]
+    y, u, v = red, -red / (2 * (1 - blue)), 0.5
+    if full:
+        said = [round(255 * y), round(128 + 255 * u), min(255, round(128 + 255 * v))]
+    else:
+        said = [round(16 + 219 * y), round(128 + 224 * u), round(128 + 224 * v)]
+    return bytes([said[0], said[1], said[0], said[2]])
+
+
+@pytest.mark.parametrize(
+    ("colours", "matrix", "full", "name"),
+    [
+        ((8, abi.PRIVATE_MAGIC, 0, DEFAULT), "601", False, "YUV422_8"),
+        ((7, abi.PRIVATE_MAGIC, 0, DEFAULT), "601", True, "YCbCr422_8"),
+        ((8, abi.PRIVATE_MAGIC, 0, FULL), "601", True, "YCbCr422_8"),
+        ((3, abi.PRIVATE_MAGIC, 0, DEFAULT), "709", False, "YCbCr709_422_8"),
+        ((8, abi.PRIVATE_MAGIC, 2, DEFAULT), "709", False, "YCbCr709_422_8"),
+        ((3, abi.PRIVATE_MAGIC, 2, FULL), "709", True, "YUV422_8_709_full"),
+        ((3, abi.PRIVATE_MAGIC, 1, LIMITED), "601", False, "YUV422_8"),
+        ((10, abi.PRIVATE_MAGIC, 0, LIMITED), "2020", False, "YUV422_8_2020"),
+        ((8, abi.PRIVATE_MAGIC, 6, FULL), "2020", True, "YUV422_8_2020_full"),
+        ((3, 0, 1, FULL), "709", False, "YCbCr709_422_8"),  # a kernel that only knows color spaces
+    ],
+)
+async def test_red_of_an_open_device_is_red_whatever_colours_it_tells(
+    begin: Begin, colours: tuple[int, int, int, int], matrix: str, full: bool, name: str
+) -> None:
+    begin(ColouredDevice(colours, red_pixels(matrix, full=full)))
+    for frame in await scenarios.stream():
+        assert frame.format.name == name
+        assert abs(frame.rgb().astype(int) - [255, 0, 0]).max() <= 2
+
+
+async def test_open_device_of_another_matrix_is_refused_and_given_back(begin: Begin) -> None:
+    begin(ColouredDevice((2, abi.PRIVATE_MAGIC, 0, DEFAULT), bytes(4)))
+    with pytest.raises(FrameFormatError, match=r"the device has those of 240M \(color space 2"):
+        await scenarios.opened(scenarios.URL)

@@ -100,10 +100,14 @@ class TriggerChecks(Parameters):
     ) -> None:
         """Check that the late result does not pass for the next trigger's."""
         async with visiting(camera_kind, application=SLOW) as (_, camera):
-            for run in range(0, 6, 2):
-                with pytest.raises(TriggerTimeoutError):
+            inspections = 0
+            for _ in range(3):
+                with pytest.raises(TriggerTimeoutError) as caught:
                     await camera.trigger(timeout=SHORT_TIMEOUT)
-                assert await number(camera) == run + 1
+                if "no trigger was sent" not in str(caught.value):  # as on a slow machine
+                    inspections += 1
+                assert await number(camera) == inspections
+                inspections += 1
             balance(camera.statistics())
 
     @in_a_loop
