@@ -112,7 +112,7 @@ class Places(Generic[G]):
         own: name of a session in the log, "a session".
 
     Attributes:
-        most: value that was given; may be changed.
+        most: connections at a time; may be changed.
         crowded_out: connections that were closed, or refused, because too many were open.
     """
 

@@ -33,7 +33,7 @@ MAX_DELAY: Final = 3600.0
 
 MAX_QUEUED_RESULTS: Final = 10_000
 DEFAULT_QUEUED_RESULTS: Final = 100
-"""Results that may wait for a delay to pass, and those that do where the request says none."""
+"""Results that wait for a delay to pass at most, where the request gives no number."""
 
 _KEYWORDS: Final = {"localizations": "localizations", "50bytestrings": "strings50"}
 
@@ -151,7 +151,7 @@ class ThesisFace(Protocol):
         ...
 
     async def end_publishing(self) -> None:
-        """Publish neither on topics that a request has named."""
+        """Publish nothing more on the topics that requests have named."""
 
     async def have_session(self) -> None:
         """Have a session with the camera, or raise the error that says why there is none."""
@@ -191,7 +191,7 @@ class ThesisService(NamedTuple):
         settles: the service changes what is published, and waits for others that do.
         after_stop: whether the service works after SmartcameraStop, before the next
             SmartcameraSetup.
-        nothing: the field of its answer that is an empty list beside an error, where it has one.
+        nothing: name of the answer's field that is an empty list beside an error, if it has one.
     """
 
     request: type[ThesisRequest]

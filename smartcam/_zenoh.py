@@ -75,7 +75,7 @@ is long; what comes beyond is dropped, and results are asked for again later."""
 QUERY_BYTES = 256
 """Bytes that a query counts beside its payload."""
 
-REPLIERS = 4
+REPLY_THREADS = 4
 """Threads that answer queries; a client that does not read its answer blocks one of them."""
 
 MAX_WAITING_QUERIES = 4096
@@ -537,7 +537,7 @@ class ZenohSession:
             quietly(query.drop)
             return
         if self._repliers is None:
-            self._repliers = ThreadPoolExecutor(REPLIERS, "smartcam-fleet-reply")
+            self._repliers = ThreadPoolExecutor(REPLY_THREADS, "smartcam-fleet-reply")
         with self._lock:
             self._replying += 1
         self._repliers.submit(call, *arguments).add_done_callback(self._replied)

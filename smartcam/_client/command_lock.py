@@ -37,7 +37,7 @@ class Before:
     Attributes:
         application: id of the application that was active.
         running: whether the application ran.
-        wanted: what was asked of the camera.
+        wanted: the application and run state that the program asked for.
     """
 
     application: int
@@ -324,7 +324,7 @@ class CommandLock:
         return isinstance(error, LinkError) or (link is not None and link.lost)
 
     async def _have(self, application: int | None, running: bool | None) -> None:
-        """Have an application and a run state, by the least that is needed; None: as it is."""
+        """Bring about an application and a run state with the fewest commands; None: leave it."""
         commands, status = self._commands, self._status
         deadline = self._connection.deadline(self._switch_timeout)
         active = await commands.query_loaded(deadline)

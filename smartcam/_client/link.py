@@ -63,7 +63,7 @@ SHARED_TURN_TIME = 0.00005
 Each step of another link waits for one turn of every link that is flooded.
 """
 
-PASSES = 4
+MAX_PASSES = 4
 """Most turns of the loop before the next chunk, where other links share the loop: as
 long as other tasks take longer than one turn."""
 
@@ -385,7 +385,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
     async def _give_way(self) -> None:
         """Let the loop go round; more often where it is shared and the others are at work."""
-        for _ in range(PASSES if links[self.loop] > 1 else 1):
+        for _ in range(MAX_PASSES if links[self.loop] > 1 else 1):
             left = perf_counter()
             await asyncio.sleep(0)
             if perf_counter() - left < SHARED_TURN_TIME:

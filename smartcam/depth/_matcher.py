@@ -29,7 +29,7 @@ SUBPIXELS: Final = 16
 WINDOWS: Final = (0, 5, 7, 9, 11, 13, 15)
 """Sides of the window in which disparities are refined, pixels; 0: no refinement."""
 
-MOST: Final = 4096
+MAX_DISPARITIES: Final = 4096
 """Disparities that are searched at most, pixels."""
 
 
@@ -89,8 +89,8 @@ class _WordParameter(NamedTuple):
 
 
 _BOTH: Final[dict[str, _WholeParameter | _WordParameter]] = {
-    "min_disparity": _WholeParameter(0, -MOST, MOST),
-    "num_disparities": _WholeParameter(128, 16, MOST, 16),
+    "min_disparity": _WholeParameter(0, -MAX_DISPARITIES, MAX_DISPARITIES),
+    "num_disparities": _WholeParameter(128, 16, MAX_DISPARITIES, 16),
     "speckle_window_size": _WholeParameter(100, 0, 1_000_000),
     "speckle_range": _WholeParameter(1, 0, 1000),
 }
@@ -166,8 +166,8 @@ class StereoMatcher:
             )
         self.algorithm = algorithm
         self.parameters: Mapping[str, Value] = _merged(algorithm, parameters)
-        if left_right is not None and not 0 <= left_right <= MOST:
-            raise _wrong("left_right", f"0 to {MOST} pixels or None", left_right)
+        if left_right is not None and not 0 <= left_right <= MAX_DISPARITIES:
+            raise _wrong("left_right", f"0 to {MAX_DISPARITIES} pixels or None", left_right)
         if refine not in WINDOWS:
             raise _wrong("refine", f"one of {WINDOWS}", refine)
         self._left_right, self._refine = left_right, refine
@@ -178,7 +178,9 @@ class StereoMatcher:
         }
         # OpenCV's own check is between its guesses only; it is in whole pixels, and -1 does not
         # turn that of SGBM off
-        numbers["disp12_max_diff"] = MOST if left_right is None else math.ceil(left_right)
+        numbers["disp12_max_diff"] = (
+            MAX_DISPARITIES if left_right is None else math.ceil(left_right)
+        )
         self._compute = _ALGORITHMS[algorithm](numbers)
         self._lock = threading.Lock()  # OpenCV's matchers keep their buffers
 

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
     from smartcam.frames import ClockStatistics, Frame
 
-KEPT: Final = 600
+MAX_PAIRS: Final = 600
 """Pairs that are remembered: 20 s at 30 pairs a second."""
 
-RECENT: Final = 30
+SKEW_PAIRS: Final = 30
 """Pairs over which the skew is measured."""
 
-LEAST: Final = 30
+MIN_PAIRS: Final = 30
 """Pairs needed to know a rate."""
 
 
@@ -34,7 +34,7 @@ class PairClock:
     """Skew and drift of two cameras, from the frames that were paired."""
 
     def __init__(self) -> None:
-        self._seen: collections.deque[_SeenPair] = collections.deque(maxlen=KEPT)
+        self._seen: collections.deque[_SeenPair] = collections.deque(maxlen=MAX_PAIRS)
 
     def saw(self, left: Frame, right: Frame) -> None:
         """Take a pair; one whose numbers begin again begins everything again."""
@@ -47,7 +47,7 @@ class PairClock:
 
     def skew(self) -> float | None:
         """Return the median skew of the last pairs, seconds the right one is later."""
-        recent = list(self._seen)[-RECENT:]
+        recent = list(self._seen)[-SKEW_PAIRS:]
         if not recent:
             return None
         return statistics.median(one.captured[1] - one.captured[0] for one in recent)
@@ -70,7 +70,7 @@ class PairClock:
     def _rates(self) -> tuple[float, float] | None:
         """Return both cameras' frames a second of our clock."""
         seen = list(self._seen)
-        if len(seen) < LEAST or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
+        if len(seen) < MIN_PAIRS or seen[-1].captured[0] - seen[0].captured[0] < MIN_DRIFT_DURATION:
             return None
         found = []
         for side in (0, 1):

@@ -12,7 +12,7 @@ import numpy as np
 from smartcam._argument_checks import a_list, a_number, or_none, takes
 from smartcam._arguments import check_flag, shown
 from smartcam.depth._from_reader import ReaderDriver
-from smartcam.depth._matcher import MOST, StereoMatcher
+from smartcam.depth._matcher import MAX_DISPARITIES, StereoMatcher
 from smartcam.depth._one_thread import OneThread
 from smartcam.depth._pair import CalibratedPair
 from smartcam.depth._pair_clock import PairClock
@@ -263,7 +263,9 @@ class StereoDepth:
 
 
 def _default_matcher(width: int) -> StereoMatcher:
-    return StereoMatcher(num_disparities=min(MOST, 16 * math.ceil(width / SEARCHED / 16)))
+    return StereoMatcher(
+        num_disparities=min(MAX_DISPARITIES, 16 * math.ceil(width / SEARCHED / 16))
+    )
 
 
 def _depth(

@@ -38,7 +38,7 @@ KNOCK_TIMEOUT = 1.0
 KNOCK_AFTER = 0.25
 """Seconds to wait before this connection: a camera going down closes its port a moment later."""
 
-SOON = 10.0
+TAKEN_WITHIN = 10.0
 """Seconds: a session that is lost so soon after its Connect was probably taken, as the client's
 own rule has it (see :mod:`smartcam._client.supervisor`)."""
 
@@ -234,7 +234,7 @@ async def explain_loss(exam: Examination, error: SmartCamError) -> None:
             **details,
         )
     elif closed and not udp and await _knock(exam):
-        soon = ", soon after its Connect" if age < SOON else ""
+        soon = ", soon after its Connect" if age < TAKEN_WITHIN else ""
         exam.fail(
             f"the camera ended the session after {age:.1f} s{soon}, and still takes connections: "
             "another client has most probably taken it",

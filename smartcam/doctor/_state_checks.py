@@ -25,7 +25,7 @@ QUERIES = 30
 QUERIES_WITHIN = 3.0
 """Seconds after which no further request is sent: on a slow link fewer must do."""
 
-SLOW = 0.05
+SLOW_ROUND_TRIP_TIME = 0.05
 """Seconds of round trip from which on a hint is given: on a local network it takes milliseconds."""
 
 MAX_SEEN = 1000
@@ -114,7 +114,7 @@ async def measure_round_trip(exam: Examination) -> None:
         await camera.query_application()
         times.append(loop.time() - sent_at)
     measured = figures(times)
-    slow = measured.median > SLOW
+    slow = measured.median > SLOW_ROUND_TRIP_TIME
     text = f"{measured.times} requests: {measured}"
     exam.say(
         "hint" if slow else "ok",

@@ -35,7 +35,7 @@ TIMEOUT = 10.0
 """Seconds for coming to the fleet."""
 
 
-MEET = 2.0
+MEET_TIMEOUT = 2.0
 """Seconds that a camera's agent is waited for before its node comes."""
 
 
@@ -165,7 +165,7 @@ class RosFleet(Server):
     async def _meet(camera: FleetCamera[Any]) -> None:
         """Wait a moment for what its agent says of it: whether it has frames."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(MEET):
+            async with asyncio.timeout(MEET_TIMEOUT):
                 while not camera.met:  # noqa: ASYNC110 - nothing tells of it
                     await asyncio.sleep(0.01)
 

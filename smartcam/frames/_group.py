@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.frames._source import FrameSource
 
 
-KEPT: Final = 8
+MAX_WAITING_FRAMES: Final = 8
 """Frames of each camera that wait for those of the others."""
 
 UNKNOWN_PERIOD: Final = 0.04
@@ -243,7 +243,7 @@ class FrameGroup:
         """Take a frame of a camera; see whether it completes a set."""
         kept = self._kept[name]
         kept.append(frame)
-        if len(kept) > KEPT:
+        if len(kept) > MAX_WAITING_FRAMES:
             kept.popleft()
             self._alone[name] += 1
         found = {name: frame}

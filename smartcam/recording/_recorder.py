@@ -78,7 +78,7 @@ VIDEO_SUFFIX = ".mkv"
 CLOSE_TIMEOUT = 30.0
 """Seconds that :meth:`Recorder.close` waits for the disk."""
 
-OVERHEAD = 512
+ITEM_OVERHEAD_BYTES = 512
 """Bytes that an item counts beside its data."""
 
 
@@ -355,7 +355,7 @@ class Recorder(Observer):
             left_out = self._left_out.pop(name, 0)
             self._counts["pictures"] += 1
             self._items.append(RecordedPicture(name, captured_at(frame), frame, left_out, *made))
-            self._waiting_pictures += size + OVERHEAD
+            self._waiting_pictures += size + ITEM_OVERHEAD_BYTES
             if not waiting or waiting < CHUNK <= self._waiting_pictures:
                 self._more.notify()
         return True
@@ -447,7 +447,7 @@ class Recorder(Observer):
                 self._counts[kind] += 1
             before = self._waiting
             self._items.append(item)
-            self._waiting += size + OVERHEAD
+            self._waiting += size + ITEM_OVERHEAD_BYTES
             if not before or before < CHUNK <= self._waiting:
                 self._more.notify()
             full = self._waiting > MAX_WAITING_BYTES

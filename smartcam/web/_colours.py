@@ -38,7 +38,7 @@ MAX_LOOKS: Final = 16
 MAX_KEPT: Final = 8
 """Viewers whose pictures are kept."""
 
-KEPT: Final = 2
+PICTURES_PER_VIEWER: Final = 2
 """Pictures kept for each viewer: the one that is shown, and the one on its way."""
 
 THREADS: Final = 2
@@ -131,7 +131,7 @@ class ColourSite(ThreadedSite):
             raise RefusedError(409, str(exc), "a source that gives frames") from exc
         except StopAsyncIteration:
             raise RefusedError(410, f"{name} has ended", "one that goes on") from None
-        kept = self._kept.setdefault(viewer, deque(maxlen=KEPT))
+        kept = self._kept.setdefault(viewer, deque(maxlen=PICTURES_PER_VIEWER))
         kept.append(frame)
         self._kept.move_to_end(viewer)
         while len(self._kept) > MAX_KEPT:

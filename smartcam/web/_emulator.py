@@ -32,10 +32,10 @@ MAX_WAIT = 30.0
 """Seconds that a call waits for a log entry at most."""
 
 MAX_WAITING_CHANGES = 16
-"""Calls that wait for one at a time. With the event streams they leave half of the places free."""
+"""Calls that may wait for a log entry at a time: with the event streams half of the places."""
 
 LOOK_AGAIN = 0.02
-"""Seconds between two looks for it."""
+"""Seconds between two looks for a log entry."""
 
 MAX_PARTS = 100
 """Parts on a table; a result container has room for about 900 localizations."""
@@ -47,8 +47,8 @@ MAX_NAMES = 20
 class EmulatorSite(Site):
     """A page and HTTP calls that show and control emulated cameras.
 
-    It runs in the emulators' own event loop. They may be started and stopped on their own; the
-    mapping is looked into at each call.
+    The site runs in the emulators' own event loop. The emulators may be started and stopped on
+    their own; each call looks into the mapping anew.
 
     ::
 

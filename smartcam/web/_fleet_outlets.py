@@ -14,7 +14,7 @@ from smartcam.web._errors import RefusedError
 if TYPE_CHECKING:
     from smartcam.fleet import Fleet, ToldOutlet, ToldStore
 
-KEPT: Final = 2.0
+ANSWER_AGE: Final = 2.0
 """Seconds for which the answer for one page does for the others, too."""
 
 MAX_STORE_QUESTIONS: Final = 4
@@ -42,19 +42,19 @@ class OutletsView:
     def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._accounts: list[ToldOutlet] = []
-        self._at = -KEPT
+        self._at = -ANSWER_AGE
         self._turn = asyncio.Lock()
         self._stores = asyncio.Semaphore(MAX_STORE_QUESTIONS)
 
     async def accounts(self) -> list[ToldOutlet]:
-        """Return the accounts of all outlets, of :data:`KEPT` seconds before at most.
+        """Return the accounts of all outlets, of :data:`ANSWER_AGE` seconds before at most.
 
         Raises:
             RefusedError: 503, the fleet is closed.
         """
         loop = asyncio.get_running_loop()
         async with self._turn:
-            if loop.time() - self._at >= KEPT:
+            if loop.time() - self._at >= ANSWER_AGE:
                 try:
                     self._accounts = await self._fleet.outlets()
                 except ConnectionClosedError as exc:

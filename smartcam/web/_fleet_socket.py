@@ -32,7 +32,7 @@ MAX_SEARCH: Final = 100
 MAX_MESSAGE_BYTES: Final = 1024
 """Bytes of a message from a page at most."""
 
-ALIVE: Final = 5.0
+ALIVE_INTERVAL: Final = 5.0
 """Seconds after which a page is told that nothing has changed, so that it knows of a dead link."""
 
 QUICK_INTERVAL: Final = 0.05
@@ -100,7 +100,7 @@ class FleetSocket(PageSocket):
         said_at = loop.time()
         while not self._view.ended:
             text = await self._news()
-            if text or loop.time() - said_at >= ALIVE:
+            if text or loop.time() - said_at >= ALIVE_INTERVAL:
                 await self._send(text or "{}")
                 said_at = loop.time()
                 await asyncio.sleep(QUICK_INTERVAL)

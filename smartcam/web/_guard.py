@@ -56,7 +56,7 @@ class Guard:
     token: str | None  # what calls must carry; None: nothing, and the site listens on loopback
 
     def check(self, request: web.Request, *, is_call: bool) -> None:
-        """Refuse a request that is not from here.
+        """Refuse a request that does not come from the site's own pages.
 
         The page's own files, which are no calls, hold no secret.
 

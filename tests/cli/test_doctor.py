@@ -51,7 +51,7 @@ RUNNING = bytes.fromhex("50535642 08000000 12000000 80000000 00000000")
 def _slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have as much asked on a slow machine, and nothing said of that."""
     monkeypatch.setattr(_state_checks, "QUERIES_WITHIN", PATIENCE)
-    monkeypatch.setattr(_state_checks, "SLOW", PATIENCE)
+    monkeypatch.setattr(_state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE)
 
 
 @pytest.fixture(scope="module")

@@ -165,7 +165,9 @@ def test_calibrate_a_camera_of_a_fleet(fleet: str, tmp_path: Path) -> None:
 
 
 def test_doctor_examines_a_camera_of_a_fleet(fleet: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_state_checks, "SLOW", PATIENCE)  # of this machine nothing is said
+    monkeypatch.setattr(
+        _state_checks, "SLOW_ROUND_TRIP_TIME", PATIENCE
+    )  # of this machine nothing is said
     done = run("doctor", f"{fleet}/line1/text", "--trigger", "--count", "2").done()
     assert [check for severity, check in checks(done)] == [
         *("notice", "bus", "agent", "session", "reservation", "status", "application"),

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from smartcam.fleet import Fleet, FleetCamera
-from smartcam.fleet._agent.host import GATHER
+from smartcam.fleet._agent.host import RESULTS_INTERVAL
 from smartcam.models import Result, SubscriberStatistics
 from smartcam.streams import Subscription
 from tests.fleet.fleetkit import NAME, PATIENCE, NumberedCamera, Plant, end_of, until
@@ -203,7 +203,7 @@ async def test_who_left_and_subscribes_again_begins_there() -> None:
             before = sender.sent
             await asyncio.sleep(0.3)
             await reader.end()
-            gathered = 1 + math.ceil(GATHER * RATE)  # not said yet
+            gathered = 1 + math.ceil(RESULTS_INTERVAL * RATE)  # not said yet
             assert (
                 check(reader.stream, sender.sent - before - gathered, EARLY + gathered).missed == 0
             )

@@ -11,7 +11,7 @@ import pytest
 
 from smartcam.emulator import Application, EmulatedCamera
 from smartcam.fleet import FleetCamera, FleetFile, FleetServer
-from smartcam.fleet._agent.host import CATCH_UP, HOLD
+from smartcam.fleet._agent.host import CATCH_UP, STATUS_DELAY
 from smartcam.fleet._bus.bus import MemoryBus
 from smartcam.fleet._inside import FleetAddress
 from smartcam.fleet._program.program import Program
@@ -78,11 +78,11 @@ async def test_a_trigger_is_a_call_and_a_reply_and_statuses_of_several_go_in_one
     camera = await plant.camera()
     await plant.camera()  # who hears of it without a reply
     await camera.trigger()
-    await asyncio.sleep(2 * HOLD)
+    await asyncio.sleep(2 * STATUS_DELAY)
     plant.said.clear()
     for _ in range(TRIGGERS):
         await camera.trigger()
-    await asyncio.sleep(2 * HOLD)
+    await asyncio.sleep(2 * STATUS_DELAY)
     assert plant.said["command"] == plant.said["reply"] == TRIGGERS
     assert plant.said["ask"] == 0  # nothing was missing
     # two statuses each; the clock stands still meanwhile
@@ -99,7 +99,7 @@ async def test_statuses_that_the_only_program_has_with_a_reply_are_not_said_agai
     statuses = camera.statuses()
     for _ in range(TRIGGERS):
         await camera.trigger()
-    await asyncio.sleep(2 * HOLD)
+    await asyncio.sleep(2 * STATUS_DELAY)
     assert plant.said["states"] == 0
     assert statuses.statistics().queued >= 2 * TRIGGERS
     await asyncio.sleep(2 * CATCH_UP)
@@ -107,7 +107,7 @@ async def test_statuses_that_the_only_program_has_with_a_reply_are_not_said_agai
     assert plant.said["ask"] == 0
     other = await plant.camera()
     await camera.trigger()
-    await asyncio.sleep(2 * HOLD)
+    await asyncio.sleep(2 * STATUS_DELAY)
     assert other.status == camera.status
     assert plant.said["states"] == 2
 
@@ -129,7 +129,7 @@ async def test_others_hear_of_every_status_in_order_a_moment_later(plant: Plant)
     streams = [one.statuses(), other.statuses()]
     for _ in range(TRIGGERS):
         await one.trigger()
-    await asyncio.sleep(2 * HOLD)
+    await asyncio.sleep(2 * STATUS_DELAY)
     heard: list[list[Status]] = [
         [await anext(stream) for _ in range(stream.statistics().queued)] for stream in streams
     ]
@@ -157,5 +157,5 @@ async def test_a_lost_camera_is_told_at_once(plant: Plant) -> None:
     async for event in gone:
         if type(event).__name__ == "Disconnected":
             break
-    assert loop.time() - begin < HOLD
+    assert loop.time() - begin < STATUS_DELAY
     assert not camera.connected

@@ -36,7 +36,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the door see a limit that is near; the process itself keeps its own."""
     most = _door._lowest_free(1 << 20) + FEW
     monkeypatch.setattr(resource, "getrlimit", lambda _: (most, most))
-    monkeypatch.setattr(_door, "RESERVED", 16)
+    monkeypatch.setattr(_door, "RESERVED_DESCRIPTORS", 16)
 
 
 def hardly_any(monkeypatch: pytest.MonkeyPatch) -> None:

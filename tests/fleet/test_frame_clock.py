@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._program.caller import DRIFT, Caller
+from smartcam.fleet._program.caller import MAX_DRIFT_RATIO, Caller
 from smartcam.frames import FrameSource
 from smartcam.frames import open as open_frames
 from smartcam.frames._inside import read_stamp
@@ -37,7 +37,7 @@ def caller() -> Caller:
 
 @given(
     ahead=st.floats(-1e4, 1e4),
-    drift=st.floats(-DRIFT, DRIFT),
+    drift=st.floats(-MAX_DRIFT_RATIO, MAX_DRIFT_RATIO),
     calls=st.lists(st.tuples(WAYS, WAYS, WAYS, st.floats(0, 100)), min_size=1, max_size=20),
     since=st.floats(0, 100),
 )

@@ -38,10 +38,10 @@ async def test_what_comes_behind_a_stop_may_have_waited_as_long(
         assert pulse.waited() == 0.0
         hold_up(STOPPED, monkeypatch)
         first = pulse.waited()
-        assert STOPPED <= first <= STOPPED + _pulse.BEAT
-        await asyncio.sleep(_pulse.SETTLE / 2)  # it comes out of the system's buffers yet
-        assert pulse.waited() == pytest.approx(first + _pulse.SETTLE / 2, abs=0.01)
-        await asyncio.sleep(_pulse.SETTLE)
+        assert STOPPED <= first <= STOPPED + _pulse.BEAT_INTERVAL
+        await asyncio.sleep(_pulse.SETTLE_TIME / 2)  # it comes out of the system's buffers yet
+        assert pulse.waited() == pytest.approx(first + _pulse.SETTLE_TIME / 2, abs=0.01)
+        await asyncio.sleep(_pulse.SETTLE_TIME)
         assert pulse.waited() == 0.0
     finally:
         pulse.close()
@@ -56,9 +56,9 @@ async def test_second_stop_counts_from_the_first_while_that_is_not_settled(
     try:
         hold_up(STOPPED, monkeypatch)
         pulse.waited()
-        await asyncio.sleep(_pulse.SETTLE / 2)
+        await asyncio.sleep(_pulse.SETTLE_TIME / 2)
         hold_up(STOPPED, monkeypatch)
-        assert pulse.waited() >= 2 * STOPPED + _pulse.SETTLE / 2
+        assert pulse.waited() >= 2 * STOPPED + _pulse.SETTLE_TIME / 2
     finally:
         pulse.close()
 
@@ -113,7 +113,7 @@ async def test_command_behind_a_stopped_agent_is_not_done_when_it_goes_on() -> N
             ((answer,),) = await asyncio.gather(patient)
             assert answer["error"] == ""
             assert box.runs == runs + 1
-            await asyncio.sleep(_pulse.SETTLE + _pulse.GAP)
+            await asyncio.sleep(_pulse.SETTLE_TIME + _pulse.STOPPED_AFTER)
             assert (await asyncio.to_thread(ask, 5.0))[0]["error"] == ""
         finally:
             await asyncio.to_thread(session.close)

@@ -23,7 +23,7 @@ from smartcam.exceptions import (
 )
 from smartcam.fleet import Fleet, FleetCamera, FleetFile
 from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._agent.claims import ASK, HOLD_OFF, RETURN
+from smartcam.fleet._agent.claims import ASK_TIMEOUT, HOLD_OFF, RETURN_WAIT
 from smartcam.fleet._bus.bus import MemoryBus, MemoryEnd
 from smartcam.fleet._file.standby import Standby
 from smartcam.fleet._inside import Keys
@@ -405,10 +405,10 @@ async def test_bus_that_was_away_is_no_reason_to_take_over() -> None:
         await pair.start("south")
         for end in pair.ends.values():  # as with a router that ends
             end.detach()
-        await asyncio.sleep(10 * ASK)
+        await asyncio.sleep(10 * ASK_TIMEOUT)
         assert pair.having() == ["north"]
         pair.ends["south"].attach()
-        await asyncio.sleep(ASK)
+        await asyncio.sleep(ASK_TIMEOUT)
         pair.ends["north"].attach()
         await asyncio.sleep(10.0)
         assert (pair.having(), pair.sharing()) == (["north"], ["north"])
@@ -421,10 +421,10 @@ async def test_who_is_back_with_the_bus_and_then_ends_is_replaced_at_once() -> N
         await pair.start("south")
         for end in pair.ends.values():
             end.detach()
-        await asyncio.sleep(2 * ASK)
+        await asyncio.sleep(2 * ASK_TIMEOUT)
         for end in pair.ends.values():
             end.attach()
-        await asyncio.sleep(ASK)  # south waits for those who are not back yet
+        await asyncio.sleep(ASK_TIMEOUT)  # south waits for those who are not back yet
         await pair.agents.pop("north").close()
         await until(lambda: pair.having() == ["south"], SOON)
 
@@ -436,11 +436,11 @@ async def test_who_is_not_back_with_the_bus_is_replaced_after_a_while() -> None:
         for end in pair.ends.values():
             end.detach()
         await pair.agents.pop("north").close()
-        await asyncio.sleep(2 * ASK)
+        await asyncio.sleep(2 * ASK_TIMEOUT)
         pair.ends["south"].attach()
-        await asyncio.sleep(RETURN - ASK)
+        await asyncio.sleep(RETURN_WAIT - ASK_TIMEOUT)
         assert pair.sharing() == []
-        await until(lambda: pair.having() == ["south"], 2 * ASK + SOON)
+        await until(lambda: pair.having() == ["south"], 2 * ASK_TIMEOUT + SOON)
 
 
 @pytest.mark.long
@@ -450,7 +450,7 @@ async def test_camera_whose_winner_ends_during_a_split_is_taken_again() -> None:
         await pair.agents.pop(winner).close()
         pair.ends["north"].attach()
         (loser,) = pair.agents
-        await until(lambda: pair.having() == [loser], RETURN + 2 * ASK + SOON)
+        await until(lambda: pair.having() == [loser], RETURN_WAIT + 2 * ASK_TIMEOUT + SOON)
         await work.some()
 
 

@@ -53,7 +53,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the thread take what came a hundred times a second."""
     monkeypatch.setattr(folder_writer, "INTERVAL", 0.01)
     monkeypatch.setattr(folder_writer, "RETRY_DELAYS", (0.02,))
-    monkeypatch.setattr(folder_writer, "ROOM", 0)
+    monkeypatch.setattr(folder_writer, "MIN_FREE_BYTES", 0)
 
 
 class Disk:
@@ -87,7 +87,7 @@ class Disk:
 async def test_files_follow_and_no_result_is_lost_between(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_files, "STEP", 1)
+    monkeypatch.setattr(folder_files, "ITEMS_PER_LOOK", 1)
     async with NumberedCamera(rate=500) as box:
         async with recording(tmp_path, box.url, size=6000) as (recorder, _):
             await until(lambda: len(files(tmp_path)) >= 4)
@@ -115,7 +115,7 @@ async def test_files_follow_and_no_result_is_lost_between(
 async def test_each_file_says_what_the_camera_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_files, "STEP", 1)
+    monkeypatch.setattr(folder_files, "ITEMS_PER_LOOK", 1)
     async with NumberedCamera() as box, recording(tmp_path, box.url, size=6000) as (_, agent):
         camera = agent.hosts[NAME].camera
         for _ in range(60):

@@ -268,7 +268,7 @@ async def test_recorder_wait_failed_can_be_cancelled(tmp_path: Path) -> None:
 def test_recorder_disk_too_slow_ends_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorder, "MAX_WAITING_BYTES", 2 * recorder.OVERHEAD)
+    monkeypatch.setattr(recorder, "MAX_WAITING_BYTES", 2 * recorder.ITEM_OVERHEAD_BYTES)
     monkeypatch.setattr(recorder, "INTERVAL", 60.0)
     made = Recorder(tmp_path / "run.mcap").open()
     for _ in range(5):

@@ -26,7 +26,7 @@ from smartcam.web import _streams as streams
 from smartcam.web._fleet import LINGER, MAX_CAMERAS
 from smartcam.web._fleet import MAX_VIEWERS as MAX_FLEET_VIEWERS
 from smartcam.web._fleet_rows import BAD_SECONDS, MAX_QUEUE
-from smartcam.web._fleet_socket import ALIVE, MAX_ROWS
+from smartcam.web._fleet_socket import ALIVE_INTERVAL, MAX_ROWS
 from smartcam.web._fleet_view import BUCKET, PERIOD, SERIES, SORTS, Filter
 from smartcam.web._history import BAR_SECONDS, MAX_BARS, MAX_PICTURES
 from smartcam.web._live import MAX_NEWS
@@ -64,7 +64,7 @@ def test_live_page_has_its_numbers() -> None:
 
 
 def test_fleet_page_has_its_numbers() -> None:
-    assert (PERIOD, SERIES, BUCKET, ALIVE) == (0.2, 600, 5, 5.0)  # which it has as words
+    assert (PERIOD, SERIES, BUCKET, ALIVE_INTERVAL) == (0.2, 600, 5, 5.0)  # which it has as words
     said = {
         f"for {BAD_SECONDS:g} s after a loss",
         f"in sight, {MAX_ROWS} at most",

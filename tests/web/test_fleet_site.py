@@ -21,7 +21,7 @@ from smartcam.web import _fleet as site_module
 from smartcam.web import _fleet_view as view_module
 from smartcam.web._fleet import CALLS, MAX_VIEWERS
 from smartcam.web._fleet_rows import BAD_SECONDS, MAX_KEPT, MAX_QUEUE, line_of
-from smartcam.web._fleet_socket import ALIVE, MAX_ROWS, PROTOCOL
+from smartcam.web._fleet_socket import ALIVE_INTERVAL, MAX_ROWS, PROTOCOL
 from smartcam.web._fleet_view import BUCKET
 from smartcam.web._streams import SLOW
 from smartcam.web._verdicts import judged
@@ -150,7 +150,7 @@ async def test_page_is_told_the_rows_in_sight_and_no_others() -> None:
 async def test_nothing_crosses_while_nothing_happens() -> None:
     async with served() as world, world.looking() as looker:
         await looker.listen(10.0)
-        heard = await looker.listen(20 * ALIVE)
+        heard = await looker.listen(20 * ALIVE_INTERVAL)
         assert set(heard) == {"{}"}
         assert 15 <= len(heard) <= 20
 

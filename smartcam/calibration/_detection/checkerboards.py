@@ -47,14 +47,14 @@ MIN_CORNERS_CONNECTED = 10
 """Corners that hang together in what may be a part of a board: pictures of leaves, bricks and noise
 have up to nine."""
 
-STRAY = 0.5
-"""Pixels by which a corner may lie apart from where the others say it is, beside four times the
-median of that."""
+MAX_STRAY_PX = 0.5
+"""Pixels by which a corner may lie off the place that the others predict, beside four times the
+median of these distances."""
 
-AREA_PART = 0.8
+OUTER_AREA_RATIO = 0.8
 """The area outside of a corner is looked at within this part of its diameter, not at its rim."""
 
-RING = 0.3
+DOT_RING_SIDES = 0.3
 """Sides of a square from the middle of the dot at the origin to the paper around it."""
 
 RING_ANGLES = np.arange(8) * np.pi / 4
@@ -160,7 +160,7 @@ def _candidates(image: GreyImage, target: Checkerboard, seen: _Search) -> Iterat
 
 
 def _parts(target: Checkerboard, shape: tuple[int, int]) -> Iterator[Checkerboard]:
-    """Yield the target where it has a shape, or what its mark may tell of it that has."""
+    """Yield the target if it has a shape, else parts of that shape that its mark can place."""
     for columns, rows in dict.fromkeys((shape, shape[::-1])):
         if (columns, rows) == (target.columns, target.rows):
             yield target
@@ -202,13 +202,13 @@ def _without_strays(
     """Return corners of which those that could not be fitted, or lie apart, are looked for again.
 
     They start from where the others say that they are; what cannot be fitted there, or lies
-    apart again, has a covariance as large as the way.
+    apart again, has a covariance as large as its distance from there.
     """
     flat = rows_of(target.columns, target.rows).astype(np.float64)
     good = corners.fitted
     expected = GridMap(flat[good], corners.points[good])(flat)
     apart = np.linalg.norm(corners.points - expected, axis=1)
-    most = STRAY + 4 * float(np.median(apart[good]))
+    most = MAX_STRAY_PX + 4 * float(np.median(apart[good]))
     stray = ~good | (apart > most)
     if not stray.any():
         return corners
@@ -253,7 +253,7 @@ def _number(
         note = f" ({outside} of the 4 such areas outside of the image)" if outside else ""
 
         def level(order: NDArray[np.intp]) -> float:
-            """Return the level of the area as it would be where all light is as in the mean."""
+            """Return the level that the area would have in the mean light of the board."""
             black, white, area = shades[int(order[0, 0])]
             part = 1.0 if area is None else (area - black) / max(white - black, 1.0)
             return float(dark + (light - dark) * part)
@@ -312,7 +312,7 @@ def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
     """
     rows, columns, _ = grid.shape
     low = -(1 + AREA_DISTANCE)
-    around = RING * np.column_stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)]) + low
+    around = DOT_RING_SIDES * np.column_stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)]) + low
     along = (
         [(at + 0.5, low) for at in range(columns - 1)],
         [(low, at + 0.5) for at in range(rows - 1)],
@@ -336,7 +336,7 @@ class _Shades(NamedTuple):
 def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arrangement) -> _Shades:
     grid = corners.points[way.order]
     squares = sorted(mean_level(image, _near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES)
-    area = target.corner_areas[0] / target.square + AREA_PART * AREA_DIAMETER / 2 * DISC
+    area = target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER / 2 * DISC
     seen = _near(grid, area)
     inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()
     level = mean_level(image, seen) if inside else None

@@ -94,14 +94,14 @@ MAX_SCALE_ERROR = 0.2
 SCALE_OFF = 0.005
 """Difference between the target's size and the nominal one that is worth a remark."""
 
-SURE = 5.0
+SURE_SIGMAS = 5.0
 """Standard deviations by which a target's size must differ where it is not adjusted."""
 
-BAD = 4.0
+BAD_POSE_RATIO = 4.0
 """A pose whose held-out error is more times the median is bad: of normal errors along two axes one
 in 60000 is."""
 
-EXACT = 1e-7
+EXACT_M = 1e-7
 """Metres: what is less off, rounding alone may explain."""
 
 MAX_BAD_POSE_SHARE = 1 / 3
@@ -476,7 +476,9 @@ def _bad(result: HandEyeCalibration) -> list[int]:
     if result.held_out_error is None:
         return []
     errors = result.leave_one_out
-    bad: list[int] = np.flatnonzero(errors > BAD * max(float(np.median(errors)), EXACT)).tolist()
+    bad: list[int] = np.flatnonzero(
+        errors > BAD_POSE_RATIO * max(float(np.median(errors)), EXACT_M)
+    ).tolist()
     return bad
 
 
@@ -583,7 +585,7 @@ def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
     if found is None or not others or None in others:
         return
     sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))
-    if abs(found - 1.0) > max(SCALE_OFF, SURE * sigma):
+    if abs(found - 1.0) > max(SCALE_OFF, SURE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
             f"expected the target as large as it was said, got {found:.4f} times that by the "
             "robot's motions, and the size was not to be adjusted: measure the print; or the "

@@ -51,11 +51,11 @@ if TYPE_CHECKING:
 
     Seen = PixelObservations | PoseObservations
 
-LEVEL = 1e-4
+SIGNIFICANCE_LEVEL = 1e-4
 """Probability with which noise alone may make more parameters differ from what was given: a scale
 that is not needed puts the camera up to eight times as far off."""
 
-LOCAL = 0.05
+MAX_SIZE_ERROR_RATIO = 0.05
 """Error of a target's stated size, as a part of it, from which the fit still converges."""
 
 ROBOT, REPROJECTION = "robot", "reprojection"
@@ -306,7 +306,7 @@ def _asked(judges: Sequence[Candidate]) -> Candidate | None:
         return judges[0] if judges else None
     plain = next((one for one in judges if one.besides == NOTHING), None)
     limit = plain.held_out if plain else math.inf
-    asked = [one for one in judges if one.chance < LEVEL and one.held_out < limit]
+    asked = [one for one in judges if one.chance < SIGNIFICANCE_LEVEL and one.held_out < limit]
     return min(asked, key=lambda one: one.held_out, default=plain or judges[0])
 
 
@@ -353,7 +353,7 @@ def _begin_of_another_size(problem: Problem) -> Solution | None:
     None where that is near to the size that was given, or not known.
     """
     scale = scale_of(problem.robot, problem.poses)
-    if scale is None or scale <= 0.0 or abs(scale - 1.0) < LOCAL:
+    if scale is None or scale <= 0.0 or abs(scale - 1.0) < MAX_SIZE_ERROR_RATIO:
         return None
     change = np.array([scale - 1.0])
     settled = _freed(problem, (0,)).seen.settled(change)

@@ -44,13 +44,13 @@ MAX_SHARED_FACTOR = 300.0
 """Largest factor of the views' shared errors: with it 100 points at 0.1 pixels would say
 nothing."""
 
-COARSE = 5
+COARSE_VALUES = 5
 """Values of each standard deviation that are tried at first."""
 
 MAX_ROUNDS = 4
 """Rounds of adjusting and estimating at most; the estimate hardly changes after two."""
 
-SETTLED = 0.02
+SETTLED_RATIO = 0.02
 """Part of the estimates by which a round must change them for another one."""
 
 
@@ -66,7 +66,7 @@ def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solu
             break
         before = noise
         noise = _estimate(robot, seen, found, noise, search=not number and start.noise is None)
-        settled = bool(np.abs(_logs(noise) - _logs(before)).max() < SETTLED)
+        settled = bool(np.abs(_logs(noise) - _logs(before)).max() < SETTLED_RATIO)
         found = adjust(robot, seen, found, noise, gain=ROUGH_GAIN)
         if settled:
             break
@@ -93,7 +93,9 @@ def _estimate(
         beyond = float(((logs - inside) ** 2).sum())
         return _unlikely(total, np.exp(inside)) + 1e3 * beyond
 
-    axes = [np.linspace(a, b, COARSE if search else 0) for a, b in zip(low, high, strict=True)]
+    axes = [
+        np.linspace(a, b, COARSE_VALUES if search else 0) for a, b in zip(low, high, strict=True)
+    ]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
     start = min([_logs(noise), *grid], key=cost)
     settings = {"xatol": 3e-3, "fatol": 1e-3, "maxiter": 300}

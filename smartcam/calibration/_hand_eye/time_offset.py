@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._hand_eye.equations import Setup
     from smartcam.geometry import PoseHistory, Transform
 
-STEPS = 41
+COARSE_STEPS = 41
 """Offsets that are tried first, over the whole range."""
 
 FOLDS = 20
@@ -145,19 +145,19 @@ class _Moving:
     def least_sigma(self, found: float, index: NDArray[np.intp]) -> float:
         """Return the sigma of an offset if all errors were noise; infinite where none is better."""
         # A mean square m + c x^2 of n values, m of noise, has its least at x with a variance m/cn.
-        step = math.copysign(4.0 * self._most / (STEPS - 1), -found)
+        step = math.copysign(4.0 * self._most / (COARSE_STEPS - 1), -found)
         least, beside = (self.error(one, index) ** 2 for one in (found, found + step))
         rise = (beside - least) / step**2
         return math.sqrt(least / (rise * 6 * len(index))) if rise > 0 else math.inf
 
     def best(self, index: NDArray[np.intp]) -> float:
         """Return the best offset of the whole range."""
-        tried = np.linspace(-self._most, self._most, STEPS)
+        tried = np.linspace(-self._most, self._most, COARSE_STEPS)
         return self.refined(index, min(tried.tolist(), key=lambda one: self.error(one, index)))
 
     def refined(self, index: NDArray[np.intp], near: float) -> float:
         """Return the best offset near to one."""
-        step = 2.0 * self._most / (STEPS - 1)
+        step = 2.0 * self._most / (COARSE_STEPS - 1)
         low, high = max(near - step, -self._most), min(near + step, self._most)
         search = load("scipy.optimize").minimize_scalar
         found = search(lambda one: self.error(one, index), bounds=(low, high), method="bounded")

@@ -52,7 +52,7 @@ OTHER_WAY: Final = 5.0
 """Factor by which poses must fit better when inverted, or a view when numbered from the target's
 other end, to be taken as given that way."""
 
-OTHERWISE: Final = 20.0
+MIN_OTHER_FIT_RATIO: Final = 20.0
 """Factor by which poses must fit better when transposed, mirrored or in another unit of length, to
 be taken as given that way: such mistakes are rarer than a pose of another view."""
 
@@ -200,14 +200,14 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
     yield RobotPoses(poses, not in_hand), OTHER_WAY, Code.WRONG_FRAME, how
     turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
     how = "with rotations transposed: their matrices or quaternions are those of the way back"
-    yield RobotPoses(turned, in_hand), OTHERWISE, Code.WRONG_FRAME, how
+    yield RobotPoses(turned, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, how
     mirrored = Rigid(X_MIRROR @ poses.rotation @ X_MIRROR, poses.translation @ X_MIRROR)
     how = "in a left-handed base: expected axes x, y, z of a right hand"
-    yield RobotPoses(mirrored, in_hand), OTHERWISE, Code.MIRRORED, how
+    yield RobotPoses(mirrored, in_hand), MIN_OTHER_FIT_RATIO, Code.MIRRORED, how
     how = "as millimetres: expected metres"
-    yield RobotPoses(poses.scaled(MILLI), in_hand), OTHERWISE, Code.POOR_FIT, how
+    yield RobotPoses(poses.scaled(MILLI), in_hand), MIN_OTHER_FIT_RATIO, Code.POOR_FIT, how
     how = "with the target in millimetres: expected its lengths in metres"
-    yield RobotPoses(poses.scaled(1 / MILLI), in_hand), OTHERWISE, Code.POOR_FIT, how
+    yield RobotPoses(poses.scaled(1 / MILLI), in_hand), MIN_OTHER_FIT_RATIO, Code.POOR_FIT, how
 
 
 def check_poses(problem: Problem) -> Agreed:

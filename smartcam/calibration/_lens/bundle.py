@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
     from smartcam.geometry._inside import Array
 
-SETTLED: Final = 1e-7
+SETTLED_COST_RATIO: Final = 1e-7
 """Part of the weighted squares by which the last step still lowers them: of 1000 coordinates it is
 a hundredth of a standard deviation."""
 
-LOOSE: Final = 0.01
+LOOSE_SIGMA_RATIO: Final = 0.01
 """Standard deviation that a sheet's point is thought to be off, in parts of its distance to the
 next: of six recorded views a tenth makes the held-out error 1.7 times as large as an exact sheet
 does, a hundredth 1.1, and of many both the same (measured)."""
 
-TIGHT: Final = 1e-4
+TIGHT_SIGMA_RATIO: Final = 1e-4
 """Standard deviation of the place, direction and size of all of a sheet's points as a whole, which
 no view tells, in parts of a point's distance to the next."""
 
-ANEW: Final = 1e-5
+SETTLED_REFIT_RATIO: Final = 1e-5
 """Part of the weighted squares by which the last step lowers them, in a fit without a pose."""
 
 MAX_FEW_POSES: Final = 5
@@ -217,7 +217,7 @@ def adjust_weighted(bundle: Bundle, sights: Sequence[Sight], more: float = 0.0) 
 
 
 def adjust(
-    bundle: Bundle, sights: Sequence[Sight], more: float, gain: float = SETTLED
+    bundle: Bundle, sights: Sequence[Sight], more: float, gain: float = SETTLED_COST_RATIO
 ) -> AdjustedBundle:
     """Return the least squares, each point weighted by its covariance and ``more`` variance.
 
@@ -280,7 +280,7 @@ def _fitted_without(
 ) -> Bundle:
     """Return the cameras as they are fitted to all views but a pose' own, and its pose to these."""
     others = [one for one in sights if one.pose != pose]
-    anew = adjust(adjusted.bundle, others, adjusted.more, ANEW).bundle
+    anew = adjust(adjusted.bundle, others, adjusted.more, SETTLED_REFIT_RATIO).bundle
     without = dataclasses.replace(anew, poses=adjusted.bundle.poses.taken([pose]))
     at = adjust(without.known(), own, adjusted.more).bundle.poses
     return dataclasses.replace(without, poses=at)
@@ -330,8 +330,8 @@ def _group(camera: int, sights: Sequence[Sight], more: float) -> _Group:
 class BundleEquations:
     """The parts of a bundle's equations that stay the same while the bundle is adjusted.
 
-    ``prior``: whether free points are held where they were meant to be, as far as LOOSE and TIGHT
-    say.
+    ``prior``: whether free points are held where they were meant to be, within
+    LOOSE_SIGMA_RATIO and TIGHT_SIGMA_RATIO.
     """
 
     def __init__(
@@ -427,5 +427,5 @@ def _prior(meant: Array) -> Array:
     near, axes = meant - meant.mean(axis=0), np.eye(3)
     moves = [*(np.cross(axis, near) for axis in axes), *(0.0 * near + axis for axis in axes), near]
     whole = np.linalg.qr(np.column_stack([one.ravel() for one in moves]))[0]
-    weights: Array = whole @ whole.T / (TIGHT * spacing) ** 2
-    return weights + np.eye(3 * len(meant)) / (LOOSE * spacing) ** 2
+    weights: Array = whole @ whole.T / (TIGHT_SIGMA_RATIO * spacing) ** 2
+    return weights + np.eye(3 * len(meant)) / (LOOSE_SIGMA_RATIO * spacing) ** 2

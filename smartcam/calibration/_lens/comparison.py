@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 CELLS: Final = (6, 8)
 """Rows and columns of an image's cells, by which is told where both have seen the target."""
 
-LEVEL: Final = 0.01
+SIGNIFICANCE_LEVEL: Final = 0.01
 """Probability with which noise alone may make two calibrations differ as much."""
 
 MIN_CHANCE: Final = 1e-9
@@ -39,7 +39,7 @@ MIN_CHANCE: Final = 1e-9
 MAX_STEPS: Final = 50
 """The fit of the motion takes at most this many steps; it usually takes five."""
 
-SETTLED: Final = 1e-9
+SETTLED_PX: Final = 1e-9
 """Pixels: a step that moves nothing by more is the last."""
 
 MIN_DIFFERENCE_PX: Final = 1e-3
@@ -123,7 +123,7 @@ class LensComparison:
     @property
     def same(self) -> bool | None:
         """True if noise explains the difference; None where the noise is not known."""
-        return None if self.chance is None else self.chance >= LEVEL
+        return None if self.chance is None else self.chance >= SIGNIFICANCE_LEVEL
 
     @property
     def verdict(self) -> str:
@@ -272,7 +272,7 @@ def _align(first: CameraModel, second: CameraModel, gauge: Array, *, far: bool) 
             np.linalg.lstsq(by_motion[known], off[known], rcond=None)[0], dtype=np.float64
         )
         motion = motion.turned_after(step)
-        if np.abs(by_motion[known] @ step).max() < SETTLED:
+        if np.abs(by_motion[known] @ step).max() < SETTLED_PX:
             return motion
     raise Code.POOR_FIT.refusal(
         "compare: expected two calibrations of one lens, got lenses of which no motion of the "

@@ -23,7 +23,7 @@ from smartcam.calibration._lens.field import (
     sensitivity,
 )
 from smartcam.calibration._lens.poses import CAMERA, TARGET
-from smartcam.calibration._lens.projection import NEGLIGIBLE, pose_changes
+from smartcam.calibration._lens.projection import MIN_SIGMA_PX, pose_changes
 from smartcam.geometry import Transform
 from smartcam.geometry._inside import Rigid, exp_rotation
 
@@ -46,16 +46,16 @@ ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
 FILLS: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
 """Parts of the image's width or height that the target may take."""
 
-TILT: Final = 35.0
+MAX_TILT_DEG: Final = 35.0
 """Degrees: more tells little more, and is hard to see."""
 
 SIDES: Final = {"lower": (1.0, 0.0), "upper": (-1.0, 0.0), "left": (0.0, 1.0), "right": (0.0, -1.0)}
 """The target's side that is farther away, and about which axis of the camera it is tilted."""
 
-MARGIN: Final = 0.02
+MARGIN_RATIO: Final = 0.02
 """At each side of the image, this part of it stays free beside the target."""
 
-TURNS: Final = 12
+MAX_STEPS: Final = 12
 """A target is brought to its place in this many steps; most are there after five."""
 
 MAP: Final = (9, 12)
@@ -147,7 +147,7 @@ def suggest_views(
 def _variance(calibration: IntrinsicCalibration) -> float:
     """Return the variance of a coordinate that the views so far have had, pixels^2."""
     sigmas = np.concatenate([one.view.sigmas for one in calibration.views if one.used])
-    return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, NEGLIGIBLE**2)
+    return max(float(np.median(sigmas)) ** 2 + calibration.sigma**2, MIN_SIGMA_PX**2)
 
 
 def _fitted(covariance: Array) -> Array:
@@ -220,7 +220,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     around = np.column_stack([rim * half, np.zeros(len(rim))])
     tilts = {"": (0.0, 0.0), **SIDES}
     ways = list(itertools.product(FILLS, ROWS, COLUMNS, tilts))
-    turns = np.array([[*tilts[side], 0.0] for *_, side in ways]) * math.radians(TILT)
+    turns = np.array([[*tilts[side], 0.0] for *_, side in ways]) * math.radians(MAX_TILT_DEG)
     upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
     rotations = exp_rotation(turns) @ upright
     turned = around @ rotations.swapaxes(1, 2)
@@ -248,13 +248,16 @@ def _placed(camera: CameraModel, turned: Array, fills: Array, parts: Array) -> A
     depth = 2 * extent * camera.matrix[0, 0] / (fills * size[0])
     at = np.broadcast_to((size - 1) / 2, (len(turned), 2)).copy()
     shifts = np.zeros((len(turned), 3))
-    for _ in range(TURNS):
+    for _ in range(MAX_STEPS):
         ahead = np.column_stack([camera.directions(at), np.ones(len(at))])
         shifts = ahead * depth[:, None]
         seen = camera.project((turned + shifts[:, None]).reshape(-1, 3)).reshape(len(at), -1, 2)
         first, last = seen.min(axis=1), seen.max(axis=1)
         wide = last - first
-        lowest, room = MARGIN * size + wide / 2, np.maximum((1 - 2 * MARGIN) * size - wide, 0.0)
+        lowest, room = (
+            MARGIN_RATIO * size + wide / 2,
+            np.maximum((1 - 2 * MARGIN_RATIO) * size - wide, 0.0),
+        )
         step = lowest + room * parts - (first + last) / 2
         at = np.clip(at + np.nan_to_num(step), 0.0, size - 1)
         depth = depth * np.nan_to_num(np.clip((wide / size).max(axis=1) / fills, 0.7, 1.5), nan=1.5)
@@ -281,6 +284,7 @@ def _words(fill: float, row: float, column: float, side: str, roll: float) -> st
         (False, True): f"at the {down} edge of the image",
         (False, False): f"in the {down} {across} corner of the image",
     }[row == 0.5, column == 0.5]
-    tilt = f"tilted by {TILT:.0f} degrees, its {side} side farther away" if side else "not tilted"
+    tilted = f"tilted by {MAX_TILT_DEG:.0f} degrees, its {side} side farther away"
+    tilt = tilted if side else "not tilted"
     turned = f", turned by {abs(math.degrees(roll)):.0f} degrees" if roll else ""
     return f"{place}, {FILLS[fill]}, {tilt}{turned}"

@@ -56,7 +56,7 @@ MIN_MOTION_SHARE: Final = 0.02
 MAX_FOCAL_SIGMA_RATIO: Final = 0.1
 """Standard deviation of the focal length over itself, beyond which it is not determined."""
 
-BAD: Final = 3.0
+BAD_VIEW_RATIO: Final = 3.0
 """Weighted rms of a view over the median of the others: healthy ones reach 1.6 (measured)."""
 
 MAX_BAD_VIEW_SHARE: Final = 1 / 3
@@ -65,7 +65,7 @@ MAX_BAD_VIEW_SHARE: Final = 1 / 3
 MIN_REACHED_SHARE: Final = 0.9
 """Part of the image that the lens' model reaches without a word: wide lenses may miss corners."""
 
-POOR: Final = 1.0
+POOR_FIT_RMS_PX: Final = 1.0
 """Pixels rms, beyond which the model of the lens, or the sheet, is not what it should be."""
 
 
@@ -283,11 +283,11 @@ def calibrate_intrinsics(
         worst, ratio = worst_view([given[number] for number in used], adjusted)
         dropped = len(given) - len(used) + 1
         enough = len(used) > MIN_VIEWS and dropped <= MAX_BAD_VIEW_SHARE * len(given)
-        if ratio <= BAD or not (drop_bad and enough):
+        if ratio <= BAD_VIEW_RATIO or not (drop_bad and enough):
             break
         del used[worst]
     check_tilts(adjusted, "intrinsics")
-    bad = [used[worst]] if ratio > BAD else []
+    bad = [used[worst]] if ratio > BAD_VIEW_RATIO else []
     found = _summary(
         given, used, adjusted, [*bad, *sorted(set(range(len(given))) - set(used))], sheet
     )
@@ -478,11 +478,11 @@ def _remarks(
             f"{label(fit.view, number)}: {fit.rms:.3g} pixels rms where the lens has "
             f"{calibration.rms:.3g} in all: it {done}"
         )
-    if calibration.rms > POOR:
+    if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(
-            f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR:g} at most: the lens "
-            f"is not of the model {calibration.camera.distortion_model}, the sheet is not flat, or "
-            "points were taken for others"
+            f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR_FIT_RMS_PX:g} at most: "
+            f"the lens is not of the model {calibration.camera.distortion_model}, the sheet is not "
+            "flat, or points were taken for others"
         )
     yield from of_sheet
     camera = calibration.camera

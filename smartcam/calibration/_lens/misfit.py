@@ -50,11 +50,11 @@ FURTHER: Final = DEFORMATIONS + SHUTTER + SMOOTH
 MIN_VIEWS_TO_EXPLAIN: Final = 4
 """Views, of which the misfit is explained at all."""
 
-ZOOMED: Final = 1.5
+ZOOM_COST_RATIO: Final = 1.5
 """Squares over those with two focal lengths, from which on these are told: recorded views reach
 1.08, a shutter that rolls 1.32, a zoom of 3 % 1.87 (measured)."""
 
-FITTED: Final = 1.2
+FITTED_COST_RATIO: Final = 1.2
 """Squares over those with a lens that is fitted to the views, from which on a known one is wrong:
 lenses from other views reach 1.04 on recorded pairs, a focal length that is 1 % off 2 where noise
 is 0.05 pixels."""
@@ -62,7 +62,7 @@ is 0.05 pixels."""
 MIN_VIEWS_FOR_LENS: Final = 3
 """Views that such a lens is fitted to at least."""
 
-TURNS: Final = 20
+MAX_ROUNDS: Final = 20
 """Most rounds in which lens and flips are chosen in turn."""
 
 
@@ -188,7 +188,7 @@ class _FlippedLens(NamedTuple):
         # Source: Lloyd, Least Squares Quantization in PCM (1982).
         basis = np.eye(len(self.mirror))[:, free]
         as_is = mirrored = reduced.squares
-        for _ in range(TURNS):
+        for _ in range(MAX_ROUNDS):
             plain, other = (reduced.matrix[one].sum(axis=0) for one in (~flipped, flipped))
             back = self.mirror * (reduced.right[flipped].sum(axis=0) - other @ self.shift)
             matrix = plain + self.mirror[:, None] * other * self.mirror
@@ -243,7 +243,7 @@ def misfit_remarks(
     )
     told = f"times smaller so; what else was tried explains less for what it takes: {others}"
     changed, after = _zoomed(reduced, usual)
-    if before > ZOOMED * after and score(after, 3) < best:
+    if before > ZOOM_COST_RATIO * after and score(after, 3) < best:
         yield Code.WRONG_LENS.remark(
             f"views of two focal lengths: those from {names[changed]} on are of another one than "
             f"those before, was the zoom or the focus moved? The squares of all are "
@@ -297,7 +297,7 @@ def lens_remarks(fitted: Sequence[Fitted], what: str, more: float) -> Iterator[R
     equations = [one.equations(more) for one in fitted]
     reduced = Reduced.of(equations)
     before, after = float(reduced.squares.sum()), reduced.best(lens_alone(equations[0]))[1]
-    if before > FITTED * after:
+    if before > FITTED_COST_RATIO * after:
         yield Code.WRONG_LENS.remark(
             f"the {what} that was given leaves {math.sqrt(before / max(after, 1e-300)):.3g} times "
             "the residuals of one that is fitted to its views: is it this camera's, at this focus?"

@@ -38,7 +38,7 @@ MIN_POINTS: Final = 4
 MIN_SPREAD_RATIO: Final = 1e-3
 """Points are on a line if their spread across it is less than this part of the spread along it."""
 
-OUTSIDE: Final = 0.1
+MAX_OUTSIDE_RATIO: Final = 0.1
 """Part of the image's sides by which a point may lie outside of it."""
 
 MIN_AGREEMENT: Final = 0.5
@@ -62,8 +62,9 @@ class TargetPose:
     Attributes:
         transform: ``T_camera_target``.
         covariance: (6, 6), of a small turn (rad) and shift (m) of the target in the camera's frame:
-            the rotation is ``exp([turn]x) R``. As the points' covariance leads to, and larger where
-            the residuals are larger than that explains. Errors of the lens are not in it.
+            the rotation is ``exp([turn]x) R``. It follows from the points' covariance, and is
+            larger where the residuals are larger than that explains. Errors of the lens are not in
+            it.
         residuals: (N, 2), seen minus projected, pixels.
         rms: rms of the residuals' lengths over sqrt(2), their freedom taken off: the standard
             deviation of a coordinate, pixels.
@@ -173,7 +174,7 @@ def _check_inside(view: TargetView, called: str) -> None:
     sides = np.array(view.size)
     off = (np.maximum(-view.points, view.points - (sides - 1)) / sides).max(axis=1)
     row = int(np.argmax(off))
-    if off[row] > OUTSIDE:
+    if off[row] > MAX_OUTSIDE_RATIO:
         got = view.points[row].tolist()
         raise Code.WRONG_SIZE.refusal(
             f"{called}: expected points in the image of {sides[0]} x {sides[1]} pixels, got {got} "

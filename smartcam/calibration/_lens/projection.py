@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
     from smartcam.geometry._inside import Array
 
-NEGLIGIBLE = 1e-4
+MIN_SIGMA_PX = 1e-4
 """Pixels: standard deviations are not taken smaller, so that views without noise have weights."""
 
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may pass for an error beside it."""
 
 
@@ -93,7 +93,7 @@ def whitening(covariance: Array, more: float) -> Array:
     """
     # With C^-1 = L L^T (Cholesky) the residuals L^T r have the covariance L^T C L = I, and their
     # squares add up to r^T C^-1 r.
-    whole = covariance + max(more, NEGLIGIBLE**2) * np.eye(2)
+    whole = covariance + max(more, MIN_SIGMA_PX**2) * np.eye(2)
     matrices = np.linalg.cholesky(np.linalg.inv(whole)).swapaxes(1, 2)
     return np.asarray(matrices, dtype=np.float64)
 
@@ -110,14 +110,14 @@ def excess(residuals: Array, covariance: Array, freedom: int) -> float:
     # Source: Paule and Mandel, Consensus Values and Weighting Factors (1982).
     values, vectors = np.linalg.eigh(covariance)
     squared = np.einsum("nij,ni->nj", vectors, residuals) ** 2
-    values = np.maximum(values, 0.0) + NEGLIGIBLE**2
+    values = np.maximum(values, 0.0) + MIN_SIGMA_PX**2
 
     def off(more: float) -> float:
         return float((squared / (values + more)).sum()) - freedom
 
     if freedom <= 0 or not np.isfinite(squared).all():
         return 0.0
-    if Noise(1.0).chance(off(0.0) + freedom, freedom) >= LEVEL:
+    if Noise(1.0).chance(off(0.0) + freedom, freedom) >= SIGNIFICANCE_LEVEL:
         return 0.0
     largest = float(squared.sum()) / freedom
     return float(load("scipy.optimize").brentq(off, 0.0, largest, xtol=1e-16))

@@ -74,7 +74,7 @@ MAX_TARGET_METRES: Final = 20.0
 OFF_MIDDLE: Final = 0.2
 """A principal point this part of the image's sides off the middle may be of another image."""
 
-SURE: Final = 5.0
+SURE_SIGMAS: Final = 5.0
 """Standard deviations by which such a principal point must be off the middle to be doubted."""
 
 
@@ -272,7 +272,7 @@ def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
     size = np.array(found.camera.size)
     middle, sigmas = found.camera.matrix[:2, 2], np.sqrt(np.diag(found.covariance)[2:4])
     off = np.abs(middle - (size - 1) / 2)
-    if ((off > OFF_MIDDLE * size) & (off > SURE * sigmas)).any():
+    if ((off > OFF_MIDDLE * size) & (off > SURE_SIGMAS * sigmas)).any():
         yield Code.WRONG_SIZE.remark(
             f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
             f"pixels, got ({middle[0]:.0f}, {middle[1]:.0f}): were points taken from an image of "

@@ -36,7 +36,7 @@ from smartcam.calibration._plane.diagnostics import (
 )
 from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
 from smartcam.calibration._plane.mapping import PlaneMap
-from smartcam.calibration._plane.model_selection import NEGLIGIBLE, Candidates, rms, squares
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, Candidates, rms, squares
 from smartcam.calibration._plane.robust import agreeing
 from smartcam.calibration._plane.validation import (
     check_lever,
@@ -66,7 +66,7 @@ KIND = "plane"
 
 PlaneModel: TypeAlias = Literal["auto", "rigid", "similarity", "affine", "homography"]
 
-CHUNK = 16_384
+POINTS_AT_ONCE = 16_384
 """Points whose covariances are worked out at once: 5 MB in between."""
 
 ENOUGH: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
@@ -336,7 +336,7 @@ class PlaneCalibration(storage.SavedCalibration):
         # J C J^T with the map's Jacobian by its parameters; C is derived in fitting.fit
         seen = as_points(points, 2, "camera points")
         return np.concatenate(
-            [self._joint(seen[i : i + CHUNK]) for i in range(0, len(seen), CHUNK)]
+            [self._joint(seen[i : i + POINTS_AT_ONCE]) for i in range(0, len(seen), POINTS_AT_ONCE)]
             or [np.zeros((0, 3, 3))]
         )
 
@@ -416,7 +416,7 @@ class PlaneCalibration(storage.SavedCalibration):
         pull = weighted.T @ offsets.ravel()
         shifted = float(pull @ np.linalg.solve(each.T @ weighted, pull))
         noise = Noise(
-            max(variance, (NEGLIGIBLE * self.place.robot_size) ** 2),
+            max(variance, (ROUNDING_RATIO * self.place.robot_size) ** 2),
             None if self.sigma_given else self.freedom,
         )
         chance = noise.chance(squared, len(rows))

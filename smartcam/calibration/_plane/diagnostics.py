@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from smartcam.calibration._plane.fitting import fit
-from smartcam.calibration._plane.model_selection import NEGLIGIBLE, squares, touch_noise
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
 from smartcam.calibration._plane.order import better_order
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._plane.model_selection import Candidates
     from smartcam.geometry._inside import Array
 
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may cause a warning."""
 
 SCALE_TOLERANCE = 0.005
@@ -154,7 +154,7 @@ def _planarity(evidence: Evidence) -> Iterator[Remark]:
     fitted = evidence.fitted.residuals
     within = squares(fitted - np.outer(fitted @ normal, normal), weights)
     noise = touch_noise(evidence.sigma, within, evidence.fitted.freedom - count)
-    if noise is not None and noise.chance(squared, count) < LEVEL:
+    if noise is not None and noise.chance(squared, count) < SIGNIFICANCE_LEVEL:
         worst, mm = int(np.argmax(weights * out**2)), 1e3 * evidence.place.robot_size
         yield Code.NOT_PLANAR.remark(
             f"the touched points lie {mm * math.sqrt(squared / count):.3g} mm rms out of a plane, "
@@ -170,7 +170,7 @@ def _fit(evidence: Evidence) -> Iterator[Remark]:
     total = squares(fitted.residuals, weights)
     chances = [_chance_among(evidence, squared, total) for squared in _studentized(fitted)]
     worst = int(np.argmin(chances))
-    if chances[worst] * len(chances) < LEVEL:
+    if chances[worst] * len(chances) < SIGNIFICANCE_LEVEL:
         residual = 1e3 * evidence.place.robot_size * float(np.linalg.norm(fitted.residuals[worst]))
         yield Code.OUTLIER.remark(
             f"point {evidence.numbers[worst]} fits far worse than the others: its residual of "
@@ -178,8 +178,8 @@ def _fit(evidence: Evidence) -> Iterator[Remark]:
             "touches"
         )
         return
-    most = max(evidence.most, NEGLIGIBLE)
-    if fitted.freedom and Noise(most**2).chance(total, fitted.freedom) < LEVEL:
+    most = max(evidence.most, ROUNDING_RATIO)
+    if fitted.freedom and Noise(most**2).chance(total, fitted.freedom) < SIGNIFICANCE_LEVEL:
         mm = 1e3 * evidence.place.robot_size
         given = "was given" if evidence.sigma is not None else "is the most that is taken for noise"
         yield Code.POOR_FIT.remark(
@@ -211,7 +211,7 @@ def _wrong_instead(evidence: Evidence) -> Iterator[Remark]:
             squared = squares(simple.residuals, np.delete(pairs.weights, out))
             found.append((0.0 if noise is None else noise.chance(squared, simple.freedom), out))
     chance, out = max(found, default=(0.0, ()))
-    if out and chance > LEVEL:
+    if out and chance > SIGNIFICANCE_LEVEL:
         points = " and ".join(str(evidence.numbers[i]) for i in out)
         yield Code.OUTLIER.remark(
             f"point{'s' * (len(out) > 1)} {points} may be wrong: without, one scale fits all "

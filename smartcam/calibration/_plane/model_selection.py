@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from smartcam.calibration._plane.fitting import Fit, ModelName, Pairs
     from smartcam.geometry._inside import Array
 
-LEVEL = 0.003
+SIGNIFICANCE_LEVEL = 0.003
 """Probability with which noise alone may choose a more general model. A simulation of nine touches
 in the middle third of a field chose it: the wrong choices cost 1 % of the error here, and 4 % at
 0.01; a tilt of one degree is found with both."""
 
-NEGLIGIBLE = 1e-9
+ROUNDING_RATIO = 1e-9
 """Residuals below this part of the points' extent are rounding, not noise."""
 
 
@@ -45,8 +45,8 @@ def touch_noise(sigma: float | None, squared: float, freedom: int) -> Noise | No
     None where both are missing.
     """
     if sigma is not None:
-        return Noise(max(sigma, NEGLIGIBLE) ** 2)
-    return Noise(max(squared / freedom, NEGLIGIBLE**2), freedom) if freedom > 0 else None
+        return Noise(max(sigma, ROUNDING_RATIO) ** 2)
+    return Noise(max(squared / freedom, ROUNDING_RATIO**2), freedom) if freedom > 0 else None
 
 
 class Candidates:
@@ -125,4 +125,7 @@ def better(simple: Fit, general: Fit, weights: Array, sigma: float | None) -> bo
     noise = touch_noise(sigma, after, general.freedom)
     if noise is None:
         return False
-    return noise.chance(max(before - after, 0.0), simple.freedom - general.freedom) < LEVEL
+    return (
+        noise.chance(max(before - after, 0.0), simple.freedom - general.freedom)
+        < SIGNIFICANCE_LEVEL
+    )

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.calibration._plane.model_selection import NEGLIGIBLE
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
 from smartcam.calibration._statistics import Noise
 from smartcam.geometry import Code, Remark
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
     Order = NDArray[np.intp]
 
-LEVEL = 1e-6
+SIGNIFICANCE_LEVEL = 1e-6
 """Largest chance that noise alone makes another order look far better than the one given."""
 
-PLAUSIBLE = 0.001
+MIN_NOISE_CHANCE = 0.001
 """Least chance that the noise of touches is as large as what the better order leaves over."""
 
 MAX_POINTS_TO_ORDER = 40
 """Points up to which an order is looked for: a step compares the square of their number."""
 
-SURE = 2
+SURE_ORDER_RATIO = 2
 """An order is sure if every other one that does as well moves as many times the touches."""
 
 MIN_POINTS_FOR_AFFINE = 6
@@ -90,19 +90,19 @@ def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
         models.append(_Affine(camera, robot))
     for model in models:
         given, freedom = model.squares(np.arange(count)[None])[0], 3 * count - model.parameters
-        if Noise(sigma**2).chance(given, freedom) > LEVEL:
+        if Noise(sigma**2).chance(given, freedom) > SIGNIFICANCE_LEVEL:
             return None  # a simple map explains the order as given
         orders, squares = model.search()
-        scale = max(squares.min() / freedom, (NEGLIGIBLE * model.extent) ** 2)
+        scale = max(squares.min() / freedom, (ROUNDING_RATIO * model.extent) ** 2)
         noise = Noise(scale, freedom)
-        if Noise(sigma**2).chance(squares.min(), freedom) < PLAUSIBLE or (
-            noise.chance(given, freedom) > LEVEL
+        if Noise(sigma**2).chance(squares.min(), freedom) < MIN_NOISE_CHANCE or (
+            noise.chance(given, freedom) > SIGNIFICANCE_LEVEL
         ):
             continue
-        alike = np.array([noise.chance(one, freedom) > PLAUSIBLE for one in squares])
+        alike = np.array([noise.chance(one, freedom) > MIN_NOISE_CHANCE for one in squares])
         moved = np.where(alike, (orders != np.arange(count)).sum(axis=1), 2 * count)
         first, *others = np.argsort(moved, kind="stable").tolist()
-        sure = all(SURE * moved[first] <= moved[one] for one in others)
+        sure = all(SURE_ORDER_RATIO * moved[first] <= moved[one] for one in others)
         after = max(squares[first] / freedom, scale)
         return Reordered(orders[first], float((given / freedom) ** 0.5), float(after**0.5), sure)
     return None

@@ -32,7 +32,7 @@ from smartcam.calibration._plane.fitting import (
     fit,
     scaled_axes,
 )
-from smartcam.calibration._plane.model_selection import NEGLIGIBLE, squares, touch_noise
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code
@@ -55,16 +55,16 @@ MAX_SUBSETS_TRIED = 500
 With half of the points wrong, all of 500 subsets of four hold a wrong one in 1 of 10^14 cases.
 """
 
-BEST = 5
+FITTED_PROPOSALS = 5
 """Proposals that are fitted to the points that agree with them."""
 
 MAX_ROUNDS = 10
 """Fitting and judging take turns at most this many times; they usually take 2 or 3."""
 
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may leave out a point, or ask for a homography."""
 
-PRICE = 0.5
+LEFT_OUT_COST_RATIO = 0.5
 """Part of the threshold that a left-out point costs where similarity and homography are compared.
 
 A homography that only goes through one wrong point more is not chosen then: with 1, two wrong ones
@@ -80,7 +80,7 @@ MEDIAN_SQUARE = 2.366
 MIN_TRIANGLE_RATIO = 0.02
 """A subset's smallest triangle is larger than this part of its largest, or its map says nothing."""
 
-TINY = 1e-8
+MIN_VARIANCE_RATIO = 1e-8
 """Part of a residual's variance below which a point cannot be judged: the map goes through it."""
 
 
@@ -149,13 +149,13 @@ def _best(pairs: Pairs, sigma: float | None) -> _Agreement | None:
     if simple is None or general is None or general.mask.sum() < general.least:
         return simple or general
     noise = min(_noise(one, pairs, sigma) for one in (simple, general))
-    price = PRICE * noise.variance * _limit(len(pairs.camera), None)
+    price = LEFT_OUT_COST_RATIO * noise.variance * _limit(len(pairs.camera), None)
     before, after = (
         squares(one.fitted.residuals, pairs.weights[one.mask]) + price * float((~one.mask).sum())
         for one in (simple, general)
     )
     more = MODELS["homography"].parameters - MODELS["similarity"].parameters
-    if noise.chance(max(before - after, 0.0), more) < LEVEL:
+    if noise.chance(max(before - after, 0.0), more) < SIGNIFICANCE_LEVEL:
         return general
     return simple
 
@@ -169,12 +169,12 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
     if sigma is None:
         sigma_of_search = _scale(squared, MODELS[name].least)
     else:
-        sigma_of_search = max(sigma, NEGLIGIBLE)
+        sigma_of_search = max(sigma, ROUNDING_RATIO)
     threshold = sigma_of_search**2 * _limit(len(pairs.camera), None)
     # MSAC: sum min(r^2, threshold). Source: Torr and Zisserman, MLESAC (2000).
     costs = np.minimum(squared, threshold).sum(axis=1)
     found: dict[bytes, _Agreement] = {}
-    for index in np.argsort(costs, kind="stable")[:BEST]:
+    for index in np.argsort(costs, kind="stable")[:FITTED_PROPOSALS]:
         one = _settle(name, pairs, squared[index] <= threshold, sigma, threshold)
         if one is not None:
             found.setdefault(one.mask.tobytes(), one)
@@ -214,10 +214,10 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     residuals = pairs.robot - apply_homography(fitted.matrix, pairs.camera)
     values, vectors = np.linalg.eigh(variances)
     along = np.einsum("nij,ni->nj", vectors, residuals)
-    told = values > TINY / pairs.weights[:, None]
+    told = values > MIN_VARIANCE_RATIO / pairs.weights[:, None]
     squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
     if sigma is not None:
-        return np.asarray(squared <= max(sigma, NEGLIGIBLE) ** 2 * _limit(len(mask), None))
+        return np.asarray(squared <= max(sigma, ROUNDING_RATIO) ** 2 * _limit(len(mask), None))
     # The squares without the point itself, which an outlier would make large: their sum falls by
     # r^T Var^-1 r when a point of three coordinates leaves the fit, and their ratio is F.
     # Source: Cook and Weisberg, Residuals and Influence in Regression (1982), chapter 2.
@@ -226,14 +226,14 @@ def _judged(fitted: Fit, pairs: Pairs, mask: Mask, sigma: float | None) -> Mask:
     for some, left in ((mask, freedom - 3), (~mask, freedom)):
         if left > 0:
             others = np.maximum(total - np.where(some & mask, squared, 0.0), 0.0)[some] / left
-            limits[some] = np.maximum(others, NEGLIGIBLE**2) * _limit(len(mask), left)
+            limits[some] = np.maximum(others, ROUNDING_RATIO**2) * _limit(len(mask), left)
     return np.asarray(squared <= limits)
 
 
 def _noise(found: _Agreement, pairs: Pairs, sigma: float | None) -> Noise:
     """Return the touches' noise: as given, or as the residuals of those that agree say."""
     squared = squares(found.fitted.residuals, pairs.weights[found.mask])
-    return touch_noise(sigma, squared, found.fitted.freedom) or Noise(NEGLIGIBLE**2)
+    return touch_noise(sigma, squared, found.fitted.freedom) or Noise(ROUNDING_RATIO**2)
 
 
 def _limit(count: int, freedom: int | None) -> float:
@@ -242,9 +242,10 @@ def _limit(count: int, freedom: int | None) -> float:
     ``count``: of points among which one may be longer in 1 of 100 calibrations. ``freedom``: of the
     estimate that the variance comes from; None where it is known.
     """
-    # Each point with LEVEL / N, so that of all points one is longer in LEVEL of the calibrations at
-    # most (Bonferroni): chi-square of three coordinates, or three times F of an estimated variance.
-    special, chance = load("scipy.special"), LEVEL / count
+    # Each point with SIGNIFICANCE_LEVEL / N, so that in at most that part of the calibrations one
+    # of all points is longer (Bonferroni): chi-square of three coordinates, or three times F of an
+    # estimated variance.
+    special, chance = load("scipy.special"), SIGNIFICANCE_LEVEL / count
     if freedom is None:
         return float(special.chdtri(3, chance))
     return 3.0 * float(special.fdtri(3, freedom, 1.0 - chance))
@@ -260,7 +261,7 @@ def _scale(squared: Array, least: int) -> float:
     middle = (count + least + 1) // 2 - 1
     median = float(np.partition(squared, middle, axis=1)[:, middle].min())
     few = 1.0 + 5.0 / (count - least)
-    return float(max(few * math.sqrt(median / MEDIAN_SQUARE), NEGLIGIBLE))
+    return float(max(few * math.sqrt(median / MEDIAN_SQUARE), ROUNDING_RATIO))
 
 
 def _subsets(count: int, least: int) -> NDArray[np.intp]:

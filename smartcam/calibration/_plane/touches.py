@@ -19,7 +19,7 @@ from smartcam._argument_checks import a_number, numbers, of_class, or_none, take
 from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
 from smartcam.calibration._plane.diagnostics import TYPICAL_SIGMA, check_side, remark_side, sigma_of
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
-from smartcam.calibration._plane.model_selection import NEGLIGIBLE
+from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
 from smartcam.calibration._plane.validation import check_lever, check_positive
 from smartcam.calibration._statistics import Noise
 from smartcam.geometry import Code, Remark
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MAX_STEPS = 50
 """The fit takes at most this many steps; it usually takes 3 to 6."""
 
-LEVEL = 0.01
+SIGNIFICANCE_LEVEL = 0.01
 """Probability with which noise alone may cause a warning."""
 
 
@@ -179,7 +179,7 @@ def _fit(touched: Array, ray: NDArray[np.intp]) -> _FittedRays:
         first, second = (frame[:, one] + np.cross(step[3:], frame[:, one]) for one in (0, 1))
         second = second - first * (first @ second) / (first @ first)
         frame = frame_from_axes(first, second)
-        if np.abs(step).max() < NEGLIGIBLE**1.5 * (1.0 + np.abs(origin).max()):
+        if np.abs(step).max() < ROUNDING_RATIO**1.5 * (1.0 + np.abs(origin).max()):
             break
     along, residuals, jacobian = _linear(touched, ray, origin, frame)
     covariance = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
@@ -217,7 +217,7 @@ def _remarks(
                 "give touch_sigma"
             )
         )
-    elif Noise(touch_sigma**2).chance(squared, freedom) < LEVEL:
+    elif Noise(touch_sigma**2).chance(squared, freedom) < SIGNIFICANCE_LEVEL:
         found.append(
             Code.POOR_FIT.remark(
                 f"the touches lie {1e3 * math.sqrt(squared / len(sheet.along)):.3g} mm rms beside "

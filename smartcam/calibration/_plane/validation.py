@@ -30,10 +30,10 @@ Three points whose legs are 10 degrees apart have 0.15.
 MAX_THICKNESS_RATIO = 0.2
 """Extent out of the plane over extent across the longest direction, both rms."""
 
-NEAR = 0.01
+SAME_MARK_RATIO = 0.01
 """Part of the points' extent: points of one touch that are closer together show one mark."""
 
-SAME = 1e-9
+SAME_POINT_RATIO = 1e-9
 """Points that are closer together than this part of the extent of all points count as the same."""
 
 MIN_DIFFERENCE = 1e-100
@@ -88,7 +88,7 @@ def distinct(camera: Array, robot: Array, weights: Array) -> Distinct:
     if len(camera) in {number.max(initial=-1) + 1, 0} and touch.max(initial=-1) + 1 == len(camera):
         each = np.arange(len(camera), dtype=np.intp)
         return Distinct(camera, robot, weights, each, each)
-    near = NEAR * float(np.linalg.norm(np.ptp(camera, axis=0)))
+    near = SAME_MARK_RATIO * float(np.linalg.norm(np.ptp(camera, axis=0)))
     for one in np.flatnonzero(np.bincount(touch) > 1):
         same = np.flatnonzero(touch == one)
         if float(np.linalg.norm(np.ptp(camera[same], axis=0))) < near:
@@ -196,7 +196,7 @@ def _extents(points: Array) -> Array:
 def _check_distinct(points: Array, what: str, least: int) -> None:
     extent = float(np.ptp(points, axis=0).max())
     rounding = np.finfo(np.float64).eps * float(np.abs(points).max())
-    grain = max(SAME * extent, 4.0 * rounding, MIN_DIFFERENCE)
+    grain = max(SAME_POINT_RATIO * extent, 4.0 * rounding, MIN_DIFFERENCE)
     distinct = len(np.unique(np.round((points - points[0]) / grain), axis=0))
     if distinct < least:
         raise Code.COINCIDENT.unexpected(

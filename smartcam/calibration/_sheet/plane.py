@@ -39,14 +39,14 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel
     from smartcam.geometry._inside import Array
 
-STEPS = 20
+MAX_STEPS = 20
 """The fit of the homography takes at most this many steps; it usually takes 2 or 3."""
 
-SETTLED = 1e-6
+SETTLED_SIGMAS = 1e-6
 """Standard deviations by which an element of the homography still changes in the last step, with
 the others held; the next step changes it a million times less."""
 
-HALF = 0.5
+DIRECTION_STEP_PX = 0.5
 """Pixels to both sides of a point, from which its direction on the sheet is taken."""
 
 
@@ -133,7 +133,11 @@ class SheetPlane:
         ahead = np.column_stack([w * w - z * z, -2.0 * z * w])
         middles, ends, starts = (
             self._mapped(self._straight(at), at)
-            for at in (pixels, pixels + HALF * ahead, pixels - HALF * ahead)
+            for at in (
+                pixels,
+                pixels + DIRECTION_STEP_PX * ahead,
+                pixels - DIRECTION_STEP_PX * ahead,
+            )
         )
         way = ends - starts
         return Poses(
@@ -144,7 +148,10 @@ class SheetPlane:
     def _seen(self, pixels: ArrayLike) -> Array:
         given = as_points(pixels, 2, "pixels")
         width, height = self.size
-        outside = ((given < -HALF) | (given > [width - HALF, height - HALF])).any(axis=1)
+        outside = (
+            (given < -DIRECTION_STEP_PX)
+            | (given > [width - DIRECTION_STEP_PX, height - DIRECTION_STEP_PX])
+        ).any(axis=1)
         if outside.any():
             at = given[int(np.argmax(outside))].tolist()
             raise Code.OUT_OF_FIELD.unexpected(
@@ -249,13 +256,13 @@ def _fitted(matrix: Array, source: Array, pixels: Array, noise: Array) -> tuple[
     # Gauss and Newton's steps. From the linear solution the second or third is the last; of 54
     # points they take 1.8 ms, with SciPy's least_squares 2.2 ms (measured), in no fewer lines.
     weights, normal = whitening(noise, 0.0), np.eye(8)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         off = weights @ (pixels - apply_homography(matrix, source))[..., None]
         jacobian = (weights @ element_derivatives(matrix, source)[..., :8]).reshape(-1, 8)
         normal = jacobian.T @ jacobian
         step = np.linalg.solve(normal, jacobian.T @ off.ravel())
         matrix = matrix + np.append(step, 0.0).reshape(3, 3)
-        if (np.abs(step) * unit_diagonal(normal)).max() < SETTLED:
+        if (np.abs(step) * unit_diagonal(normal)).max() < SETTLED_SIGMAS:
             break
     covariance = np.zeros((9, 9))
     covariance[:8, :8] = inverse_scaled(normal)

@@ -15,10 +15,10 @@ from smartcam._arguments import check_flag, check_text
 from smartcam.calibration._files import storage
 from smartcam.calibration._lens.bundle import Bundle, Sight, adjust_weighted, camera_covariance
 from smartcam.calibration._lens.intrinsics import (
-    BAD,
+    BAD_VIEW_RATIO,
     MAX_BAD_VIEW_SHARE,
     MIN_VIEWS,
-    POOR,
+    POOR_FIT_RMS_PX,
     worst_view,
 )
 from smartcam.calibration._lens.poses import TARGET, check_view, half_turned
@@ -364,7 +364,7 @@ def calibrate_stereo(
                 "stereo: expected cameras that show the pairs as they are, got points behind one"
             )
         worst, ratio = worst_view([one.view for one in sights], adjusted)
-        if ratio <= BAD:
+        if ratio <= BAD_VIEW_RATIO:
             break
         if sights[worst] not in bad:
             bad.append(sights[worst])
@@ -480,7 +480,7 @@ def _remarks(
     for one in found.bad:
         used = any(one is sight for sight in found.sights)
         done = "is used all the same" if used else "was not used"
-        off = f"fits more than {BAD:g} times worse than the others"
+        off = f"fits more than {BAD_VIEW_RATIO:g} times worse than the others"
         if one.camera == 1 and one.pose in found.apart:
             pixels = found.apart[one.pose]
             far = f"{pixels:.3g} pixels off" if math.isfinite(pixels) else "nowhere near"
@@ -490,11 +490,11 @@ def _remarks(
             )
         name = f"{label(one.view, one.pose)}, {SIDES[one.camera]}"
         yield Code.BAD_VIEW.remark(f"{name}: {off}; it {done}")
-    if calibration.rms > POOR:
+    if calibration.rms > POOR_FIT_RMS_PX:
         yield Code.POOR_FIT.remark(
-            f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR:g} at most: a lens is "
-            "not of its model, the sheet is not flat, or the pairs were not taken at the same "
-            "moments"
+            f"residuals of {calibration.rms:.3g} pixels rms, expected {POOR_FIT_RMS_PX:g} at most: "
+            "a lens is not of its model, the sheet is not flat, or the pairs were not taken at the "
+            "same moments"
         )
     yield from remark_sides(calibration.transform)
     yield from of_sheet

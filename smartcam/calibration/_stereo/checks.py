@@ -31,21 +31,21 @@ if TYPE_CHECKING:
     from smartcam.geometry import Transform
     from smartcam.geometry._inside import Array
 
-WORST: Final = 5.0
+MAX_RMS_PX: Final = 5.0
 """Pixels rms, beyond which the pairs do not belong together."""
 
 WORST_PART: Final = 0.005
 """Residuals, rms, beyond which the pairs do not belong together, as a part of the longer side of
-the image: it counts where it is more pixels than WORST."""
+the image: it counts where it is more pixels than MAX_RMS_PX."""
 
-EXCHANGED: Final = 1.05
+EXCHANGED_RESIDUAL_RATIO: Final = 1.05
 """Residuals over those with the lenses exchanged, from which on they are: two lenses of one make
 differ by 1.7 and more where they are not (measured on recorded pairs)."""
 
 MIN_SWAPPED_SHARE: Final = 0.75
 """At least this part of the pairs must fit better with the lenses exchanged."""
 
-APART: Final = 30.0
+MIN_APART_CHI2: Final = 30.0
 """Squared standard deviations by which the right camera's place is no chance from the left one's:
 of three axes one in a million is more."""
 
@@ -82,7 +82,7 @@ def check_pairs(moments: Sequence[Moment], known: tuple[CameraModel | None, ...]
         for lenses in ((first, second), (second, first))
     )
     ratio = math.sqrt(float(so.sum() / other.sum())) if other.sum() > 0 else 1.0
-    if ratio > EXCHANGED and (other < so).mean() >= MIN_SWAPPED_SHARE:
+    if ratio > EXCHANGED_RESIDUAL_RATIO and (other < so).mean() >= MIN_SWAPPED_SHARE:
         raise Code.SWAPPED_LENSES.refusal(
             "stereo: expected the left camera's lens as left and the right one's as right, got "
             f"residuals {ratio:.3g} times as large as with the two exchanged",
@@ -102,7 +102,7 @@ def check_apart(transform: Transform, covariance: Array) -> None:
     """
     # by the variance along it, which few views tell where they do not tell all of the covariance
     shift, spread = transform.translation, covariance[3:, 3:]
-    if float(shift @ shift) ** 2 <= APART * float(shift @ spread @ shift):
+    if float(shift @ shift) ** 2 <= MIN_APART_CHI2 * float(shift @ spread @ shift):
         raise Code.COINCIDENT.refusal(
             "stereo: expected two cameras that stand apart, got one "
             f"{1e3 * float(np.linalg.norm(shift)):.2g} mm from the other, which may be nothing: "
@@ -174,7 +174,7 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     ``rms``: of the residuals, a coordinate, pixels. ``sights``: the used views; ``bad``: those that
     fit worst.
     """
-    most = most_rms([one.view for one in sights], WORST, WORST_PART)
+    most = most_rms([one.view for one in sights], MAX_RMS_PX, WORST_PART)
     if rms <= most:
         return
     named = ", ".join(f"{label(one.view, one.pose)} ({SIDES[one.camera]})" for one in bad)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._views import TargetView
     from smartcam.geometry._inside import Array
 
-NEAREST: Final = 1.01
+NEIGHBOUR_DISTANCE_RATIO: Final = 1.01
 """Points that are no farther apart than this many times the least distance are neighbours."""
 
 
@@ -61,7 +61,7 @@ def spacing_errors(target: Target, ids: Indices, points: Array) -> Array:
         return np.zeros(0)
     apart = np.linalg.norm(target.points - target.points[0], axis=1)[1:].min()
     tree = load("scipy.spatial").cKDTree(flat)
-    one, two = tree.query_pairs(NEAREST * apart, output_type="ndarray").T
+    one, two = tree.query_pairs(NEIGHBOUR_DISTANCE_RATIO * apart, output_type="ndarray").T
     true = np.linalg.norm(flat[one] - flat[two], axis=1)
     errors: Array = np.linalg.norm(points[one] - points[two], axis=1) - true
     return errors

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel, Transform
     from smartcam.geometry._inside import Array
 
-STEPS = 10
+MAX_STEPS = 10
 """Steps from the linear solution to the least reprojection error; two or three are enough."""
 
-SETTLED = 1e-9
+SETTLED_DEPTH_RATIO = 1e-9
 """Part of its depth that a point still moves in the last step."""
 
 
@@ -51,11 +51,11 @@ def triangulate(
     points[~(points[:, 2] > 0)] = np.nan
     white = [whitening(one, 0.0) for one in covariance]
     normal = np.full((len(points), 3, 3), np.nan)
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         normal, step = _step(pair, pixels, white, points)
         points = points + step
         with np.errstate(invalid="ignore"):
-            moved = np.linalg.norm(step, axis=1) > SETTLED * np.abs(points[:, 2])
+            moved = np.linalg.norm(step, axis=1) > SETTLED_DEPTH_RATIO * np.abs(points[:, 2])
         if not moved.any():
             break
     behind = ~((points[:, 2] > 0) & (pair.transform.apply(points)[:, 2] > 0))

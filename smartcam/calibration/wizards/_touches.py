@@ -149,8 +149,8 @@ class Touches:
     ) -> Touch:
         """Ask for a touch.
 
-        ``place``: what is to be touched, for people. ``mark``: what the camera sees of it.
-        ``what``: as of :class:`Touch`.
+        ``place``: text that says what to touch. ``mark``: position at which the camera sees it.
+        ``what``: attribute of :class:`Touch`.
         """
         description = f"Move the tip of the tool onto {place}, with the tool held as at every touch"
         step = Step(id=step_id, title=title, description=f"{description}.", **self.shown(mark))

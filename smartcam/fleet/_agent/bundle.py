@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from smartcam.fleet._bus.bus import Bus, Publisher
     from smartcam.fleet._bus.keys import Keys
 
-GATHER = 0.005
+BUNDLE_INTERVAL = 0.005
 """Seconds between two bundles, at least."""
 
-FULL = 1 << 15
+FULL_BUNDLE_BYTES = 1 << 15
 """Bytes of results with which a bundle goes at once."""
 
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
@@ -115,11 +115,11 @@ class AgentBundle:
         self._fresh += (_PART.pack(len(name), len(runs)), name, runs)
         self._count += 1
         self._bytes += len(runs)
-        if self._bytes >= FULL:
+        if self._bytes >= FULL_BUNDLE_BYTES:
             self.flush()
         elif self._due is None:
             loop = asyncio.get_running_loop()
-            at = self._said_at + GATHER
+            at = self._said_at + BUNDLE_INTERVAL
             self._due = (
                 loop.call_at(at, self.flush) if at > loop.time() else loop.call_soon(self.flush)
             )

@@ -50,8 +50,8 @@ class ProgramCall(NamedTuple):
         arguments: arguments of the call, by name.
         blobs: byte strings that came with the call.
         timeout: seconds that the call may take.
-        entered: applications to go back to of this program's temporary switches, by their call.
-        order: a trigger that came in numbers; in place of arguments.
+        entered: applications to go back to after this program's temporary switches, by call number.
+        order: a trigger in binary form, in place of arguments.
         reservation: the call that made the reservation in whose block it is; None outside of one.
     """
 
@@ -137,7 +137,7 @@ async def outcomes(
     application: int | None,
     timeout: float,
 ) -> list[bytes]:
-    """Trigger for somebody, and return the runs that came of it.
+    """Trigger for a program, and return the runs that this caused.
 
     The arguments are those of :meth:`SharedCamera.trigger_for`; ``owner`` is whose trigger it is.
     """
@@ -244,7 +244,7 @@ async def _reboot(call: ProgramCall) -> Answer:
 
 
 async def _take_back(call: ProgramCall) -> Answer:
-    """Have a camera that another client took tried again now, and wait for its session."""
+    """Try now to take back a camera that another client took, and wait for the session."""
     camera = call.host.require()
     camera.take_again()
     await camera.wait_connected(call.timeout)

@@ -43,13 +43,13 @@ logger: logging.Logger = logging.getLogger("smartcam.fleet")
 HOLD_OFF = 0.2
 """Seconds per step of preference until an agent that stands by takes a camera without agent."""
 
-ASK = 0.5
+ASK_TIMEOUT = 0.5
 """Seconds for another agent's answer, and between two looks at what it has."""
 
-RESOLVE = 2.0
+RESOLVE_TIMEOUT = 2.0
 """Seconds for finding the addresses of a host's name."""
 
-RETURN = 4.0
+RETURN_WAIT = 4.0
 """Seconds for others to be back on a bus that was away, before what they had is taken over."""
 
 CONTEST = 30.0
@@ -103,7 +103,7 @@ class Claims:
                     f"an agent named {name} is in fleet {self._keys.fleet} already; each has a "
                     "name of its own: `agent:` in its fleet file"
                 )
-            await asyncio.sleep(ASK)
+            await asyncio.sleep(ASK_TIMEOUT)
 
     async def claim_name(self, timeout: float) -> None:
         """Have the agent's name from now on, as long as no agent that was started before has it.
@@ -168,7 +168,7 @@ class Claims:
             ConfigurationError: another one has it, and this one does not stand by.
         """
         self._wanted[name] = settings
-        for key in await self._bus.present(self._keys.camera("*", name), ASK):
+        for key in await self._bus.present(self._keys.camera("*", name), ASK_TIMEOUT):
             self._note(key, True)
         others = self._others.get(name)
         if not others:
@@ -196,7 +196,7 @@ class Claims:
             ConfigurationError: one of the addresses is taken; says which and by whom.
         """
         listing = self._keys.listing("**")
-        answers = await self._bus.ask(listing, b"", ASK) if cameras else ()
+        answers = await self._bus.ask(listing, b"", ASK_TIMEOUT) if cameras else ()
         ports = {one.address.port for one in cameras.values()}
         there: list[tuple[str, str, Address]] = []
         for _, payload in answers:
@@ -262,7 +262,7 @@ class Claims:
             told = {
                 (one.summary.camera, one.summary.agent): one.standby
                 for agent in sorted({agent for _, agent in there})
-                for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK)
+                for one in await ask_cameras(self._bus, self._keys, agent, "**", ASK_TIMEOUT)
             }
             if all(told.get(one) for one in there):
                 return
@@ -276,7 +276,7 @@ class Claims:
                     f"already{more}; a camera has one agent. `standby: true` in both fleet files "
                     "makes this one stand by"
                 )
-            await asyncio.sleep(ASK)
+            await asyncio.sleep(ASK_TIMEOUT)
 
     # ------------------------------------------------------------------ who has what
 
@@ -337,12 +337,12 @@ class Claims:
         await asyncio.sleep(HOLD_OFF * self._standby.preference)
         while away or not self._bus.reached:
             if self._bus.reached:
-                if await self._appears(name, RETURN):
+                if await self._appears(name, RETURN_WAIT):
                     return  # should it go again, that is another matter
                 away = False
             else:
                 away = True
-                await asyncio.sleep(ASK)
+                await asyncio.sleep(ASK_TIMEOUT)
         settings = self._wanted.get(name)
         if settings is None or self._others.get(name) or name in self._agent.hosts:
             return
@@ -350,7 +350,7 @@ class Claims:
             await self.refuse_taken({name: settings})
         except ConfigurationError as exc:
             logger.warning("! %s", exc)
-            await asyncio.sleep(RETURN)
+            await asyncio.sleep(RETURN_WAIT)
             self._again.add(name)
             return
         if name not in self._wanted or self._others.get(name) or name in self._agent.hosts:
@@ -388,10 +388,10 @@ class Claims:
                 if await self._yields(host, other):
                     await self._give_up(name, other)
                     return
-                await asyncio.sleep(ASK)
+                await asyncio.sleep(ASK_TIMEOUT)
             elif away or not self._bus.reached:
                 away = not self._bus.reached
-                await self._appears(name, ASK if away else RETURN)
+                await self._appears(name, ASK_TIMEOUT if away else RETURN_WAIT)
             elif self._standby is not None and _is_taken(host):
                 logger.warning("! %s: no agent has it: %s stands by", name, agent.name)
                 self._contested.pop(name, None)
@@ -400,7 +400,7 @@ class Claims:
                 self._again.add(name)
                 return
             elif self._is_contested(name):
-                await self._appears(name, ASK)
+                await self._appears(name, ASK_TIMEOUT)
             else:
                 return
 
@@ -410,7 +410,7 @@ class Claims:
         Of two that have no session the first one by name goes on trying.
         """
         agent, name = self._agent, host.name
-        told = await ask_cameras(self._bus, self._keys, other, name, ASK)
+        told = await ask_cameras(self._bus, self._keys, other, name, ASK_TIMEOUT)
         if host.connected or agent.hosts.get(name) is not host:
             return False
         yields = bool(told) and (told[0].summary.connected or other < agent.name)
@@ -454,7 +454,7 @@ async def _places_of(hosts: set[str]) -> dict[str, set[str]]:
     if names:
         tasks = [asyncio.create_task(resolve(one)) for one in names]
         try:
-            await asyncio.wait(tasks, timeout=RESOLVE)
+            await asyncio.wait(tasks, timeout=RESOLVE_TIMEOUT)
         finally:
             for task in tasks:
                 task.cancel()

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 MAX_STATES_PER_BUNDLE = 1000
 MAX_STATE_BYTES = 1 << 19
-HOLD = 0.005
+STATUS_DELAY = 0.005
 """Seconds that a status may wait for others, so that one message tells them. The program whose
 trigger it belongs to hears of it with the reply."""
 
@@ -58,10 +58,10 @@ CATCH_UP = 0.2
 """Seconds behind such a reply after which the number of the next state is told where no state was:
 the reply may have been lost, and nothing else would tell."""
 
-GATHER = 0.002
+RESULTS_INTERVAL = 0.002
 """Seconds between two messages with results, at least: those that come faster go together."""
 
-FULL = 1 << 16
+FULL_MESSAGE_BYTES = 1 << 16
 """Bytes of results that go at once, however soon after the last."""
 
 REMINDERS = (0.05, 0.2, 1.0, 5.0)
@@ -385,10 +385,10 @@ class Host:
         self.topics.on_status(status)
         camera, number = self._camera, self.states.following
         if not (camera.connected and self._opened.is_set()):
-            self._say({"kind": "Status"}, hold=HOLD)
+            self._say({"kind": "Status"}, hold=STATUS_DELAY)
             return
         data = encode_status(number, int(status), camera.endian, camera.active_application)
-        self._have_said(data, asyncio.get_running_loop().time(), HOLD)
+        self._have_said(data, asyncio.get_running_loop().time(), STATUS_DELAY)
 
     def _on_event(self, event: CameraEvent) -> None:
         self._tell(event)
@@ -461,11 +461,11 @@ class Host:
         if self._results_out.heard or self._bundle.heard:
             self._fresh.append(data)
             self._fresh_bytes += len(data)
-            if self._fresh_bytes >= FULL:
+            if self._fresh_bytes >= FULL_MESSAGE_BYTES:
                 self._flush_results()
             elif self._due is None:
                 loop = asyncio.get_running_loop()
-                at = self._said_at + GATHER
+                at = self._said_at + RESULTS_INTERVAL
                 call = self._flush_results
                 self._due = loop.call_at(at, call) if at > loop.time() else loop.call_soon(call)
         self.topics.on_run(run)

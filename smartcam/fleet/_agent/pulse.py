@@ -10,13 +10,13 @@ from __future__ import annotations
 import asyncio
 from typing import Final
 
-BEAT: Final = 0.1
+BEAT_INTERVAL: Final = 0.1
 """Seconds between two looks at the clock."""
 
-GAP: Final = 0.25
+STOPPED_AFTER: Final = 0.25
 """Seconds between two looks from which on the agent counts as having been stopped."""
 
-SETTLE: Final = 1.0
+SETTLE_TIME: Final = 1.0
 """Seconds after a stop in which messages may have waited: they lay in the system's buffers."""
 
 
@@ -46,13 +46,13 @@ class Pulse:
 
     def _beat(self) -> None:
         self._look()
-        self._timer = asyncio.get_running_loop().call_later(BEAT, self._beat)
+        self._timer = asyncio.get_running_loop().call_later(BEAT_INTERVAL, self._beat)
 
     def _look(self) -> float:
         now = asyncio.get_running_loop().time()
-        if now - self._last > GAP:
+        if now - self._last > STOPPED_AFTER:
             if self._last >= self._settled:
                 self._since = self._last
-            self._settled = now + SETTLE
+            self._settled = now + SETTLE_TIME
         self._last = now
         return now

@@ -29,7 +29,7 @@ from smartcam._zenoh import (
 )
 from smartcam.exceptions import ConnectFailedError, SmartCamError
 from smartcam.fleet._bus.bus import Bus, BusQuestion, Handle, Publisher, never
-from smartcam.fleet._security.certificates import LOOK, read_identity, shake_hands
+from smartcam.fleet._security.certificates import LOOK_TIMEOUT, read_identity, shake_hands
 from smartcam.fleet._security.door import plain_host
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class ZenohEnd(ZenohSession, Bus):
         end = loop.time() + timeout
         await self.look_at_certificates()
         try:
-            await super().open(timeout - min(LOOK, timeout / 3))  # to find out why not
+            await super().open(timeout - min(LOOK_TIMEOUT, timeout / 3))  # to find out why not
         except ConnectFailedError as exc:
             if self._link.listen:
                 raise
@@ -162,7 +162,7 @@ class ZenohEnd(ZenohSession, Bus):
 
     async def _why_refused(self, folder: Path, left: float) -> str:
         """Return one endpoint's objection to a handshake; empty if no endpoint has any."""
-        each = max(0.0, min(LOOK, left / len(self._link.connect)))
+        each = max(0.0, min(LOOK_TIMEOUT, left / len(self._link.connect)))
         for endpoint in self._link.connect:
             kind, _, place = endpoint.partition("/")
             host, _, port = place.rpartition(":")

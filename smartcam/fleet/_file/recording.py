@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class RecordSection(Fields):
-    """Recording beside the agent: of each camera files that follow each other, in one folder."""
+    """Recording beside the agent: files that follow each other, of each camera, in one folder."""
 
     folder: str = Field(
         "recordings",

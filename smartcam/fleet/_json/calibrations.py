@@ -40,7 +40,7 @@ PICTURE_TIMEOUT = 20.0
 
 
 class JsonCalibrationCamera:
-    """A camera of an agent as it is calibrated.
+    """A camera of an agent, as a calibration uses it.
 
     Args:
         work: the service under way.
@@ -83,7 +83,7 @@ class JsonCalibrationCamera:
 
     @contextlib.asynccontextmanager
     async def _allowed(self) -> AsyncIterator[None]:
-        """Have no other program the camera for itself meanwhile."""
+        """See that no other program reserves the camera meanwhile."""
         program = f"{self._work.request.program or 'a program'} without smartcam"
         await self._host.enter(program, "a calibration", GATE_TIMEOUT)
         try:
@@ -92,7 +92,7 @@ class JsonCalibrationCamera:
             self._host.gate.leave(program)
 
     def _within(self, seconds: float) -> Work:
-        """Return the work with so many seconds at most."""
+        """Return the work, bounded to a number of seconds."""
         return self._work._replace(timeout=min(self._work.timeout, seconds))
 
 

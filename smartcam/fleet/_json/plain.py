@@ -72,7 +72,7 @@ GRACE = 0.5
 FIRST_TRY = 600.0
 """Seconds that Setup waits for a camera; its timeout is shorter."""
 
-LOOK = 2.0
+LOOK_TIMEOUT = 2.0
 """Seconds for asking the bus who is there."""
 
 
@@ -338,7 +338,8 @@ class Plain:
         """Return True if no other agent has a camera and this agent is the first by its name."""
         keys, bus = self._keys, self._bus
         having, there = await asyncio.gather(
-            bus.present(keys.camera("*", camera), LOOK), bus.present(keys.agent("*"), LOOK)
+            bus.present(keys.camera("*", camera), LOOK_TIMEOUT),
+            bus.present(keys.agent("*"), LOOK_TIMEOUT),
         )
         owners = {keys.tail(key, "presence/camera")[0] for key in having} - {self._agent.name}
         agents = {keys.tail(key, "presence/agent")[0] for key in there} | {self._agent.name}

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from smartcam.fleet._program.program import Program, Reply
     from smartcam.protocols import Counters
 
-DRIFT = 1e-4
+MAX_DRIFT_RATIO = 1e-4
 """Seconds in a second by which two clocks go apart at most."""
 
 HELLO_TIMEOUT = 2.0
@@ -346,13 +346,13 @@ class Caller:
     def sample(self, clock: float) -> None:
         """Take the time of the agent's clock that a message just now told."""
         now = asyncio.get_running_loop().time()
-        least = self._ahead - DRIFT * (now - self._measured)
+        least = self._ahead - MAX_DRIFT_RATIO * (now - self._measured)
         self._ahead, self._measured = max(least, clock - now), now
 
     def bound(self, clock: float, said: float) -> None:
         """Bound the agent's clock, which showed ``clock`` after it heard a message of ours."""
         now = asyncio.get_running_loop().time()
-        most = self._most + DRIFT * (now - self._bounded)
+        most = self._most + MAX_DRIFT_RATIO * (now - self._bounded)
         self._most, self._bounded = min(most, clock - said), now
 
     def here(self, clock: float) -> tuple[float, float]:
@@ -360,8 +360,8 @@ class Caller:
         if self.program.bus.local:
             return clock, clock
         now = asyncio.get_running_loop().time()
-        least = self._ahead - DRIFT * max(0.0, now - self._measured)
-        most = max(least, self._most + DRIFT * max(0.0, now - self._bounded))
+        least = self._ahead - MAX_DRIFT_RATIO * max(0.0, now - self._measured)
+        most = max(least, self._most + MAX_DRIFT_RATIO * max(0.0, now - self._bounded))
         return clock - most, clock - least
 
     def clock_at_most(self, at: float) -> float:
@@ -372,7 +372,7 @@ class Caller:
 
     def clock(self, at: float) -> float:
         """Return the agent's time at a time of the loop's clock, or one a little earlier."""
-        return at + self._ahead - DRIFT * max(0.0, at - self._measured)
+        return at + self._ahead - MAX_DRIFT_RATIO * max(0.0, at - self._measured)
 
     # ------------------------------------------------------------------ reservations
 

@@ -29,7 +29,7 @@ WARN_BEFORE = (timedelta(days=30), timedelta(days=7))
 
 DAY = timedelta(days=1)
 
-LOOK = 1.0
+LOOK_TIMEOUT = 1.0
 """Seconds for finding out why a handshake failed."""
 
 RENEW = "smartcam fleet certificates DIR makes a new one"
@@ -220,7 +220,9 @@ class Handshake(NamedTuple):
     ends: datetime | None
 
 
-async def shake_hands(host: str, port: int, folder: Path, within: float = LOOK) -> Handshake:
+async def shake_hands(
+    host: str, port: int, folder: Path, within: float = LOOK_TIMEOUT
+) -> Handshake:
     """Try a handshake, and say what came of it ``within`` seconds."""
     loop = asyncio.get_running_loop()
     writer: asyncio.StreamWriter | None = None

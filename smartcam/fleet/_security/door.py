@@ -55,7 +55,7 @@ MAX_CALM_GROWTH = 8
 CHECK_AFTER = 50
 """Looks until the engine's sockets are looked at, which it opens anew with renewed certificates."""
 
-RESERVED: Final = 256
+RESERVED_DESCRIPTORS: Final = 256
 """Descriptors that the port leaves to cameras and health; a quarter of all where those are few."""
 
 MAX_HALF_OPEN_CONNECTIONS: Final = 16
@@ -197,7 +197,7 @@ class Door:
         if most == resource.RLIM_INFINITY:
             return
         left = most - lowest
-        reserve = min(RESERVED, most // 4)
+        reserve = min(RESERVED_DESCRIPTORS, most // 4)
         if not self.shut and left <= reserve:
             self.shut = True
             self._set()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-HELD: Final = 32
+MAX_HELD_FRAMES: Final = 32
 """Encoded frames whose data a decoder remembers until their pictures come out."""
 
 
@@ -249,7 +249,7 @@ class H264Decoder:
         self._count += 1
         packet.pts = self._count
         self._held[self._count] = frame
-        if len(self._held) > HELD:
+        if len(self._held) > MAX_HELD_FRAMES:
             del self._held[next(iter(self._held))]
         return packet
 

@@ -5,7 +5,7 @@ and what the camera is to send once more. At most :data:`MAX_OPEN_BLOCKS` blocks
 
 A block whose packets are missing waits for them while the camera is asked, and blocks behind it
 wait for it. It is lost when the camera says that it has them no longer, has not sent them after
-:data:`TRIES` requests, or more is missing than is worth asking for.
+:data:`MAX_REQUESTS` requests, or more is missing than is worth asking for.
 
 Ids that begin anew are told from late packets by the camera's clock: a late leader's time lies
 before that of the newest block, a new one's behind it; and by a second of silence where the camera
@@ -40,7 +40,7 @@ SILENCE_TIMEOUT: Final = 0.05
 RESEND_INTERVAL: Final = 0.03
 """Seconds until what did not come is asked for once more."""
 
-TRIES: Final = 4
+MAX_REQUESTS: Final = 4
 """Requests for the packets of one block."""
 
 MAX_MISSING_PACKETS: Final = 64
@@ -230,7 +230,7 @@ class Assembler:
             missing > max(MAX_MISSING_PACKETS, block.packets // 4)
             or len(holes) > MAX_GAPS_PER_BLOCK
         )
-        if block.tries >= TRIES or too_many:
+        if block.tries >= MAX_REQUESTS or too_many:
             block.dead = True
             return
         past = block.over or block.trailer is not None or block.progress + SILENCE_TIMEOUT <= now

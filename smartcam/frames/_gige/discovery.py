@@ -25,7 +25,7 @@ from smartcam.frames._gige.gvcp import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-WAIT: Final = 0.5
+ANSWER_WAIT: Final = 0.5
 """Seconds for answers; the standard has cameras answer within 200 ms."""
 
 MAX_CAMERAS: Final = 256
@@ -90,7 +90,7 @@ def networks() -> list[Network]:
 
 
 async def find(
-    places: Iterable[Network], *, port: int = PORT, wait: float = WAIT
+    places: Iterable[Network], *, port: int = PORT, wait: float = ANSWER_WAIT
 ) -> list[AnsweringCamera]:
     """Ask for cameras.
 

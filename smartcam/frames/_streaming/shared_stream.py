@@ -26,7 +26,7 @@ begins to play in that time."""
 KEY_PAUSE: Final = 1.0
 """Seconds between two key frames that viewers ask for, however many they are."""
 
-FAILURES: Final = 3
+MAX_FAILURES: Final = 3
 """Frames in a row that cannot be encoded before the stream ends."""
 
 
@@ -221,7 +221,7 @@ class SharedH264:
             except FrameFormatError:
                 self.counts.failed += 1
                 failures += 1
-                if failures == FAILURES:
+                if failures == MAX_FAILURES:
                     raise
                 continue
             failures = 0

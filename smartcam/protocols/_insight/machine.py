@@ -261,7 +261,7 @@ class InSightMachine:
         """Put a request in line; write :meth:`data_to_send` next.
 
         A Get status that is in line already is not repeated: its answer is new enough. Disconnect
-        has no words, the connection's end is that; what is in line is dropped.
+        sends nothing: the connection ends, and what is in line is dropped.
 
         Raises:
             LocalProtocolError: there is no session, or an answer of the same kind is still owed.

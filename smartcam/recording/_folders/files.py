@@ -26,7 +26,7 @@ logger: logging.Logger = logging.getLogger("smartcam.recording")
 LOOK_INTERVAL = 10.0
 """Seconds after which it is looked again what is in the folder, where files are begun."""
 
-STEP = 64
+ITEMS_PER_LOOK = 64
 """Items after which a file's size is looked at."""
 
 
@@ -79,7 +79,7 @@ class FolderFiles:
         done = written = 0
         try:
             for place, one in enumerate(given):
-                if track.file is None or (not place % STEP and self._is_over(track)):
+                if track.file is None or (not place % ITEMS_PER_LOOK and self._is_over(track)):
                     self._flush(track, written)
                     done, written = place, 0
                     self._begin(track, one)

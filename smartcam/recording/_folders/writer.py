@@ -26,8 +26,8 @@ from smartcam.recording._recorder import (
     CHUNK,
     CLOSE_TIMEOUT,
     INTERVAL,
+    ITEM_OVERHEAD_BYTES,
     MAX_WAITING_BYTES,
-    OVERHEAD,
     Description,
 )
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.recording")
 
-ROOM = 4 * CHUNK
+MIN_FREE_BYTES = 4 * CHUNK
 """Bytes that must be free on a disk that was full before it is tried again."""
 
 RETRY_DELAYS = (1.0, 2.0, 4.0, 8.0, 15.0, 30.0)
@@ -155,7 +155,7 @@ class FolderWriter:
                 return False
             before = waiting.bytes
             waiting.items.append((track, given))
-            waiting.bytes += size + OVERHEAD
+            waiting.bytes += size + ITEM_OVERHEAD_BYTES
             if not before or before < CHUNK <= waiting.bytes:
                 self._more.notify()
             return True
@@ -264,7 +264,7 @@ class FolderWriter:
         if now < trouble.again or not found:
             return False
         self._files.enter()
-        if trouble.full and shutil.disk_usage(self._folder.path).free < ROOM:
+        if trouble.full and shutil.disk_usage(self._folder.path).free < MIN_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return True
 

@@ -39,7 +39,7 @@ UNPACKED_PER_BYTE = 10_000
 """Bytes that a larger file may unpack to for each of its own. Containers of nothing but zeros come
 to 6,000; a bomb to 30,000."""
 
-PIECE = 1 << 18
+PIECE_BYTES = 1 << 18
 """Bytes that are read or inflated at once."""
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -194,7 +194,7 @@ class RecordReader:
     def _pieces(self, inflate: Callable[[int], bytes]) -> bytearray:
         """Join what comes, up to the bound."""
         data = bytearray()
-        while piece := inflate(PIECE):
+        while piece := inflate(PIECE_BYTES):
             data += piece
             self.count_unpacked(len(piece))
             if len(data) > MAX_CHUNK:
@@ -221,16 +221,16 @@ class RecordReader:
 
     def _read(self, size: int) -> bytes:
         """Return the next bytes; what a length says is reserved as it comes, not before."""
-        if size <= PIECE:
+        if size <= PIECE_BYTES:
             return self._piece(size)
         data = bytearray()
         while len(data) < size:
-            data += self._piece(min(PIECE, size - len(data)))
+            data += self._piece(min(PIECE_BYTES, size - len(data)))
         return bytes(data)
 
     def _skip(self, size: int) -> None:
         while size:
-            size -= len(self._piece(min(PIECE, size)))
+            size -= len(self._piece(min(PIECE_BYTES, size)))
 
     def _piece(self, size: int) -> bytes:
         data = self._stream.read(size)

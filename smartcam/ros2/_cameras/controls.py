@@ -118,7 +118,7 @@ class CameraControls:
     async def _refresh(self, source: FrameSource) -> None:
         """Have all parameters be as the device has their features: setting one may change others.
 
-        It waits until the set counts that has begun it.
+        The refresh waits until the setting that caused it counts.
         """
         await asyncio.sleep(REFRESH_DELAY)
         for parameter, name in [*self._features.items()]:
@@ -158,7 +158,7 @@ async def _set(driver: Any, name: str, value: int) -> None:
     """Set a control.
 
     Raises:
-        SmartCamError: the device does not take the value, or has something else then.
+        SmartCamError: the device does not take the value, or has another one afterwards.
     """
     has = await driver.set_control(name, int(value))
     if has != int(value):

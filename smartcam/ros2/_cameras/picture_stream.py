@@ -21,7 +21,7 @@ Item = TypeVar("Item")
 LOOK_INTERVAL: Final = 0.1
 """Seconds between two looks whether somebody hears."""
 
-SELDOM: Final = 1.0
+SELDOM_INTERVAL: Final = 1.0
 """Seconds between two looks where the graph tells of new listeners."""
 
 AGAIN: Final = Backoff(initial=0.5, maximum=10.0)
@@ -105,11 +105,11 @@ class HeardPictures(Generic[Item]):
         loop = asyncio.get_running_loop()
         often = 0.0
         while not self.heard:
-            pause = LOOK_INTERVAL if not self._watches or loop.time() < often else SELDOM
+            pause = LOOK_INTERVAL if not self._watches or loop.time() < often else SELDOM_INTERVAL
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause):
                     await self._woken.wait()
-                often = loop.time() + SELDOM
+                often = loop.time() + SELDOM_INTERVAL
                 self._woken.clear()
                 await asyncio.sleep(0)
 

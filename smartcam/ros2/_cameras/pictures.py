@@ -34,7 +34,7 @@ Value = TypeVar("Value")
 SIZE_TIMEOUT: Final = 10.0
 """Seconds for a picture whose size is asked for."""
 
-RECENT: Final = 16
+MAX_STAMPS: Final = 16
 """Stamps of pictures that are remembered: each has one ``camera_info``."""
 
 
@@ -80,7 +80,7 @@ class CameraPictures:
         self._requests = PictureRequests(node, self.frame_id, self._lens, self._one)
         self._ends: list[Any] = []
         self._streams: list[HeardPictures[Frame]] = []
-        self._stamps: collections.deque[float] = collections.deque(maxlen=RECENT)
+        self._stamps: collections.deque[float] = collections.deque(maxlen=MAX_STAMPS)
         self._size: tuple[int, int] | None = None
         self._codecs = Codecs(threads=1)
         self._thread: ThreadPoolExecutor | None = None

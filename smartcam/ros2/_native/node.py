@@ -201,7 +201,7 @@ class NativeNode(NamedNode):
     # ------------------------------------------------------------------ for its ends
 
     def in_loop(self, do: Callable[..., None], *given: Any) -> bool:
-        """Have something done in the event loop; return False where that is gone."""
+        """Have something done in the event loop; return False where the loop is gone."""
         spun = self._spun
         return spun is not None and spun.in_loop(do, *given)
 

@@ -31,7 +31,7 @@ MAX_NAMES = 1024
 MAX_REASON_CHARACTERS = 1000
 """Characters of why a set did not work."""
 
-TURN = 64
+NAMES_PER_TURN = 64
 """Names until other things have their turn."""
 
 SEPARATOR: Final = "."
@@ -132,7 +132,7 @@ class ParameterServices:
             if value is None:
                 return []
             made.append(make(name, value))
-            if not place % TURN:
+            if not place % NAMES_PER_TURN:
                 await asyncio.sleep(0)
         return made
 
@@ -146,7 +146,7 @@ class ParameterServices:
                 names.append(name)
                 if SEPARATOR in name:
                     prefixes[name.rpartition(SEPARATOR)[0]] = None
-            if not place % TURN:
+            if not place % NAMES_PER_TURN:
                 await asyncio.sleep(0)
         return {"result": {"names": names, "prefixes": list(prefixes)}}
 

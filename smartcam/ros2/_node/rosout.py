@@ -30,7 +30,7 @@ MAX_TEXT_CHARACTERS = 8000
 CLOSE_TIMEOUT = 1.0
 LOOK_INTERVAL = 0.005
 
-TURN = 64
+RECORDS_PER_TURN = 64
 """Records that are published in one turn of the event loop."""
 
 DEBUG, WARN, FATAL = 10, 30, 50
@@ -133,7 +133,7 @@ class RosOut:
             self._waiting.clear()
             return
         with _inside():
-            for _ in range(min(TURN, len(self._waiting))):
+            for _ in range(min(RECORDS_PER_TURN, len(self._waiting))):
                 with contextlib.suppress(RosError):  # which would be logged, and come here
                     publisher.publish(self._waiting.popleft())
                     self._handed += 1

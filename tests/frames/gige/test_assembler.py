@@ -170,7 +170,7 @@ def test_nothing_answers_and_the_frame_is_lost_after_its_tries() -> None:
     first, second = frame(1, 1), frame(2, 2)
     stream.feed(*first[:3], *first[4:], *second)
     stream.wait(1)
-    assert [(one.first, one.last) for one in stream.wanted] == [(3, 3)] * _assembler.TRIES
+    assert [(one.first, one.last) for one in stream.wanted] == [(3, 3)] * _assembler.MAX_REQUESTS
     assert stream.numbers == [2]
     assert stream.pictures[0].lost == 1
 

@@ -104,7 +104,7 @@ async def drain(reader: FrameReader) -> None:
 async def test_pictures_come_whole_and_in_order_with_their_times(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(receiving, "WAITING", 10_000)
+    monkeypatch.setattr(receiving, "MAX_WAITING_FRAMES", 10_000)
     port = two_ports()
     async with (
         frames.open(DRAWN) as drawn,
@@ -140,7 +140,7 @@ async def test_pictures_come_whole_and_in_order_with_their_times(
 
 
 async def test_packets_that_are_lost_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(receiving, "WAITING", 10_000)
+    monkeypatch.setattr(receiving, "MAX_WAITING_FRAMES", 10_000)
     monkeypatch.setattr(feedback, "MAX_RESEND_AGE", LIMIT)
     port = two_ports()
     async with way(port) as between, frames.open(DRAWN) as drawn:
@@ -213,7 +213,7 @@ async def test_a_frame_s_end_is_asked_for_before_the_next_frame_comes() -> None:
 async def test_a_key_frame_in_the_midst_of_a_refresh_is_shown_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(receiving, "WAITING", 100)
+    monkeypatch.setattr(receiving, "MAX_WAITING_FRAMES", 100)
     port, packetizer = two_ports(), H264Packetizer()
     async with Codecs(threads=1) as codecs:
         encoder, sent = codecs.h264_encoder(keyint=30), []
@@ -340,7 +340,7 @@ async def test_what_cannot_be_decoded_at_all_is_told() -> None:
 
 
 async def test_a_decoder_that_is_too_slow_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(receiving, "WAITING", 4)
+    monkeypatch.setattr(receiving, "MAX_WAITING_FRAMES", 4)
     port, packetizer = two_ports(), H264Packetizer()
     async with Codecs(threads=1) as codecs:
         encoder, sent = codecs.h264_encoder(keyint=30), []

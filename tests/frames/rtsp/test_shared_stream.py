@@ -10,7 +10,7 @@ import pytest
 
 from smartcam.exceptions import FrameFormatError, FrameSourceError, FrameTimeoutError
 from smartcam.frames import Codecs
-from smartcam.frames._streaming.shared_stream import FAILURES, KEY_PAUSE, LINGER, SharedH264
+from smartcam.frames._streaming.shared_stream import KEY_PAUSE, LINGER, MAX_FAILURES, SharedH264
 from tests.frames.drivers import GoneError, scripted
 from tests.frames.pictures import frame_of, stamped
 from tests.handmade import until
@@ -194,13 +194,13 @@ async def test_one_damaged_frame_is_left_out_but_not_all(stream: Stream) -> None
     stream.shared.join(viewer)
     await stream.give(1)
     await stream.driver.streams()
-    for _ in range(FAILURES - 1):
+    for _ in range(MAX_FAILURES - 1):
         failed = stream.shared.counts.failed
         stream.driver.give(replace(drawn(2), data=b"cut off"))
         await until(lambda f=failed: stream.shared.counts.failed > f)  # type: ignore[misc]
     await stream.give(3)
     assert viewer.units == [(1, True), (3, True)]
-    for _ in range(FAILURES):
+    for _ in range(MAX_FAILURES):
         failed = stream.shared.counts.failed
         stream.driver.give(replace(drawn(4), data=b"cut off"))
         await until(lambda f=failed: stream.shared.counts.failed > f)  # type: ignore[misc]

@@ -419,4 +419,4 @@ async def test_port_pairs_are_even_and_odd(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(socket.socket, "getsockname", lambda _: ("127.0.0.1", 4000))
     with pytest.raises(OSError, match="no two ports"):
         port_pair("127.0.0.1", socket.AF_INET)
-    assert len(asked) == 2 * delivery.PAIRS
+    assert len(asked) == 2 * delivery.MAX_TRIES

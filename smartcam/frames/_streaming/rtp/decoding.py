@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtp.codings import Coding
 
 
-WAITING: Final = 16
+MAX_WAITING_FRAMES: Final = 16
 """Encoded frames that wait for the decoder; what comes beyond ends with a key frame."""
 
 MAX_UNDECODABLE_FRAMES: Final = 10
@@ -151,7 +151,7 @@ class UnitDecoding:
         source = self._source
         assert source is not None  # noqa: S101 - nothing comes before it begins
         self._units += [(one, source.utc(one.timestamp)) for one in units]
-        if len(self._units) > WAITING:
+        if len(self._units) > MAX_WAITING_FRAMES:
             self.overflows += 1
             self._skipped += len(self._units)
             self._missed += sum(self._pace.lost(one) for one, _ in self._units)

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtp.packets import RtpPacket
 
 
-WINDOW: Final = 64
+MAX_WAITING_PACKETS: Final = 64
 """Packets that may wait for an earlier one that is missing."""
 
 MAX_PACKETS_AHEAD, MAX_PACKETS_LATE = 3000, 500
 """Packets: a sequence number further off is a stream that began anew, if a second one follows."""
 
-PROOFS: Final = 2
+MARKER_PROOFS: Final = 2
 """Frames behind whose marker another timestamp followed, after which markers are believed."""
 
 
@@ -32,9 +32,9 @@ class Depacketizer:
     Another SSRC is a new stream.
 
     A frame ends with the packet that has the marker. Some senders put markers on each slice or
-    unit: a wary reader waits until :data:`PROOFS` frames showed that the marker is right, or until
-    :meth:`end_marked`; behind a wrong one frames end with the next timestamp. Parameters without a
-    picture belong to the next frame, whatever their marker and timestamp.
+    unit: a wary reader waits until :data:`MARKER_PROOFS` frames showed that the marker is right, or
+    until :meth:`end_marked`; behind a wrong one frames end with the next timestamp. Parameters
+    without a picture belong to the next frame, whatever their marker and timestamp.
 
     Args:
         window: packets.
@@ -46,15 +46,15 @@ class Depacketizer:
         duplicates: packets that came more than once, or too late.
         damaged: frames that something was seen of, and that did not come whole.
         streams: how often a stream began.
-        proofs: frames whose marker was right; :data:`PROOFS` of them are enough.
+        proofs: frames whose marker was right; :data:`MARKER_PROOFS` of them are enough.
     """
 
     def __init__(
-        self, window: int = WINDOW, kind: UnitKind | None = None, *, wary: bool = False
+        self, window: int = MAX_WAITING_PACKETS, kind: UnitKind | None = None, *, wary: bool = False
     ) -> None:
         self._window, self._kind = window, kind or H264Units()
         self._wary = wary
-        self.proofs = 0 if wary else PROOFS
+        self.proofs = 0 if wary else MARKER_PROOFS
         self.lost = self.duplicates = self.damaged = self.streams = 0
         self._ssrc: int | None = None
         self._told = (0, 0)  # what of lost and damaged the last unit said
@@ -183,7 +183,7 @@ class Depacketizer:
         over = self._open.has_picture or not self._open.parts
         if packet.marker and over and not self._marks_lie:
             self._marked_at = now
-            if self.proofs >= PROOFS:
+            if self.proofs >= MARKER_PROOFS:
                 yield from self._end()
 
     def _opened(self, packet: RtpPacket, now: float) -> OpenUnit:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.frames._streaming.rtp.packets import RtpPacket
 
 
-WINDOW: Final = 1024
+MAX_WAITING_PACKETS: Final = 1024
 """Packets that may wait for missing ones."""
 
 LOOK_INTERVAL: Final = 0.005
@@ -143,7 +143,7 @@ class StreamReceiver:
         self._done, self._gone, self._only = done, gone, only
         self._agreed = agreed
         self._loop = asyncio.get_running_loop()
-        self._depacketizer = Depacketizer(WINDOW, kind, wary=True)
+        self._depacketizer = Depacketizer(MAX_WAITING_PACKETS, kind, wary=True)
         self._depacketizer.proofs = proofs
         self._reception: Reception | None = None
         self._early: tuple[wire.SenderReport, float] | None = None  # before the first packet

@@ -26,7 +26,7 @@ SEND_BUFFER: Final = 128 << 10
 SO_RCVBUFFORCE: Final = 33 if sys.platform == "linux" else socket.SO_RCVBUF
 """asm-generic/socket.h: past rmem_max, for processes that may administer the network."""
 
-TRIES: Final = 32
+MAX_TRIES: Final = 32
 """Tries to find two free ports side by side."""
 
 
@@ -129,7 +129,7 @@ class SocketPair:
         Raises:
             OSError: no ports are free.
         """
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(MAX_TRIES)):
             with _socket(at.family) as probe:
                 probe.bind((at.host, 0))
                 even = probe.getsockname()[1] & ~1
@@ -147,7 +147,7 @@ class SocketPair:
         Raises:
             OSError: no ports are free.
         """
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(MAX_TRIES)):
             with contextlib.ExitStack() as stack:
                 rtp, rtcp = (stack.enter_context(_socket(to.family)) for _ in range(2))
                 rtp.bind(("", 0))

@@ -26,7 +26,7 @@ SEND_BUFFER: Final = 64 << 10
 DATAGRAMS: Final = 1 << 20
 """Bytes of datagrams that the system may hold: a key frame's, at once."""
 
-PAIRS: Final = 32
+MAX_TRIES: Final = 32
 """Tries to find two ports, an even one and the next."""
 
 
@@ -183,7 +183,7 @@ def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, s
     Raises:
         OSError: there is no pair of free ports.
     """
-    for _ in range(PAIRS):
+    for _ in range(MAX_TRIES):
         first = _bound(host, 0, family)
         port = first.getsockname()[1]
         try:

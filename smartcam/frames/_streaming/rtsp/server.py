@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 PORT: Final = 8554
 
-RATE: Final = 30.0
+DEFAULT_FRAME_RATE: Final = 30.0
 """Frames a second of a source that does not say."""
 
 _ANY: Final = ("", "0.0.0.0", "::")  # noqa: S104 - compared, not bound
@@ -195,4 +195,4 @@ def _rate(source: FrameSource) -> float:
         rates = source.format.rates
     except LocalProtocolError:
         rates = ()
-    return min(max(rates[0], 0.01), 1000.0) if rates else RATE
+    return min(max(rates[0], 0.01), 1000.0) if rates else DEFAULT_FRAME_RATE
