@@ -12,6 +12,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,6 +117,25 @@ def _test_files(path: Path) -> list[Path]:
     if not path.is_relative_to(ROOT / "tests"):
         return []
     return list(path.rglob("test_*.py")) if path.is_dir() else [path] if path.is_file() else []
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as ``long`` the cases of a ``sampled`` test that the short run leaves out.
+
+    Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
+    values of the parameter that changes fastest take turns.
+    """
+    counts: Counter[tuple[Any, str]] = Counter()
+    for item in items:
+        marker = item.get_closest_marker("sampled")
+        if marker is None or item.get_closest_marker("long"):
+            continue
+        test, every = (item.parent, getattr(item, "originalname", "")), marker.kwargs["every"]
+        row, place = divmod(counts[test], every)
+        if (row + place) % every:
+            item.add_marker(pytest.mark.long)
+        counts[test] += 1
 
 
 def pytest_collection_finish() -> None:
