@@ -329,6 +329,7 @@ def from_rgb(video: Any) -> Any:
     return came.format.rgb(came.data, came.width, came.height, came.stride)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     "name", [one.name for one in PIXEL_FORMATS if isinstance(one.layout, SampleLayout)]
 )

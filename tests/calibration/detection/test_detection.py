@@ -60,6 +60,7 @@ OTHERS = [
 TILTED = [one for one in TILTED if one not in OTHERS]
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("target", "roll"), [*TILTED, *(pytest.param(*one, marks=pytest.mark.long) for one in OTHERS)]
 )
@@ -315,6 +316,7 @@ def laid_out(points: Array) -> NDArray[np.intp]:
     return places
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(("grid", "count", "proper"), GRIDS, ids=repr)
 def test_arrangements_of_shuffled_points_are_those_that_look_alike(
     grid: CircleGrid, count: int, proper: int

@@ -56,6 +56,7 @@ def test_corners_of_a_grid_board_are_opencvs() -> None:
     np.testing.assert_allclose(PLAIN.points[PLAIN.corners, :2], theirs, atol=1e-7)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("grid", [APRIL, PLAIN, LATER], ids=lambda one: one.dictionary)
 @pytest.mark.parametrize(("tilt", "roll"), [(0, 0), (30, 70), (25, 200)])
 def test_grid_has_each_corner_where_it_is(grid: MarkerGrid, tilt: int, roll: int) -> None:
@@ -111,6 +112,7 @@ def test_grid_with_a_marker_of_another_place_leaves_it_out() -> None:
     assert told.text.endswith(": 11")
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("shown", "said", "code"),
     [

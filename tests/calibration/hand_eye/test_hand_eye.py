@@ -277,6 +277,7 @@ def test_hand_eye_of_a_bent_sheet_does_not_bend_its_lens() -> None:
     assert math.sqrt(float(np.mean(np.square(off)))) < 5e-3
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("setup", ONE_LONG)
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.27, 2.0])
 def test_hand_eye_refuses_a_print_of_quite_another_size(setup: Setup, factor: float) -> None:

@@ -125,6 +125,7 @@ ODD: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("how", ["", "&transport=udp"], ids=["tcp", "udp"])
 @pytest.mark.parametrize("name", ODD)
 async def test_an_odd_camera_gives_all_its_pictures(camera: Camera, name: str, how: str) -> None:
@@ -439,6 +440,7 @@ async def test_packets_twice_and_in_another_order_lose_nothing(camera: Camera) -
         assert in_a_row(got)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("how", ["&transport=tcp", "&transport=udp"])
 @pytest.mark.parametrize("every", [10, 17, 50, 100])
 async def test_no_picture_is_broken_and_each_loss_is_counted(
