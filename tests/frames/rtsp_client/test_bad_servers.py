@@ -217,7 +217,7 @@ def reports_only(camera: Camera) -> None:
 HEAD = b"RTSP/1.0 200 OK\r\nCSeq: 2\r\n"
 PACKET = b"$\0\0\x0c" + struct.pack("!BBHII", 0x80, 96, 1, 2, 7)
 ALERT = b"\x15\x03\x01\x00\x02\x02\x46"
-"""What a TLS server answers to one that does not speak TLS."""
+"""The answer of a TLS server to a client that does not speak TLS."""
 
 HTML = answers(
     DESCRIBE=lambda one: (
