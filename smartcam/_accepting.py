@@ -181,7 +181,7 @@ class Places(Generic[G]):
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: is missing then.
+            what: word for what the connection lacks then, for the log.
             now: the moment.
         """
         place = self._places.get(occupant)
@@ -326,7 +326,7 @@ class Acceptor(Generic[G]):
         Args:
             occupant: the connection.
             within: seconds from now on.
-            what: is missing then, for the log.
+            what: word for what the connection lacks then, for the log.
         """
         self.places.expect(occupant, within, what, asyncio.get_running_loop().time())
         self._set_timer()
@@ -469,7 +469,7 @@ async def listening(host: str, port: int, *, local: bool = False) -> socket.sock
         local: whether only loopback will do.
 
     Raises:
-        OSError, ValueError, OverflowError: it cannot be had, or is not ``local``.
+        OSError, ValueError, OverflowError: the address cannot be had, or is not ``local``.
     """
     loop = asyncio.get_running_loop()
     async with asyncio.timeout(RESOLVE_TIMEOUT):

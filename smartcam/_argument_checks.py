@@ -106,7 +106,7 @@ def as_array(value: Any, what: str) -> Any:
     """Return an array of whatever it is that came.
 
     Raises:
-        ConfigurationError: it is no array.
+        ConfigurationError: the value is no array.
     """
     import numpy as np
 

@@ -31,7 +31,7 @@ MAX_SECONDS = 1e9
 """Seconds that a time may have at most, about 31 years: more would overflow a loop's timer."""
 
 MAX_TEXT_LENGTH = 10_000
-"""Characters that a text may have at most, where nothing narrower is said."""
+"""Characters that a text may have at most, where no smaller bound is given."""
 
 MAX_DATA_BYTES = 1 << 30
 """Bytes that a byte string may have at most; the largest payload that a client may accept."""

@@ -59,7 +59,7 @@ def load(name: str, use: str = "") -> Any:
         use: what needs it, with its verb, for the error; "" for what mostly does.
 
     Raises:
-        MissingExtraError: it is not installed, or it is OpenCV 5.0.0.
+        MissingExtraError: the package is not installed, or it is OpenCV 5.0.0.
     """
     there = sys.modules.get(name)
     if there is not None and there is _LOADED.get(name):
@@ -80,7 +80,7 @@ def missing(name: str, use: str = "", which: str = "") -> MissingExtraError:
 
     Args:
         name: dotted name of the module.
-        use: as of :func:`load`.
+        use: as for :func:`load`.
         which: what the package must be, where not every version will do.
     """
     called, extra, usual = PACKAGES[name.partition(".")[0]]

@@ -290,8 +290,9 @@ class LoopThread:
 
         Raises:
             ConfigurationError: the thread does not run.
-            LocalProtocolError: it is called in the thread itself, or in a fork of the process.
-            ResponseTimeoutError: it took longer than ``timeout``; it was cancelled.
+            LocalProtocolError: the function is called in the thread itself, or in a fork of the
+                process.
+            ResponseTimeoutError: the coroutine took longer than ``timeout``; it was cancelled.
             KeyboardInterrupt: Ctrl-C; it was cancelled.
             Exception: whatever it raises.
         """

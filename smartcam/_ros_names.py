@@ -22,7 +22,7 @@ def check_node(name: str) -> str:
     """Return the name of a node.
 
     Raises:
-        ConfigurationError: it cannot be one.
+        ConfigurationError: the name cannot be one.
     """
     if len(name) > MAX_NAME_CHARACTERS or not _NODE.fullmatch(name):
         raise ConfigurationError(
@@ -36,7 +36,7 @@ def check_namespace(namespace: str) -> str:
     """Return a namespace as ``/`` or ``/line1/cell2``; ``line1`` is ``/line1``.
 
     Raises:
-        ConfigurationError: it cannot be one.
+        ConfigurationError: the text cannot be one.
     """
     text = "/" + namespace.strip("/")
     return "/" if text == "/" else _checked(text, "namespace")
@@ -46,7 +46,7 @@ def check_domain(domain: int) -> int:
     """Return a domain's number.
 
     Raises:
-        ConfigurationError: it is not valid.
+        ConfigurationError: the number is not valid.
     """
     if not 0 <= domain <= 0xFFFFFFFF:
         raise ConfigurationError(f"ROS domain {domain}: expected 0 or more")
@@ -69,7 +69,7 @@ def resolve(name: str, namespace: str, node: str, what: str = "topic") -> str:
         what: kind of the thing named, for error texts.
 
     Raises:
-        ConfigurationError: it cannot be one.
+        ConfigurationError: the name cannot be one.
     """
     checked = _checked(name, what)
     if checked.startswith("/"):

@@ -208,7 +208,7 @@ class _Inside(Generic[T]):
     """A context that is entered and left in the loop's thread.
 
     Attributes:
-        entered: whether it was entered, and leaving it has not begun.
+        entered: whether the object was entered, and leaving it has not begun.
     """
 
     def __init__(self, context: contextlib.AbstractAsyncContextManager[T]) -> None:
@@ -279,7 +279,7 @@ class SyncSubscription(Generic[ItemT]):
             timeout: seconds.
 
         Raises:
-            ResponseTimeoutError: none came in time.
+            ResponseTimeoutError: no item came in time.
             ConnectionClosedError: the stream has ended in order.
             SmartCamError: an item that is an error (the stream stays usable), or how it ended.
         """
@@ -361,7 +361,7 @@ class SyncFrameReaderBase:
 
         Raises:
             StopIteration: the source ended in order.
-            FrameTimeoutError: none came in time; it may be waited for again.
+            FrameTimeoutError: no frame came in time; it may be waited for again.
             FrameSourceError: how the source ended.
         """
         frame = self._wait(self._take)

@@ -143,11 +143,11 @@ class ThesisFace(Protocol):
         """Raise ConfigurationError where there can be no such topic."""
 
     def publish_status(self, topic: str) -> dict[str, Any]:
-        """Publish the status on this topic, and on none that was said before."""
+        """Publish the status on this topic, and no longer on the one before."""
         ...
 
     async def publish_results(self, topic: str, min_delay: float, queue: int) -> dict[str, Any]:
-        """Publish results on this topic, and on none that was said before."""
+        """Publish results on this topic, and no longer on the one before."""
         ...
 
     async def end_publishing(self) -> None:
@@ -236,7 +236,7 @@ def _check_place(face: ThesisFace, request: SetupRequest) -> None:
     """See that a request means the camera that the face has.
 
     Raises:
-        ConfigurationError: it means another one.
+        ConfigurationError: the request means another camera.
     """
     name, has, model = face.name, face.address, request.camera_model_name
     cure = "; Stop it first, or choose another camera_name"

@@ -93,7 +93,7 @@ class RequestHeader(BaseModel):
         """The time in seconds since 1970; None where the header says none.
 
         Raises:
-            ConfigurationError: it is no time.
+            ConfigurationError: the stamp is no time.
         """
         said = self.stamp or self.time
         try:
@@ -235,7 +235,7 @@ def checked_localizations(value: object, camera: str) -> list[Localization]:
     """Return the localizations that a value is.
 
     Raises:
-        InterpretationError: it is not valid.
+        InterpretationError: the value is not valid.
     """
     found = localizations_of(value)
     if found is None:

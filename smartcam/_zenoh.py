@@ -226,7 +226,7 @@ def engine() -> Any:
     """Return Zenoh.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: Zenoh is not installed.
     """
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
     return load("zenoh")
@@ -286,7 +286,8 @@ class ZenohSession:
         """Open the session.
 
         Raises:
-            ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds.
+            ConnectFailedError: the session cannot listen, or reach anybody, within ``timeout``
+                seconds.
             ConfigurationError: the engine refuses a setting.
             LocalProtocolError: this process is a fork of one that had a session before.
         """
@@ -361,8 +362,8 @@ class ZenohSession:
         between. What is declared meanwhile is declared with all else.
 
         Raises:
-            ConnectFailedError: it cannot listen again within ``timeout`` seconds; it is away until
-                it is tried again.
+            ConnectFailedError: the session cannot listen again within ``timeout`` seconds; it is
+                away until it is tried again.
 
         Cancellation: as an error.
         """
@@ -560,7 +561,7 @@ class ZenohSession:
         """The engine's session.
 
         Raises:
-            ConfigurationError: it is not open.
+            ConfigurationError: the session is not open.
         """
         if self._session is None:
             raise ConfigurationError(f"{self._what} is not open")

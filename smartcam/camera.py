@@ -187,7 +187,7 @@ class Camera(abc.ABC, Generic[ValueT]):
         Raises:
             ConnectFailedError: no session; names each attempt and what came.
             CommandRejectedError: the camera does not have the application.
-            ResponseTimeoutError: it did not become ready within ``switch_timeout``.
+            ResponseTimeoutError: the camera did not become ready within ``switch_timeout``.
             ConnectionLostError: the session was lost again before the application was ready.
 
         Cancellation: the link is dropped.
@@ -443,7 +443,7 @@ class Camera(abc.ABC, Generic[ValueT]):
             timeout: seconds from the call.
 
         Raises:
-            TriggerTimeoutError: nothing came in time.
+            TriggerTimeoutError: no result came in time.
             InterpretationError: what came does not fit its layout, or its calibration.
 
         Cancellation: safe; the result still goes to the streams.
@@ -696,7 +696,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: it did not within ``timeout`` seconds.
+            ResponseTimeoutError: the camera did not within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
         """
@@ -712,7 +712,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera always runs (``bid``).
-            ResponseTimeoutError: it did not within ``timeout`` seconds.
+            ResponseTimeoutError: the camera did not within ``timeout`` seconds.
 
         Cancellation: safe; the command may have been sent.
         """
@@ -842,7 +842,7 @@ class Camera(abc.ABC, Generic[ValueT]):
 
         Raises:
             UnsupportedError: the camera has none.
-            FrameTimeoutError: none came in time.
+            FrameTimeoutError: no frame came in time.
             FrameSourceError: the device is not there, in use, or was unplugged.
             ConnectionLostError: the agent is gone.
 

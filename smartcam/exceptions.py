@@ -319,7 +319,7 @@ class FrameSourceError(SmartCamError, OSError):
 
 
 class FrameFormatError(FrameSourceError):
-    """A source has no such pixels, or bytes are no picture of the format they are said to have."""
+    """A source has no such pixels, or bytes are no picture of the format that they should have."""
 
 
 class FrameFeatureError(FrameSourceError):
@@ -373,7 +373,7 @@ class RosError(SmartCamError):
 
 
 class RosMessageError(RosError):
-    """Bytes, or fields, that are no message of the type that they are said to have."""
+    """Bytes, or fields, that are no message of the type that they should have."""
 
 
 class ServiceCallError(RosError):

@@ -205,7 +205,7 @@ class Localization(NamedTuple):
         feature_id: name of the taught feature.
         quality: 0 to 1.
         photo_index: index of the photo it was found in.
-        pose: where it lies: x right, y up, theta counter-clockwise.
+        pose: place of the part: x right, y up, theta counter-clockwise.
     """
 
     feature_id: str
@@ -236,8 +236,9 @@ class Calibration(Protocol):
                 frame.
 
         Raises:
-            CalibrationError: one of them cannot be brought there. That makes the whole result an
-                :exc:`~smartcam.InterpretationError`, and so does anything else that is raised.
+            CalibrationError: one of the localizations cannot be brought there. That makes
+                the whole result an :exc:`~smartcam.InterpretationError`, and so does anything else
+                that is raised.
         """
         ...
 

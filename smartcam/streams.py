@@ -140,7 +140,7 @@ class Queue(Generic[T]):
 
         Raises:
             StopAsyncIteration: closed.
-            SmartCamError: how it ended.
+            SmartCamError: the stream has ended, and how.
         """
         while not self._items:
             if self._ended:

@@ -67,14 +67,18 @@ def docstrings() -> Iterator[Text]:
 ENTRY = re.compile(r"^    (?:\*{0,2}[\w, ]+): (.+)$", re.MULTILINE)
 
 
-@found_once
-def entries() -> Iterator[Text]:
-    """Yield the first line of what is said of each attribute and argument."""
+def entries(*sections: str) -> Iterator[Text]:
+    """Yield the first line of what is said of each attribute and argument, or in sections."""
     for module, line, text in docstrings():
         for section in re.split(r"^(?=\w+:$)", text, flags=re.MULTILINE):
-            if section.startswith(("Args:", "Attributes:")):
+            if section.startswith(sections or ("Args:", "Attributes:")):
                 for one in ENTRY.findall(section):
                     yield Text(module, line, one)
+
+
+def errors() -> Iterator[Text]:
+    """Yield the first line of the cause of each error that a function raises."""
+    yield from entries("Raises:")
 
 
 FRAGMENT = re.compile(r"(Of|The same|This|That|Those|These|In which|By which|At which|Of which)\b")
@@ -99,6 +103,7 @@ def test_functions_say_what_they_return_by_a_noun() -> None:
 
 HALF = {
     "an argument is said by a noun, not by 'of ...'": (entries, r"^(of|for|in|by) (?!ten )"),
+    "an error is said of a noun": (errors, r"^(it|they|that|none|one(?! of)|there is none)\b"),
     "'is none' says nothing of what it is not": (
         docstrings,
         r"(?<!there) (is|are|was|were) none\b",

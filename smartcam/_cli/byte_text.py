@@ -23,7 +23,7 @@ def bytes_of_text(text: str) -> bytes:
 
     Raises:
         ConfigurationError: a dump whose offsets do not follow each other.
-        ValueError: it is none of these.
+        ValueError: the text is in no form that is known here.
     """
     lines = [line for line in text.splitlines() if line.strip()]
     found = [_DUMP_LINE.fullmatch(line) for line in lines]

@@ -111,7 +111,7 @@ async def tower(
     """Build the tower, and tell how well it was seen.
 
     Args:
-        options: how it is told.
+        options: the options of the command.
         seed: seed of where everything lies, and of all noise.
         table: another one; None: one of the seed.
         colours: colours of the blocks.
@@ -217,7 +217,7 @@ def loose_blocks(
     """Return the blocks of a colour that lie on the table, as seen from far above.
 
     Raises:
-        FrameFormatError: there is none; it says what there is instead.
+        FrameFormatError: there is no block of the colour; it says what there is instead.
     """
     lying: list[BlockPose] = []
     for one in _regions(sight, colours):
@@ -233,7 +233,7 @@ def measured_block(table: TowerTable, rough: BlockPose, colours: ColourRange) ->
     """Go above a block and return its pose; from there its sides are hardly seen.
 
     Raises:
-        FrameFormatError: it is not there.
+        FrameFormatError: the block is not there.
     """
     sight = table.look((rough.x, rough.y, NEAR), maps=0)
     found = [_pose(sight, one, BLOCK[2]) for one in _regions(sight, colours)]
@@ -254,7 +254,7 @@ def tower_place(sight: TableSight, depth: NDArray[np.float32]) -> tuple[float, f
     """Return the place of whatever is higher than one block, x and y in metres.
 
     Raises:
-        FrameFormatError: nothing is.
+        FrameFormatError: no place is higher.
     """
     region = _high(sight, depth)[0]
     height = sight.camera[2] - region_depth(depth, region.mask).median
@@ -265,7 +265,7 @@ def measured_top(table: TowerTable, x: float, y: float) -> BlockPose:
     """Go above the tower and return the pose and the height of its top.
 
     Raises:
-        FrameFormatError: it is not there, or its top is no block.
+        FrameFormatError: the tower is not there, or its top is no block.
     """
     sight = table.look((x, y, ABOVE), MAPS)
     average, smooth = TemporalFilter(delta=EDGE), SpatialFilter(delta=EDGE)

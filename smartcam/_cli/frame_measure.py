@@ -29,7 +29,7 @@ async def measure(source: FrameSource, seconds: float) -> dict[str, Any]:
     """Read a source for some time, from its first frame on, and return what came out.
 
     Raises:
-        FrameSourceError: it gave not a frame, or ended with an error.
+        FrameSourceError: the source gave no frame, or ended with an error.
 
     Cancellation: safe; it reads no longer.
     """

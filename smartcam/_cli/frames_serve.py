@@ -154,7 +154,7 @@ async def serve_sources(
     """Serve sources until cancelled, or for ``--seconds``; one that fails harms no other.
 
     Raises ConfigurationError, FrameFormatError, UnsupportedError: all sources fail by them;
-    ConfigurationError: it cannot listen.
+    ConfigurationError: the site cannot listen.
     """
     if len(urls) > MAX_SHOWN:
         raise click.UsageError(f"expected {MAX_SHOWN} URLs at most, got {len(urls)}")

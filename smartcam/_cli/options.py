@@ -274,7 +274,7 @@ class Options:
 
         ``fleet``: the agent of a fleet may know what is not said here, such as ``y_down``. Raises
         CalibrationError: the calibration's file is damaged, newer, or holds something else;
-        ConfigurationError: it cannot be opened, or was made with another ``--y-down``.
+        ConfigurationError: the calibration cannot be opened, or was made with another ``--y-down``.
         """
         options: dict[str, Any] = {"interpret_as": self.interpret_as}
         if self.y_down or not fleet:

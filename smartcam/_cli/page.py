@@ -22,7 +22,7 @@ class PageOptions:
 
     Attributes:
         wanted: whether there is one.
-        place: where it is, and its token, as a site takes them.
+        place: address of the page, and its token, as a site takes them.
 
     Raises:
         click.UsageError: something is said of a page that is not wanted.

@@ -36,7 +36,7 @@ class Before:
 
     Attributes:
         application: id of the application that was active.
-        running: whether it ran.
+        running: whether the application ran.
         wanted: what was asked of the camera.
     """
 
@@ -198,7 +198,7 @@ class CommandLock:
     def leave(self, before: Before) -> asyncio.Task[None] | None:
         """Go back as soon as the turn is free; in the next session, and None, where there is none.
 
-        The block that is left first is done last: of several owed ways back the outermost counts.
+        Where several ways back are owed, the one to the outermost block's application counts.
         """
         if self._jobs is None or self._waits.end is not None:
             self._owe(before)
@@ -215,7 +215,7 @@ class CommandLock:
         return task
 
     async def leave_and_wait(self, before: Before) -> None:
-        """Go back, and raise what stood in the way.
+        """Go back, and raise the error that prevented it.
 
         Cancellation: going back is finished nevertheless.
         """
@@ -228,12 +228,12 @@ class CommandLock:
         """Load the active application again, which empties the camera's queue of input data.
 
         Args:
-            needed: whether it is still to be done, once the turn is there.
+            needed: function that tells, once the turn is there, whether this is still to be done.
             timeout: seconds to wait for it.
 
         Raises:
-            SmartCamError: what stood in the way.
-            ResponseTimeoutError: it takes longer.
+            SmartCamError: the application could not be loaded, and why.
+            ResponseTimeoutError: loading takes longer.
 
         Cancellation: it is finished nevertheless, as after the timeout.
         """

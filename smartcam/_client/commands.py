@@ -77,7 +77,7 @@ class Commands:
         await self._leave_run_mode(deadline)
 
     async def void_inspection(self, deadline: float) -> None:
-        """Stop and start again, and have heard all that was said before the start.
+        """Stop and start again; hear all that the camera sent before the start.
 
         Cancellation: it may stay stopped; it is halted then.
         """
@@ -222,7 +222,7 @@ class Commands:
 
         Raises:
             ConfigurationError: the dialect can have no such application.
-            UnsupportedError: it loads none, or none by name.
+            UnsupportedError: the camera loads none, or none by name.
         """
         name = self._connection.name
         if isinstance(application, str):
@@ -238,7 +238,7 @@ class Commands:
         """Check that the dialect may have an application; 0 is the camera's to refuse.
 
         Raises:
-            ConfigurationError: it has no such id.
+            ConfigurationError: the dialect has no such id.
         """
         ids = self._connection.dialect.application_ids
         if application != 0 and application not in ids:

@@ -91,7 +91,7 @@ class Connection:
         """Return the link.
 
         Raises:
-            LinkError: there is none, and why.
+            LinkError: there is no session, and why.
         """
         if self._waits.end is not None:
             self._waits.raise_end()
@@ -104,7 +104,7 @@ class Connection:
         """Dialect of this session.
 
         Raises:
-            LinkError: there is none.
+            LinkError: there is no session.
         """
         return self.require_link().machine.dialect
 
@@ -112,7 +112,7 @@ class Connection:
         """See to it that the dialect has a message, before anything is done for it.
 
         Raises:
-            UnsupportedError: it has not.
+            UnsupportedError: the dialect has not.
             LinkError: there is no session.
         """
         if not self.dialect.has(message_type):
@@ -122,7 +122,7 @@ class Connection:
         """Return the loop time in ``timeout`` seconds.
 
         Raises:
-            ConfigurationError: it is no finite number of seconds, 0 or more.
+            ConfigurationError: the timeout is no finite number of seconds, 0 or more.
         """
         loop = self._loop or asyncio.get_running_loop()
         return loop.time() + check_seconds(timeout, "timeout", self.name)

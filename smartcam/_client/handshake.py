@@ -71,7 +71,7 @@ class Session(NamedTuple):
 
     Attributes:
         link: the link.
-        address: where it leads, with the dialect pinned.
+        address: address of the attempt, with the dialect pinned.
         dialect: what is spoken.
         version: protocol version from the Connect answer.
         early: every chunk that came meanwhile, in order: the first status, and whatever else the
@@ -202,7 +202,7 @@ async def attempt(
         address: where the camera is.
         dialects: one, or several that begin a session alike.
         transport: TCP or UDP.
-        progress: is told how far it came.
+        progress: function that is told how far the handshake came.
         name: name of the camera, for logs.
         max_length: largest payload accepted, bytes.
         trace: called with every frame.
@@ -272,7 +272,7 @@ def _for_layout(
     """Return the attempts in which the camera can be told a layout.
 
     Raises:
-        ConfigurationError: it can be told in none of them.
+        ConfigurationError: no attempt can tell the layout.
     """
     groups: list[tuple[Dialect, ...]] = []
     refused: ConfigurationError | None = None

@@ -194,8 +194,8 @@ class Interpretation:
         """Interpret one container.
 
         Raises:
-            InterpretationError: it does not fit, or the calibration cannot turn its value into
-                poses of the robot; then the calibration's error is chained.
+            InterpretationError: the container does not fit, or the calibration cannot turn its
+                value into poses of the robot; then the calibration's error is chained.
             WrongApplicationError: a mapping does not know its application.
         """
         way = self._one or self._known(container.application)
@@ -273,8 +273,8 @@ class _Calibrations:
         y_down: the camera's y axis points down.
 
     Raises:
-        ConfigurationError: it is no calibration, and no mapping from application ids to some; or
-            one that was made with y taken the other way.
+        ConfigurationError: the calibration is no calibration, and no mapping from application ids
+            to some; or one that was made with y taken the other way.
     """
 
     def __init__(self, given: Any, y_down: bool) -> None:
@@ -372,7 +372,7 @@ def _calibration(given: Any, y_down: bool) -> Calibration:
     """Return the calibration that was given.
 
     Raises:
-        ConfigurationError: it is not valid, or one that would mirror poses.
+        ConfigurationError: the calibration is not valid, or one that would mirror poses.
     """
     method = getattr(given, "to_robot", None)
     if isinstance(given, type) or not callable(method) or inspect.iscoroutinefunction(method):

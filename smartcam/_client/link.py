@@ -157,7 +157,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
 
         Args:
             message: what to say.
-            answered: whether it is answered, where the protocol does not know.
+            answered: whether the message is answered, where the protocol does not know.
 
         Raises:
             LocalProtocolError: the protocol's state forbids it.

@@ -108,7 +108,7 @@ class Requests:
 
         Raises:
             UnsupportedError: the camera does not know the request.
-            CommandRejectedError: it refused, or is too busy.
+            CommandRejectedError: the camera refused, or is too busy.
         """
         code = answer.code if isinstance(answer, m.Acknowledgement) else 0
         verdict = self._connection.dialect.code(code, request).verdict
@@ -131,7 +131,7 @@ class Requests:
         """Send a request and return its answer, which may come among statuses and results.
 
         Raises:
-            ResponseTimeoutError: it did not come, as for :meth:`exchange`.
+            ResponseTimeoutError: the answer did not come, as for :meth:`exchange`.
         """
         got = await self.exchange(message, answer, deadline)
         if not isinstance(got, answer):
@@ -144,8 +144,8 @@ class Requests:
         """Send a request and return the answer registered under ``key``; as :meth:`ask`.
 
         Raises:
-            ResponseTimeoutError: it did not come. It stays owed where it may come yet; if it is
-                overdue, too, the link is given up.
+            ResponseTimeoutError: the answer did not come. It stays owed where it may come yet; if
+                it is overdue, too, the link is given up.
         """
         answer = await self.post(message, key, deadline)
         try:
@@ -247,7 +247,8 @@ class Requests:
         """Wait for the answer to an earlier request, which is dropped.
 
         Raises:
-            ResponseTimeoutError: it did not come; the link is given up if its own time is over too.
+            ResponseTimeoutError: the answer did not come; the link is given up if its own time is
+                over too.
         """
         while self._waits.owes(key):  # a trigger may have sent the next Query before this goes on
             owed = self._waits.owed_answer(key)

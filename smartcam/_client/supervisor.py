@@ -65,8 +65,8 @@ class Supervisor:
 
     Attributes:
         session: the last session that was made, None before the first.
-        on_taken: is called when the camera was taken, and has it tried again slowly; None: a camera
-            that was taken is the end.
+        on_taken: function that is called when the camera was taken, and has it tried again slowly;
+            None: a camera that was taken is the end.
     """
 
     _settings: CameraSettings
@@ -372,7 +372,7 @@ class Supervisor:
         """Make a new session after a long pause, or as soon as somebody takes the camera back.
 
         Raises:
-            SmartCamError: it was given up.
+            SmartCamError: the client gave up.
         """
         pause = self._pause_of_taken
         self._waits.end = taken
@@ -389,7 +389,7 @@ class Supervisor:
         """Make a new session, as often as the policy says; ``at_once``: without a first pause.
 
         Raises:
-            SmartCamError: it was given up.
+            SmartCamError: the client gave up.
         """
         policy, name = self._settings.reconnect, self._name
         settings = self._settings.model_copy(update={"address": self.address})

@@ -470,7 +470,7 @@ class Triggers:
         until it is reset (BVS ID guide p. 227, published).
 
         Raises:
-            OvertriggeredError: it stays set; no trigger was sent.
+            OvertriggeredError: the bit stays set; no trigger was sent.
         """
         now = asyncio.get_running_loop().time()
         grace = min(OVERTRIGGERED_GRACE, 0.5 * (deadline - now))

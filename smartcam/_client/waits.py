@@ -125,7 +125,7 @@ class Waits:
         """Raise why there is no session, if there is none.
 
         Raises:
-            LinkError: it.
+            LinkError: there is no session, and why.
         """
         if self.end is not None:
             raise told(self.end)

@@ -80,8 +80,8 @@ def load_cloud(path: str | os.PathLike[str], *, unit: LengthUnit | None = None) 
 
     Raises:
         ConfigurationError: another suffix, or no such unit.
-        FrameSourceError: it cannot be read.
-        FrameFormatError: nothing says the unit, or its bytes are no such file, or it has no x, y
+        FrameSourceError: the file cannot be read.
+        FrameFormatError: nothing says the unit, or the file's bytes are no cloud, or have no x, y
             and z, or its coordinates are so large that float32 would take a millimetre from them.
     """
     path = check_path(path, "path", "cloud")

@@ -35,7 +35,7 @@ class ReaderDriver(FrameDriver):
         """Enter the reader, and see its first frame.
 
         Raises:
-            FrameTimeoutError: none came in time.
+            FrameTimeoutError: no frame came in time.
             FrameSourceError: the reader's source is not there.
         """
         self._reader = await self._frames.__aenter__()

@@ -52,7 +52,7 @@ def read_camera_infos(left: str | os.PathLike[str], right: str | os.PathLike[str
             ``NOT_RIGID``: a rectification is no rotation; ``SWAPPED_SIDES``: the right one is not
             that of the right camera of a pair.
         MissingExtraError: PyYAML is not installed.
-        OSError: one cannot be read.
+        OSError: one of the files cannot be read.
     """
     given = [(parse_camera_info(_text(path)), path) for path in (left, right)]
     (one, _), (two, _) = given

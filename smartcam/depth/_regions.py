@@ -72,7 +72,7 @@ def region_depth(
 
     Raises:
         ConfigurationError: no region, or ``shared`` is below 1.
-        FrameFormatError: nothing there has a depth, or it is no map of depth.
+        FrameFormatError: no pixel there has a depth, or the array is no map of depth.
     """
     if not (shared >= 1 and math.isfinite(shared)):
         raise ConfigurationError(

@@ -242,7 +242,7 @@ class StereoDepth:
         """Return the depth of the newest pair.
 
         Raises:
-            FrameTimeoutError: none came in time.
+            FrameTimeoutError: no pair came in time.
             FrameFormatError: a frame is cut, or has no brightness; the next one may have.
             FrameSourceError: of the camera that ended with one.
             LocalProtocolError: the pair is not open.

@@ -53,7 +53,7 @@ class DoctorOptions:
 
     Attributes:
         application: id that is expected to be active, None for any.
-        interpreter: interpretation of the results; None where nothing was said.
+        interpreter: interpretation of the results; None where none was given.
         y_down: whether the camera's y axis points down.
         trigger: whether triggers may be sent, and ``application`` loaded for them.
         timeout: seconds for each step, None for the defaults.
@@ -232,7 +232,7 @@ class Examination:
     def patient(self) -> Camera:
         """The camera in a session.
 
-        LookupError: there is none; checks that use it come behind the one that connects.
+        LookupError: there is no session; checks that use it come behind the one that connects.
         """
         if self.camera is None:
             raise LookupError("there is no session")

@@ -51,7 +51,7 @@ def address_of(url: str) -> Address:
     """Return the address of a camera of a fleet.
 
     Raises:
-        ConfigurationError: it is not valid.
+        ConfigurationError: the address is not valid.
     """
     address = FleetAddress.parse(url)
     if not address.camera:

@@ -126,7 +126,8 @@ def read_span(text: str, *, whole: bool = False) -> Span | None:
     be in a larger one.
 
     Raises:
-        ConfigurationError: it means no address, or no host's, or an IPv6 network that is too large.
+        ConfigurationError: the text means no address, or no host's, or an IPv6 network that is too
+            large.
     """
     text = text.strip()
     span = _read(text, whole=whole)
@@ -224,7 +225,7 @@ def address_of(text: str) -> HostAddress:
     """Return the address that a name server has told.
 
     Raises:
-        ConfigurationError: it is no host's.
+        ConfigurationError: the address is no host's.
     """
     span = read_span(text)
     if span is None:

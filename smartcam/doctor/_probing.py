@@ -205,7 +205,8 @@ async def locate(host: str, *, timeout: float) -> str:
     The session that says so is over then. ``timeout``: seconds for all ways together.
 
     Raises:
-        ConnectFailedError: none answered; says what the most telling way met, and what to do.
+        ConnectFailedError: no protocol was answered; says what the most telling way met, and what
+            to do.
 
     Cancellation: the link is dropped.
     """

@@ -75,7 +75,7 @@ class EmulatedFleet(Server):
         """Return a camera.
 
         Raises:
-            ConfigurationError: none is called so.
+            ConfigurationError: no camera is called so.
         """
         try:
             return self._cameras[name]
@@ -105,7 +105,7 @@ class EmulatedFleet(Server):
         """Start all; does nothing where they are started already.
 
         Raises:
-            ConfigurationError: one cannot listen; none is started.
+            ConfigurationError: one of the cameras cannot listen; none is started.
 
         Cancellation: leaves all stopped.
         """

@@ -47,9 +47,9 @@ class Inspector(ABC):
 
         Args:
             order: the run.
-            seen: is called when the picture is there.
-            done: is called with what the application's layout holds; None where the inspection
-                failed and there is no result.
+            seen: function that is called when the picture is there.
+            done: function that is called with what the application's layout holds; None where the
+                inspection failed and there is no result.
 
         Both are called in the event loop's thread, later and not from inside this call. After
         :meth:`cancel` neither is.

@@ -292,7 +292,7 @@ class LineCamera(WireCamera):
         """Return the lines it speaks: those of its protocol's first dialect.
 
         Raises:
-            ConfigurationError: that protocol does not speak in lines.
+            ConfigurationError: the protocol protocol does not speak in lines.
         """
         dialect = next(iter(self.protocol.dialects.values()))
         if not isinstance(dialect, LineDialect):

@@ -38,7 +38,7 @@ class Port:
         """Open the port for the first time.
 
         Raises:
-            OSError, ValueError, OverflowError: it cannot be had.
+            OSError, ValueError, OverflowError: the port cannot be had.
 
         Cancellation: leaves it closed.
         """

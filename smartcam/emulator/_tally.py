@@ -25,7 +25,8 @@ class Tally(Counter[K]):
         """Wait until ``key`` was counted ``count`` times since the beginning.
 
         Raises:
-            TimeoutError: it was not in ``timeout`` seconds of real time; the text says how often.
+            TimeoutError: the key was not in ``timeout`` seconds of real time; the text says how
+                often.
 
         Cancellation: safe.
         """

@@ -143,7 +143,7 @@ class TicketedCamera(LineCamera):
         """Return the frames of its protocol's first dialect.
 
         Raises:
-            ConfigurationError: that has none with tickets.
+            ConfigurationError: the dialect has none with tickets.
         """
         dialect = next(iter(self.protocol.dialects.values()))
         if not isinstance(dialect, TicketedDialect):

@@ -51,7 +51,7 @@ class LogEntry(NamedTuple):
         message: what the frame says; None for an unknown id, a body that does not fit, and bytes
             that make no frame.
         hex: the frame's payload, or the first bytes that make no frame.
-        error: why it was ignored, None for a frame. A whole frame that is ignored has two
+        error: why the bytes were ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
         fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
             behind them where it was lost for that reason. None where none did. The entry of a
@@ -148,7 +148,7 @@ class Log(Sequence[LogEntry]):
         """Return an entry, or some as a list.
 
         Raises:
-            IndexError: there is none.
+            IndexError: there is no such entry.
         """
         entries = self._read()
         return entries[index] if isinstance(index, int) else list(entries)[index]
@@ -201,7 +201,7 @@ class Log(Sequence[LogEntry]):
         """Take the oldest entry away.
 
         Raises:
-            IndexError: there is none.
+            IndexError: there is no entry.
         """
         entry = self._read().popleft()
         self._forget_oldest()

@@ -343,7 +343,7 @@ class WireCamera(Server):
             timeout: seconds.
 
         Raises:
-            ResponseTimeoutError: they did not come in time.
+            ResponseTimeoutError: the frames did not come in time.
 
         Cancellation: safe.
         """
@@ -361,7 +361,7 @@ class WireCamera(Server):
         """Open the port; does nothing if it is started already.
 
         Raises:
-            ConfigurationError: it cannot listen there.
+            ConfigurationError: the server cannot listen there.
 
         Cancellation: leaves it stopped.
         """
@@ -415,7 +415,7 @@ class WireCamera(Server):
             faults: faults of :mod:`smartcam.emulator.faults`, or mappings with ``kind``.
 
         Raises:
-            ConfigurationError: one is wrong, or too many would wait; none was added.
+            ConfigurationError: one of the faults is wrong, or too many would wait; none was added.
         """
         with self.step():
             self._collect()  # what was said before is not changed

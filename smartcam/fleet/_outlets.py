@@ -100,7 +100,7 @@ class FleetOutlets(Server):
         """Return the answers of the stores, by the outlet's name.
 
         Raises:
-            ConfigurationError: one cannot be read now.
+            ConfigurationError: one of the stores cannot be read now.
 
         Cancellation: its thread goes on to the end of what it does.
         """

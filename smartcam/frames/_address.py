@@ -47,7 +47,7 @@ class FrameAddress:
         """Read a URL, or the path of a file.
 
         Raises:
-            ConfigurationError: it is not valid.
+            ConfigurationError: the text is not valid.
         """
         given = check_text(fspath_of(url), "frame source").strip()
         if not given:
@@ -106,7 +106,7 @@ class FrameAddress:
         """Return ``WIDTHxHEIGHT`` as two numbers.
 
         Raises:
-            ConfigurationError: it is something else.
+            ConfigurationError: the text is something else.
         """
         found = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
         if found is None:
@@ -117,7 +117,7 @@ class FrameAddress:
         """Return a parameter's number.
 
         Raises:
-            ConfigurationError: it is not valid, or not from ``least`` to ``most``.
+            ConfigurationError: the value is not valid, or not from ``least`` to ``most``.
         """
         try:
             value = float(text)

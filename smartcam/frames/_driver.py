@@ -70,14 +70,14 @@ class FrameSink(ABC):
         """Count lost frames; the next frame does not count them again."""
 
     def skipped(self, count: int) -> None:  # noqa: B027 - most drivers have none
-        """Take that frames came to the far end of a link, where newer ones took their place."""
+        """Note that frames came to the far end of a link, where newer ones took their place."""
 
     @abstractmethod
     def ended(self, error: FrameSourceError | None) -> None:
-        """Take that nothing more comes: None at the end of a file. Readers get the error."""
+        """Note that nothing more comes: None at the end of a file. Readers get the error."""
 
     def trigger_failed(self, error: SmartCamError) -> None:  # noqa: B027 - most have no trigger
-        """Take that the picture of the trigger under way will not come."""
+        """Note that the picture of the trigger under way will not come."""
 
     async def taken(self) -> None:  # noqa: B027 - a driver without readers waits for none
         """Return once every reader has taken the last frame: for a recording that is to lose none.
@@ -201,7 +201,8 @@ class FrameDriver(ABC):
         """Find the device, see that it can do what the address asks for; it does not stream yet.
 
         Raises:
-            FrameSourceError: it is not there, is in use, or cannot do that; it says what it can.
+            FrameSourceError: the device is not there, is in use, or cannot do that; it says what it
+                can.
         """
 
     @abstractmethod
@@ -209,7 +210,7 @@ class FrameDriver(ABC):
         """Start the stream into ``sink``. A device that was lost since is opened anew.
 
         Raises:
-            FrameSourceError: it does not; nothing streams.
+            FrameSourceError: the device does not; nothing streams.
         """
 
     @abstractmethod

@@ -112,7 +112,7 @@ class FrameEvents:
         """Return the next event.
 
         Raises:
-            FrameTimeoutError: none came in time; it may be waited for again.
+            FrameTimeoutError: no event came in time; it may be waited for again.
             FrameSourceError: the device is gone.
 
         Cancellation: safe; no event is lost.

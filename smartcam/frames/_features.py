@@ -299,7 +299,7 @@ class FrameFeature:
 
         Raises:
             FrameFeatureError: there is no such command, or the device refuses it now.
-            FrameTimeoutError: it was not done within ``timeout``.
+            FrameTimeoutError: the command was not done within ``timeout``.
             UnsupportedError: a source of this kind has no features.
 
         Cancellation: the device may have done it.
@@ -313,7 +313,7 @@ def checked_value(value: object) -> FeatureValue:
     """Return a value that a feature may have, as a plain one.
 
     Raises:
-        ConfigurationError: it is not valid.
+        ConfigurationError: the value is not valid.
     """
     given = plain(value)
     if isinstance(given, str):

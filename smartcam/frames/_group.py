@@ -134,7 +134,8 @@ class FrameGroup:
         """Largest skew of a set, seconds.
 
         Raises:
-            LocalProtocolError: it follows from what the cameras stream, and they are not open.
+            LocalProtocolError: the skew follows from what the cameras stream, and they are not
+                open.
         """
         if self._within is not None:
             return self._within
@@ -198,7 +199,7 @@ class FrameGroup:
         """Return the newest set that was not returned yet.
 
         Raises:
-            FrameTimeoutError: none came in time; the text says which cameras gave frames.
+            FrameTimeoutError: no set came in time; the text says which cameras gave frames.
             FrameSourceError: of the first camera that ended with one.
 
         Cancellation: safe; the set is there for the next one.

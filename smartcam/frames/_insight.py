@@ -74,8 +74,9 @@ class InSightDriver(FrameDriver):
         """Read a picture, and leave the camera again.
 
         Raises:
-            FrameFormatError: it sends no bitmap.
-            FrameSourceError: it is not there, refuses the session, or has no picture to be read.
+            FrameFormatError: the camera sends no bitmap.
+            FrameSourceError: the camera is not there, refuses the session, or has no picture to be
+                read.
         """
         try:
             await self._connect()
@@ -89,7 +90,7 @@ class InSightDriver(FrameDriver):
         """Connect, and ask for pictures.
 
         Raises:
-            FrameSourceError: it is not there, or refuses.
+            FrameSourceError: the camera is not there, or refuses.
         """
         try:
             await self._connect()

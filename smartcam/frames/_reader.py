@@ -93,7 +93,7 @@ class FrameReader:
         """Return the newest frame that was not returned yet.
 
         Raises:
-            FrameTimeoutError: none came in time; it may be waited for again.
+            FrameTimeoutError: no frame came in time; it may be waited for again.
             FrameSourceError: the source ended with it.
 
         Cancellation: safe; the frame is there for the next one.
@@ -112,7 +112,7 @@ class FrameReader:
 
         Raises:
             ConfigurationError: a time that is not valid.
-            FrameTimeoutError: none came in time.
+            FrameTimeoutError: no frame came in time.
             FrameSourceError: the source ended.
 
         Cancellation: safe.
@@ -137,7 +137,7 @@ class FrameReader:
 
         Raises:
             ConfigurationError: a time that is not valid.
-            FrameTimeoutError: none came in time.
+            FrameTimeoutError: no frame came in time.
             FrameSourceError: the source ended.
 
         Cancellation: safe; frames that came before are skipped.
@@ -176,7 +176,7 @@ class FrameReader:
         """Raise the error that the source ended with, where it ended.
 
         Raises:
-            FrameSourceError: it ended.
+            FrameSourceError: the source ended.
         """
         if self._ended:
             ended = FrameSourceError(f"{self._name}: it ended", source=self._name)

@@ -195,7 +195,7 @@ class FrameSource(FrameSink):
         """Format of the stream.
 
         Raises:
-            LocalProtocolError: it is not open.
+            LocalProtocolError: the source is not open.
         """
         if self._format is None:
             raise LocalProtocolError(f"{self.name} is not open: use `async with`")
@@ -217,7 +217,7 @@ class FrameSource(FrameSink):
         """Open the device; it does not stream yet.
 
         Raises:
-            FrameSourceError: it is not there, in use, or cannot do what it is asked for.
+            FrameSourceError: the device is not there, in use, or cannot do what it is asked for.
 
         Cancellation: nothing stays open.
         """
@@ -396,7 +396,7 @@ class FrameSource(FrameSink):
         """Wait until the device streams; with ``anew`` the stream begins once more.
 
         Raises:
-            FrameSourceError: it does not begin to stream.
+            FrameSourceError: the device does not begin to stream.
         """
         if anew and self._streaming:
             self._again = True

@@ -60,7 +60,7 @@ class Undistorter:
             colour: whether its colours are wanted, (H, W, 3); else its brightness, (H, W).
 
         Raises:
-            FrameFormatError: it has another size, or not what is wanted.
+            FrameFormatError: the frame has another size, or not what is wanted.
         """
         _check_size(frame, self._size)
         picture = frame.rgb() if colour else frame.grey()

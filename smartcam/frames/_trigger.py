@@ -130,7 +130,7 @@ class TriggerQueue:
             pending.outcome.set_result(frame)
 
     def failed(self, error: SmartCamError) -> None:
-        """Take that the trigger under way has no picture."""
+        """Note that the trigger under way has no picture."""
         if self._pending is not None and not self._pending.outcome.done():
             self._pending.outcome.set_exception(error)
 

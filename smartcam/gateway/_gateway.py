@@ -38,7 +38,7 @@ class Gateway(Server):
     Args:
         camera: the camera; whoever made it opens and closes it. While it has no session, requests
             are answered with the reason.
-        settings: where it listens and how it writes.
+        settings: address to listen on, and form of the answers.
 
     Raises:
         ConfigurationError: ``interpret_as`` of the camera is not valid.
@@ -86,7 +86,7 @@ class Gateway(Server):
         """Open the port; does nothing if it is open.
 
         Raises:
-            ConfigurationError: it cannot listen there.
+            ConfigurationError: the gateway cannot listen there.
 
         Cancellation: leaves it closed.
         """

@@ -117,7 +117,7 @@ class RequestReader:
         """Return the requests that are whole now.
 
         Raises:
-            NotWritableError: one is longer than :data:`MAX_LINE_BYTES`.
+            NotWritableError: one of the requests is longer than :data:`MAX_LINE_BYTES`.
         """
         data, found = self._rest + data, []
         at = _behind_blanks(data, 0)
@@ -176,7 +176,7 @@ class AnswerWriter:
         """Return the bytes of an answer.
 
         Raises:
-            NotWritableError: it has no room for the values.
+            NotWritableError: the answer has no room for the values.
         """
         style = self._style
         values = [self._value(one) for one in answer.values]

@@ -38,8 +38,8 @@ class RobotLink(asyncio.Protocol):
         acceptor: gives it a place.
 
     Attributes:
-        settled: whether it has asked for a part: then it keeps its place, which one that said
-            nothing, or anything else, has to leave for a newcomer.
+        settled: whether the robot has asked for a part: then it keeps its place, which one that
+            said nothing, or anything else, has to leave for a newcomer.
     """
 
     _transport: asyncio.Transport

@@ -196,7 +196,8 @@ class GatewayFile(GatewaySettings):
         """Read a file.
 
         Raises:
-            ConfigurationError: it cannot be read, or a field is wrong; told with line and field.
+            ConfigurationError: the file cannot be read, or a field is wrong; told with line and
+                field.
             MissingExtraError: the extra ``yaml`` is not installed.
         """
         file = read_model(path, "gateway", cls, "listen", _mistake)

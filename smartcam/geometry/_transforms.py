@@ -52,7 +52,7 @@ class Transform:
         source: the frame that it comes from.
         rotation: (3, 3), determinant +1. Read-only.
         translation: (3,), metres: the source's origin in the target. Read-only.
-        at: when it was so; None for one that does not change.
+        at: moment at which the transform held; None for one that does not change.
 
     Raises:
         CalibrationError: no rotation (``NOT_RIGID``: a reflection and a scale, too), not finite,
@@ -120,7 +120,7 @@ class Transform:
             source: the frame whose pose they are.
             translation: (3,), metres.
             quaternion: (4,), ``x, y, z, w``. Its length is made one.
-            at: when it was so.
+            at: moment at which the transform held.
 
         Raises:
             CalibrationError: ``NOT_RIGID``: the quaternion's length is more than 1 % off.

@@ -154,7 +154,7 @@ class CellCamera:
         """Return the program of an application's number or name.
 
         Raises:
-            ConfigurationError: there is none.
+            ConfigurationError: there is no such application.
         """
         application = check_application_or_name(application, who="program")
         for number, program in self.programs.items():

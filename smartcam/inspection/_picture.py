@@ -37,7 +37,7 @@ class Picture:
         frame: the frame that the pixels are of.
 
     Raises:
-        FrameFormatError: it has no pixels, or too many, or is of another type or shape.
+        FrameFormatError: the value has no pixels, or too many, or is of another type or shape.
 
     Attributes:
         frame: the frame that it is of; None: pixels alone.

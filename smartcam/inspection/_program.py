@@ -131,7 +131,7 @@ class Program:
             input: input data of the trigger.
 
         Raises:
-            FrameFormatError: it is no picture.
+            FrameFormatError: the value is no picture.
             InspectionError: a tool failed.
             MissingExtraError: what a tool needs is not installed.
         """
@@ -363,7 +363,7 @@ def register_tool(name: str, tool: type[AnyTool]) -> None:
     """Have a tool in this process, without a package that brings it.
 
     Raises:
-        ConfigurationError: it is no tool, or the name cannot be one.
+        ConfigurationError: the class is no tool, or the name cannot be one.
         PluginError: the name is taken by another one.
     """
     if not (isinstance(tool, type) and issubclass(tool, Tool)):

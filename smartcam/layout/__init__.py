@@ -91,7 +91,7 @@ class Layout:
         Args:
             described: a dataclass, a pydantic model or a NamedTuple; ``list[Part]`` for records to
                 the end.
-            lenient: as of the layout.
+            lenient: as for the layout.
 
         Raises:
             LayoutError: a field has no layout text, one that is wrong (with the place), or one that

@@ -133,7 +133,7 @@ class Field:
         type: ``bool``, ``int8`` to ``uint64``, ``real32``, ``real64`` or ``string``.
         length: bytes of a string, None for the other types.
         unit: unit on the wire; the value is SI. None: taken as it comes.
-        sequence: whether it carries the sequence number (``@sequence``).
+        sequence: whether the field carries the sequence number (``@sequence``).
     """
 
     name: str

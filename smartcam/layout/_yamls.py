@@ -55,7 +55,7 @@ def compose(text: str, *, what: str = "YAML") -> Any:
     """Return the node that a document is, which :func:`construct` makes data of; None: empty.
 
     Raises:
-        BadYamlError: it is no YAML, or goes beyond a bound.
+        BadYamlError: the text is no YAML, or goes beyond a bound.
         MissingExtraError: PyYAML is not installed.
     """
     yaml = yaml_module(what)

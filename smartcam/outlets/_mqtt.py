@@ -338,7 +338,7 @@ def _command_fields(payload: object) -> dict[str, Any]:
     """Return the fields of a command's message; an empty message has none.
 
     Raises:
-        ConfigurationError: it is too large, or no JSON object.
+        ConfigurationError: the message is too large, or no JSON object.
     """
     data = bytes(payload) if isinstance(payload, (bytes, bytearray)) else b"?"
     if len(data) > MAX_COMMAND_BYTES:

@@ -144,7 +144,7 @@ class Outlets(Server):
         """Return the results at far ends that can be asked, by the outlet's name; blocks.
 
         Raises:
-            ConfigurationError: one cannot be read now.
+            ConfigurationError: one of the stores cannot be read now.
         """
         check_kind(question, StoreQuestion, "question", "a StoreQuestion", "stored")
         answers = {name: pump.outlet.stored(question) for name, pump in self._pumps.items()}

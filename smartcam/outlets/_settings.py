@@ -56,7 +56,7 @@ class Secret(_OutletFields):
             folder: folder of a relative path.
 
         Raises:
-            ConfigurationError: it is not there; says where it was looked for.
+            ConfigurationError: the secret is not there; says where it was looked for.
         """
         if self.variable is not None:
             found = os.environ.get(self.variable)
@@ -117,7 +117,8 @@ class OutletsFile(_OutletFields):
         """Read a file.
 
         Raises:
-            ConfigurationError: it cannot be read, or a field is wrong; told with line and field.
+            ConfigurationError: the file cannot be read, or a field is wrong; told with line and
+                field.
             MissingExtraError: the extra ``yaml`` is not installed.
         """
         return read_model(

@@ -106,7 +106,7 @@ class ResultStore(Outlet[StoreSettings]):
         """Return the results in the file.
 
         Raises:
-            ConfigurationError: it cannot be read.
+            ConfigurationError: the file cannot be read.
         """
         return read_store(self.path, question)
 

@@ -143,7 +143,7 @@ class Dialect(ABC):
     Args:
         name: name as in ``?dialect=``.
         about: one line for people.
-        source: where it is described, with its grade.
+        source: document that describes the dialect, with its grade.
         quirks: names of the deviations from the dialect that this one has, as in ``?quirks=``.
         shows_triggers: the status tells of each trigger that is taken: Waiting for Trigger drops.
     """
@@ -196,7 +196,7 @@ class Dialect(ABC):
         """Return the id of a message in this dialect.
 
         Raises:
-            UnsupportedError: it has no such message.
+            UnsupportedError: the dialect has no such message.
         """
 
     def called(self, message: Message) -> str:
@@ -233,7 +233,7 @@ class Dialect(ABC):
         """Return the bytes of the answer to a raw request.
 
         Raises:
-            CommandRejectedError: they say nothing but that the camera refused.
+            CommandRejectedError: the bytes say nothing but that the camera refused.
         """
 
     def unsupported(self, message_type: type[Message]) -> UnsupportedError:
@@ -247,7 +247,7 @@ class Dialect(ABC):
         """Return the dialect with these deviations from it.
 
         Raises:
-            ConfigurationError: it knows no such deviation.
+            ConfigurationError: the dialect knows no such deviation.
         """
         for name in names:
             raise ConfigurationError(f"dialect {self.name} has no quirk {name!r}; it has none")

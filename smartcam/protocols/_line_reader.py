@@ -32,7 +32,7 @@ class LineReader:
 
     @property
     def pending(self) -> bytes:
-        """Copy of those bytes."""
+        """Copy of the bytes that wait for more."""
         return bytes(self._buffer)
 
     def feed(self, data: bytes) -> None:

@@ -74,7 +74,8 @@ class LineRow(NamedTuple):
 
     Attributes:
         request: what the client asks for; None for a line that the camera says unasked.
-        line: how it asks, with the message's fields in braces: ``"PROGRAM {application}"``.
+        line: the line of the request, with the message's fields in braces: ``"PROGRAM
+            {application}"``.
         answer: what the answer is; None for a request that is not answered.
         read: makes it of the answer's line, or several messages of it; a ValueError or LookupError
             says that it is no answer.
@@ -238,7 +239,7 @@ class LineDialect(Dialect):
         """Return the bytes of a line.
 
         Raises:
-            ConfigurationError: it cannot stand in a line.
+            ConfigurationError: the text cannot stand in a line.
         """
         data = line.replace("{ticket}", ticket).encode(self.encoding, "replace")
         if len(data) > self.max_line or any(byte in self.line_end for byte in data):
@@ -265,7 +266,7 @@ class LineDialect(Dialect):
         """Return a line of the user's own, checked; a dialect with such lines may refuse some.
 
         Raises:
-            ConfigurationError: it is no line that can be sent.
+            ConfigurationError: the text is no line that can be sent.
         """
         return line
 
@@ -274,8 +275,9 @@ class LineDialect(Dialect):
 
         Raises:
             UnsupportedError: how another line is answered is not known.
-            ConfigurationError: it is no line that can be sent.
-            LocalProtocolError: it triggers, and nothing in its answer would tell whose trigger.
+            ConfigurationError: the text is no line that can be sent.
+            LocalProtocolError: the line triggers, and nothing in its answer would tell whose
+                trigger.
         """
         if self.row(LineCommand) is None or not isinstance(message_id, str):
             raise UnsupportedError(f"dialect {self.name}: there are no other requests")

@@ -72,7 +72,7 @@ class TicketedDialect(LineDialect):
         """Return the bytes of a request.
 
         Raises:
-            ConfigurationError: it cannot stand in a frame.
+            ConfigurationError: the content cannot stand in a frame.
         """
         data = line.encode(ENCODING, "replace")
         if len(data) > self.max_line or (not self.asks_with_length and b"\r\n" in data):

@@ -18,8 +18,8 @@ def opened(path: Path, *, overwrite: bool) -> IO[bytes]:
 
     Raises:
         ConfigurationError: another recorder writes it.
-        FileExistsError: it is there already.
-        OSError: it cannot be made.
+        FileExistsError: the file is there already.
+        OSError: the file cannot be made.
     """
     stream = open(path, "wb" if overwrite else "xb", opener=_open_whole)  # noqa: SIM115
     try:

@@ -135,7 +135,7 @@ class RecordingFolder:
 
         Raises:
             ConfigurationError: another recorder writes in it.
-            OSError: it cannot be made, or read.
+            OSError: the folder cannot be made, or read.
         """
         self.leave()
         if not self._made:
@@ -214,7 +214,7 @@ class RecordingFolder:
         """Delete a file of the recorder's; one that is not its own any more is left.
 
         Raises:
-            OSError: it cannot be deleted.
+            OSError: the file cannot be deleted.
         """
         path = self.path / name
         if is_ours(path):

@@ -83,8 +83,8 @@ def write_pcap(
     Raises:
         ConfigurationError: no such camera, or the file is there already or cannot be made.
         UnsupportedError: a camera is a fleet's, whose frames are its agent's.
-        RecordingError: it cannot be written to its end: the disk is full, or a frame fits into no
-            packet.
+        RecordingError: the file cannot be written to its end: the disk is full, or a frame fits
+            into no packet.
     """
     check_recording(recording, "pcap")
     path = check_path(path, "path", "pcap")

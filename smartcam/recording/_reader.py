@@ -131,7 +131,7 @@ class Recording:
         """Return the camera of that name; without a name the only one there is.
 
         Raises:
-            ConfigurationError: there is none of that name, or there are several; names them.
+            ConfigurationError: there is no camera of that name, or there are several; names them.
         """
         if name is not None:
             name = check_text(name, "camera", f"recording {self.path}")
@@ -249,7 +249,8 @@ def load_recording(
     Raises:
         ConfigurationError: the file cannot be read, is no MCAP, or is another program's; nothing
             of a folder can be read; a time has no time zone.
-        RecordingError: it goes beyond a bound that no recording comes near, or the disk fails.
+        RecordingError: the recording goes beyond a bound that no recording comes near, or the disk
+            fails.
         MissingExtraError: what inflates its chunks is not installed.
     """
     path = check_path(path, "path", "recording")
@@ -281,7 +282,7 @@ def each_item(path: Path, note: Callable[[str], None]) -> Iterator[Item]:
 
     Raises:
         ConfigurationError: a file cannot be read, or is no recording of ours.
-        RecordingError: it goes beyond a bound, or the disk fails.
+        RecordingError: the recording goes beyond a bound, or the disk fails.
     """
     for file in _files_in(path, None, None) if path.is_dir() else [path]:
         scan = _Scan(file)
@@ -437,8 +438,8 @@ class _Scan:
         """Yield everything that can be read; with ``states`` also what a camera was.
 
         Raises:
-            ConfigurationError: it is no recording of ours.
-            RecordingError: it goes beyond a bound, or the disk fails.
+            ConfigurationError: the file is no recording of ours.
+            RecordingError: the file goes beyond a bound, or the disk fails.
         """
         try:
             stream = self.path.open("rb")

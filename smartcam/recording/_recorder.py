@@ -325,8 +325,8 @@ class Recorder(Observer):
         Raises:
             ConfigurationError: an argument is of another kind; or it becomes a video, and the
                 picture is another camera's.
-            FrameFormatError: it becomes a video, which cannot hold the picture without loss; or
-                nobody could read the picture again, such as one of more than 1,048,576 pixels
+            FrameFormatError: the file becomes a video, which cannot hold the picture without loss;
+                or nobody could read the picture again, such as one of more than 1,048,576 pixels
                 along a side. The recording goes on without it.
             MissingExtraError: the distribution of frames is not installed.
         """
@@ -378,7 +378,7 @@ class Recorder(Observer):
 
         Raises:
             ConfigurationError: an argument is of another kind.
-            FrameFormatError: it is no bitmap.
+            FrameFormatError: the file is no bitmap.
             MissingExtraError: the distribution of frames is not installed.
         """
         camera = check_text(camera, "camera", "recording", least=1, most=MAX_NAME)
@@ -416,8 +416,8 @@ class Recorder(Observer):
         Raises:
             ConfigurationError: an argument is wrong.
             LocalProtocolError: the source is not open.
-            FrameFormatError: it becomes a video, which cannot hold the pictures without loss; or
-                one of them cannot be recorded, as :meth:`add_picture` says.
+            FrameFormatError: the file becomes a video, which cannot hold the pictures without loss;
+                or one of them cannot be recorded, as :meth:`add_picture` says.
             FrameSourceError: the source is gone, or stuck; what came before is recorded.
             RecordingError: the recording ended, such as on a full disk.
             MissingExtraError: the distribution of frames is not installed.
@@ -566,7 +566,7 @@ class RecordingFile:
         """Look whether the file is still where it was.
 
         Raises:
-            OSError: it was deleted, or moved away with its folder.
+            OSError: the file was deleted, or moved away with its folder.
         """
         own = os.fstat(self._stream.fileno())
         if not os.path.samestat(own, self.path.stat()):

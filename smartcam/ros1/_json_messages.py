@@ -77,7 +77,7 @@ def to_json(kind: MessageType, message: Any) -> dict[str, Any]:
     """Return a message, or the mapping of its fields, as JSON has it, with :class:`Raw` for bytes.
 
     Raises:
-        RosMessageError: it is no message of this type.
+        RosMessageError: the value is no message of this type.
     """
     # what comes back fits, and is ours: who publishes may use a buffer again
     return _fields(kind, kind.decode(kind.encode(message)))

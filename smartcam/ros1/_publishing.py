@@ -63,7 +63,7 @@ class RosbridgePublisher:
             **fields: the fields, where no message is given.
 
         Raises:
-            RosMessageError: it is no message of the type.
+            RosMessageError: the value is no message of the type.
             RosError: the publisher is closed.
         """
         if message is not None and fields:

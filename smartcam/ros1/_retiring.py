@@ -67,7 +67,7 @@ async def _answered(web: aiohttp.ClientWebSocketResponse) -> None:
     """Wait until a bridge is through with what it was told.
 
     Raises:
-        ConnectionError: it is gone.
+        ConnectionError: the bridge is gone.
     """
     asked = question(KNOWN, {})
     await web.send_json(asked)

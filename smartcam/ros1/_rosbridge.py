@@ -115,7 +115,7 @@ class RosbridgeNode(NamedNode):
         """Wait until the bridge is there.
 
         Raises:
-            TimeoutError: it was not within ``timeout`` seconds.
+            TimeoutError: the bridge was not within ``timeout`` seconds.
         """
         await self._wait(timeout, lambda: self._link.connected)
 

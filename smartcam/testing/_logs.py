@@ -88,7 +88,7 @@ class CameraLog(Sequence["LogEntry"]):
         """Return an entry, or some as a list.
 
         Raises:
-            IndexError: there is none.
+            IndexError: there is no such entry.
         """
         return self._read()[index]
 
@@ -119,7 +119,7 @@ class CameraLog(Sequence["LogEntry"]):
             timeout: seconds that they may still take.
 
         Raises:
-            AssertionError: they did not.
+            AssertionError: the messages did not.
             ConfigurationError: no message is called so.
         """
         __tracebackhide__ = True
@@ -162,7 +162,7 @@ class CameraLog(Sequence["LogEntry"]):
             timeout: seconds that it may still take.
 
         Raises:
-            AssertionError: one did not, or is still connected.
+            AssertionError: one of the clients did not, or is still connected.
         """
         __tracebackhide__ = True
         timeout = check_seconds(timeout, "timeout", "expect_disconnect_before_close")

@@ -59,7 +59,7 @@ class _InLoop:
         """Start what lives in the thread; do nothing if it runs.
 
         Raises:
-            ConfigurationError: it cannot listen; nothing is started.
+            ConfigurationError: the server cannot listen; nothing is started.
         """
         if self._owns_thread:
             self._thread.start()
@@ -250,7 +250,7 @@ class ThreadedCamera(_InLoop):
         """Move the camera's manual clock on; all that falls due has happened then.
 
         Raises:
-            ConfigurationError: it runs in real time, or the time is negative.
+            ConfigurationError: the clock runs in real time, or the time is negative.
         """
         clock = self._emulator.clock
         if not isinstance(clock, ManualClock):
@@ -269,7 +269,7 @@ class ThreadedCamera(_InLoop):
         In a coroutine use :meth:`received`: this holds up the event loop that calls it.
 
         Raises:
-            ResponseTimeoutError: they did not come in time.
+            ResponseTimeoutError: the messages did not come in time.
         """
         timeout = check_seconds(timeout, "timeout", "wait_received")
         self._thread.call(
@@ -283,7 +283,7 @@ class ThreadedCamera(_InLoop):
         """Wait as :meth:`wait_received` does, in a coroutine of asyncio or, with anyio, of trio.
 
         Raises:
-            ResponseTimeoutError: they did not come in time.
+            ResponseTimeoutError: the messages did not come in time.
 
         Cancellation: safe.
         """
@@ -335,7 +335,7 @@ class ThreadedFleet(_InLoop, Mapping[str, ThreadedCamera]):
         """Return a camera.
 
         Raises:
-            KeyError: none is called so.
+            KeyError: no camera is called so.
         """
         return self._cameras[name]
 

@@ -100,7 +100,7 @@ class CloudSite(ThreadedSite):
         skipped. It is thinned and packed in a thread.
 
         Raises:
-            ConfigurationError: it is no cloud.
+            ConfigurationError: the value is no cloud.
         """
         if not isinstance(cloud, Cloud):
             raise ConfigurationError(f"show: expected a Cloud, got {type(cloud).__name__}")

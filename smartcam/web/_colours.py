@@ -118,7 +118,7 @@ class ColourSite(ThreadedSite):
         """Return the next frame of the source, and keep it for a viewer.
 
         Raises:
-            RefusedError: there is none, or too many wait for one.
+            RefusedError: there is no frame, or too many wait for one.
         """
         name = self.source.name
         try:
@@ -142,7 +142,7 @@ class ColourSite(ThreadedSite):
         """Return the last frame that a viewer got, or the one with a number.
 
         Raises:
-            RefusedError: it is not kept any longer.
+            RefusedError: the frame is not kept any longer.
         """
         for frame in reversed(self._kept.get(viewer, ())):
             if sequence in {None, frame.sequence}:
@@ -233,7 +233,7 @@ class RangeBody(CallBody):
         """Return the range.
 
         Raises:
-            RefusedError: it is not valid.
+            RefusedError: the text is not valid.
         """
         try:
             return ColourRange(**self.model_dump())

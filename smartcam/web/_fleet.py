@@ -108,7 +108,7 @@ class FleetSite(Site):
         """Follow the fleet, and open the port.
 
         Raises:
-            ConfigurationError: it cannot listen there.
+            ConfigurationError: the site cannot listen there.
 
         Cancellation: leaves it stopped.
         """

@@ -142,7 +142,8 @@ def checked_token(token: str) -> str:
     """Return a token that was given.
 
     Raises:
-        ConfigurationError: it is too short, or has signs that a header or a URL cannot carry.
+        ConfigurationError: the token is too short, or has signs that a header or a URL cannot
+            carry.
     """
     signs = token.replace("-", "").replace("_", "")
     if len(token) < MIN_TOKEN or not (signs.isascii() and signs.isalnum()):

@@ -51,7 +51,7 @@ class OperationsSite(Server):
 
     Raises:
         MissingExtraError: the extra ``operations`` is not installed.
-        ConfigurationError: that is no place, or the file says to listen nowhere.
+        ConfigurationError: the address is no place, or the file says to listen nowhere.
     """
 
     def __init__(self, server: FleetServer, *, listen: str | None = None) -> None:
@@ -80,7 +80,7 @@ class OperationsSite(Server):
         """Open the port; does nothing if it is open.
 
         Raises:
-            ConfigurationError: it cannot listen there.
+            ConfigurationError: the site cannot listen there.
 
         Cancellation: leaves it stopped.
         """

@@ -145,7 +145,7 @@ class SitePictures:
 
         Args:
             place: place of the source.
-            tried: is told each time what went wrong, None for nothing.
+            tried: function that is told each time what went wrong, None for nothing.
         """
         for delay in Backoff().delays():
             try:
@@ -162,7 +162,7 @@ class SitePictures:
         """Show a source to a viewer, until the end.
 
         Raises:
-            RefusedError: it is no WebSocket, or there are :data:`MAX_VIEWERS` already.
+            RefusedError: the request is no WebSocket, or there are :data:`MAX_VIEWERS` already.
         """
         check_websocket(request, PROTOCOL, len(self.viewers), MAX_VIEWERS)
         return await Viewer(self, place, request).serve()
@@ -221,7 +221,7 @@ class Viewer(PageSocket):
     Attributes:
         place: place of the source.
         address: address of the viewer.
-        gone: is set when that is over.
+        gone: event that is set when that is over.
     """
 
     def __init__(self, pictures: SitePictures, place: int, request: web.Request) -> None:

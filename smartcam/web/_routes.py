@@ -80,7 +80,7 @@ class _Call(Generic[C]):
         """Answer a request.
 
         Raises:
-            RefusedError: it cannot be done.
+            RefusedError: the request cannot be done.
         """
         call = CallRequest(
             request=request,

@@ -102,7 +102,7 @@ class Site(Server):
         """Open the port; does nothing if it is started already.
 
         Raises:
-            ConfigurationError: it cannot listen there.
+            ConfigurationError: the server cannot listen there.
 
         Cancellation: leaves it stopped.
         """
@@ -201,7 +201,7 @@ async def open_port(
     """Return the port on which an application is served from now on.
 
     Raises:
-        OSError, ValueError, OverflowError: it cannot be had, or it is not ``local``.
+        OSError, ValueError, OverflowError: the address cannot be had, or it is not ``local``.
 
     Cancellation: leaves nothing open.
     """

@@ -103,7 +103,7 @@ class TeachSite(ThreadedSite):
         """Have the thread do something.
 
         Raises:
-            RefusedError: it cannot be done, or the site is stopped.
+            RefusedError: the call cannot be done, or the site is stopped.
 
         Cancellation: safe; a thread that has begun goes on to the end.
         """
@@ -116,7 +116,7 @@ class TeachSite(ThreadedSite):
         """Add the camera's next frame to the pictures; return its number.
 
         Raises:
-            RefusedError: there is none.
+            RefusedError: there is no frame.
         """
         if self.source is None:
             raise RefusedError(409, "a picture of now", "a camera; these are files")
@@ -135,7 +135,7 @@ class TeachSite(ThreadedSite):
         """Return a picture by its number.
 
         Raises:
-            RefusedError: there is none.
+            RefusedError: there is no such picture.
         """
         found = self.pictures.get(int(number)) if number.isdecimal() else None
         if found is None:

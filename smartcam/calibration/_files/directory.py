@@ -42,8 +42,8 @@ class Folder:
         path: the folder, absolute.
 
     Raises:
-        ConfigurationError: it is no path.
-        OSError: it cannot be made.
+        ConfigurationError: the path is no path.
+        OSError: the folder cannot be made.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

@@ -32,7 +32,7 @@ def load_calibration(path: str | os.PathLike[str]) -> AnyCalibration:
 
     Raises:
         CalibrationError: the file is damaged, newer, or holds something else.
-        OSError: it is not there, or cannot be read.
+        OSError: the file is not there, or cannot be read.
     """
     return of_document(read_document(path), str(path))
 

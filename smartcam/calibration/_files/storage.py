@@ -123,7 +123,7 @@ class SavedCalibration(Stored):
 
         Raises:
             CalibrationError: the file is damaged, newer, or holds something else.
-            OSError: it is not there, or cannot be read.
+            OSError: the file is not there, or cannot be read.
         """
         found = cls.from_data(store.read(path, cls.kind))
         warn(found, str(path))

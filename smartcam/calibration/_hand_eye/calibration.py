@@ -265,8 +265,8 @@ def calibrate_hand_eye_from_poses(
         robot_poses: ``T_base_flange``.
         target_poses: ``T_camera_target``, as many.
         setup: as for :func:`calibrate_hand_eye`.
-        method: as for :func:`calibrate_hand_eye`; ``reprojection`` weighs a milliradian as a
-            millimetre.
+        method: as for :func:`calibrate_hand_eye`; ``reprojection`` weighs a milliradian as
+            a millimetre.
         adjust: as for :func:`calibrate_hand_eye`.
         robot_sigmas: as for :func:`calibrate_hand_eye`.
         drop_bad: as for :func:`calibrate_hand_eye`.

@@ -208,7 +208,7 @@ def mean_target(camera: Rigid, robot: RobotPoses, seen: Rigid) -> Rigid:
 
 
 def scale_of(robot: RobotPoses, seen: Rigid) -> float | None:
-    """Return the target's size over the one that was said, as the robot's motions tell it."""
+    """Return the target's size over the one that was given, as the robot's motions tell it."""
     found = solve_linear("park", robot, seen)  # its rotation asks for no lengths
     if found is None:
         return None

@@ -350,7 +350,7 @@ def _begin(problem: Problem) -> Solution | None:
 def _begin_of_another_size(problem: Problem) -> Solution | None:
     """Return the closed form of a target of the size that the robot's motions tell.
 
-    None where that is near to the size that was said, or not told.
+    None where that is near to the size that was given, or not known.
     """
     scale = scale_of(problem.robot, problem.poses)
     if scale is None or scale <= 0.0 or abs(scale - 1.0) < LOCAL:

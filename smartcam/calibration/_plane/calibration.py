@@ -125,7 +125,7 @@ class PlaneCalibration(storage.SavedCalibration):
         freedom: coordinates of the points that count, minus parameters.
         touch_sigma: sigma of one coordinate of a touch of weight 1, metres: as given or, where
             ``sigma_given`` is false, estimated from the residuals; None where there is no telling.
-        sigma_given: whether it was given.
+        sigma_given: whether the sigma was given.
         candidates: rms held-out error of each compared model, metres; None where a model has none.
         nominal_scale: metres for each unit of the camera's points as the user expects them.
         tool_z: (3,), direction of the tool's axis into the plane; None where it is not known.
@@ -309,7 +309,8 @@ class PlaneCalibration(storage.SavedCalibration):
 
         Raises:
             CalibrationError: WRONG_FRAME: they come in another frame than ``camera_frame``;
-                OUT_OF_PLANE: one is not in the camera's plane; OUT_OF_FIELD: one is behind the
+                OUT_OF_PLANE: a pose is not in the camera's plane; OUT_OF_FIELD: a pose is behind
+                    the
                 plane's horizon; NOT_FINITE: a pose would hold what is no number.
         """
         if isinstance(localizations, Localization):

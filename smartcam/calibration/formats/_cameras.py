@@ -144,7 +144,7 @@ def read_cameras(
             what its format says, or has a lens of another model; ``WRONG_SIZE``: it has no size of
             the images, or another one; ``UNIT_UNKNOWN``; ``UNKNOWN_FORMAT``.
         MissingExtraError: PyYAML is not installed.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     wanted = known(FORMS, form, "format of cameras")
     if size is not None:

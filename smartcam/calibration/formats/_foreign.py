@@ -140,7 +140,7 @@ def _lens(
 # ---------------------------------------------------------------------- one camera, or several
 
 Found = tuple["list[ForeignLens]", "list[Transform]", "str | None"]
-"""Lenses, the transforms from each into the next one, and the unit of these where it is said."""
+"""Lenses, the transforms from each into the next one, and their unit where the file gives it."""
 
 BY_FORMAT: Final = ""
 """Unit of lengths that are metres because the format says so, not the file."""

@@ -70,7 +70,7 @@ def read_lenses(
         CalibrationError: ``UNKNOWN_FORMAT``: none of these; ``WRONG_KIND``: a calibration without a
             lens; and what :func:`read_cameras` and ``load`` of the calibrations say.
         MissingExtraError: PyYAML is not installed.
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with Path(path).open("rb") as stream:
         head = stream.read(HEAD)

@@ -52,9 +52,9 @@ class PlaneMatrix(NamedTuple):
     Attributes:
         matrix: (4, 3) with ``w (x, y, z, 1) = matrix (u, v, 1)``, metres. A
             :class:`~smartcam.calibration.PlaneProjection` of it maps poses.
-        model: how it was fitted.
+        model: name of the model that was fitted.
         robot_frame: where x, y and z are.
-        camera_frame: where u and v are; empty where it was not said.
+        camera_frame: frame of u and v; empty where none was given.
     """
 
     matrix: Array

@@ -46,7 +46,7 @@ class Journal:
 
     Raises:
         CalibrationError: ``IN_USE`` or ``BROKEN_FILE``.
-        OSError: it cannot be opened.
+        OSError: the file cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:

@@ -209,7 +209,7 @@ class CalibrationService:
 
         Raises:
             CalibrationError: ``BAD_NAME``, ``NOT_FOUND``; or it cannot be read.
-            OSError: it cannot be read.
+            OSError: the file cannot be read.
         """
         path = self.folder.find(name_or_path)
         self._calibration = of_document(read_document(path), path.name)

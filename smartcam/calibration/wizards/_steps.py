@@ -84,7 +84,7 @@ class Number(Input):
         unit: shown behind it; the answer comes in this unit.
         minimum: smallest one taken.
         maximum: largest one taken.
-        integer: whether it must be whole.
+        integer: whether the number must be whole.
         optional: whether the answer may be left out (null).
     """
 

@@ -266,7 +266,7 @@ def switch(camera: CameraUnderTest) -> Switch:
     """Load the other application, of a stopped camera.
 
     Raises:
-        NotObserved: none was named, or it may not be loaded.
+        NotObserved: no application was named, or loading is not allowed.
         Differs: no answer comes.
     """
     camera.require(Allow.SWITCH)
@@ -317,8 +317,8 @@ def downtime(camera: CameraUnderTest) -> Downtime:
     """Restart the camera and wait until it answers again.
 
     Raises:
-        NotObserved: that is not allowed.
-        Differs: it does not go away, or does not come back.
+        NotObserved: a restart is not allowed.
+        Differs: the camera does not go away, or does not come back.
     """
     camera.require(Allow.REBOOT)
     with camera.session() as client:

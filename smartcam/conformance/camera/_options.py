@@ -29,7 +29,7 @@ MAX_INPUT_DATA = 1 << 16
 class Allow(enum.Flag):
     """The actions that are allowed on a camera.
 
-    ``RUN``, ``TRIGGER`` and ``SWITCH`` are allowed unless it is said otherwise: what they change is
+    ``RUN``, ``TRIGGER`` and ``SWITCH`` are allowed unless options forbid them: what they change is
     put back. The others leave something behind.
     """
 

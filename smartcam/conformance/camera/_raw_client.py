@@ -143,7 +143,7 @@ class RawClient:
 
         Raises:
             EndedError: the camera ends the link.
-            Differs: it sends what makes no frame.
+            Differs: the camera sends bytes that make no frame.
         """
         deadline = time.monotonic() + within
         while True:
@@ -219,7 +219,7 @@ class RawClient:
             mark: a length of :attr:`heard`; default: only what comes now.
 
         Raises:
-            Differs: it does not come in time.
+            Differs: the answer does not come in time.
             EndedError: the camera ends the link.
         """
         is_it = fits if callable(fits) else lambda heard: heard.message_id == fits
@@ -282,7 +282,7 @@ class RawClient:
         """Return the status word as it is now: asked for where it can be, else the last one.
 
         Raises:
-            NotObserved: none came since Connect.
+            NotObserved: no status came since Connect.
             Differs: a request is not answered.
         """
         if self.wire.is_bid:

@@ -70,7 +70,7 @@ class CameraReport:
         """Return the finding of one check or question.
 
         Raises:
-            KeyError: it was not done.
+            KeyError: the check was not done.
         """
         for one in self.findings:
             if one.item.name == name:

@@ -195,7 +195,7 @@ class CameraUnderTest:
         """Open a session; a smart camera's first status has come.
 
         Raises:
-            NotObserved: there is none.
+            NotObserved: the camera gives no session.
         """
         if self.gone:
             raise NotObserved(f"the camera is gone: {self.gone}")
@@ -228,7 +228,7 @@ class CameraUnderTest:
 
         Raises:
             Differs: the camera does not answer.
-            EndedError: it ends the link.
+            EndedError: the camera ends the link.
         """
         answer = client.answer(m.Connect())
         self._learn_code(answer)
@@ -280,7 +280,7 @@ class CameraUnderTest:
         """See that something is allowed.
 
         Raises:
-            NotObserved: it is not.
+            NotObserved: the option does not allow this.
         """
         missing = needs & ~self._allow
         if missing:
@@ -290,8 +290,8 @@ class CameraUnderTest:
         """Have the camera out of run mode.
 
         Raises:
-            NotObserved: that is not allowed.
-            Differs: it does not stop.
+            NotObserved: Stop is not allowed.
+            Differs: the camera does not stop.
         """
         bits = self.wire.bits
         if self.wire.is_bid or not client.look() & bits.running:
@@ -317,8 +317,8 @@ class CameraUnderTest:
         """Have an application loaded; return what came from the request to its end.
 
         Raises:
-            NotObserved: that is not allowed, or the camera refuses it.
-            Differs: it is not answered, or the application is another one then.
+            NotObserved: the switch is not allowed, or the camera refuses it.
+            Differs: the switch is not answered, or leads to another application.
         """
         if self.active(client) == application:
             return []
@@ -347,7 +347,7 @@ class CameraUnderTest:
         """Have the application loaded and waiting for a trigger.
 
         Raises:
-            NotObserved: that is not allowed, or the application needs no trigger.
+            NotObserved: a switch is not allowed, or the application needs no trigger.
             Differs: the camera does not do it.
         """
         self.load(client, self.application)

@@ -229,7 +229,7 @@ def next_number(camera: CameraUnderTest, client: RawClient) -> bytes:
     """Trigger once and return the four bytes of the sequence number in the result.
 
     Raises:
-        NotObserved: it is not known where it stands, or no result comes.
+        NotObserved: the number's place is not known, or no result comes.
     """
     offset = camera.options.sequence_offset
     if offset is None:

@@ -212,7 +212,7 @@ class CommandClient(Client):
         cwd: folder to run it in; default the present one.
 
     Raises:
-        ConfigurationError: it has no place for the task or for the camera's address.
+        ConfigurationError: the command has no place for the task or for the camera's address.
     """
 
     def __init__(self, command: str | Sequence[str], cwd: str | None = None) -> None:

@@ -125,7 +125,7 @@ class Device:
         quirks: what is not known about real cameras.
         clock_time: what its clock shows at first; a time without a zone is taken as it is.
         scene: the table it looks at.
-        behaviour: how it behaves in its dialect.
+        behaviour: behaviour of the camera in its dialect.
 
     Attributes:
         around: every operator's action (:meth:`start`, :meth:`stop`, :meth:`trigger`,

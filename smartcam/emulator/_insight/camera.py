@@ -75,7 +75,7 @@ class EmulatedInSight(LineCamera):
         model: name of the camera model, in the first line that the camera sends.
         active: file, or id, of the job that is loaded at first; default the first of the jobs,
             without any an empty one that was never saved.
-        online: whether it is online at first.
+        online: whether the camera is online at first.
         image: the 8 bit grey image that the camera sees; default a pattern.
         evaluations: answers to ``EV``: expression to the text that is sent; others fail.
         info: what ``GI`` tells, instead of the emulator's own.
@@ -241,7 +241,7 @@ class EmulatedInSight(LineCamera):
         """Let the camera see another image.
 
         Raises:
-            ConfigurationError: it is no 8 bit grey image.
+            ConfigurationError: the image is no 8 bit grey image.
         """
         self.device.image = image
 
@@ -256,7 +256,7 @@ class EmulatedInSight(LineCamera):
             job: file name or id of the job.
 
         Raises:
-            ConfigurationError: there is none, or another one is being loaded.
+            ConfigurationError: there is no such job, or another one is being loaded.
         """
         self.device.load(check_application_or_name(job, "job", "emulator"))
 
@@ -294,7 +294,7 @@ class EmulatedInSight(LineCamera):
             timeout: seconds.
 
         Raises:
-            ResponseTimeoutError: it did not come in time.
+            ResponseTimeoutError: the command did not come in time.
 
         Cancellation: safe.
         """

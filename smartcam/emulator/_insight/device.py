@@ -143,7 +143,7 @@ class InSightDevice:
         """Return a job by its file name, with the extension or without, or by its id.
 
         Raises:
-            ConfigurationError: there is none.
+            ConfigurationError: there is no such job.
         """
         for one in self.jobs.values():
             if one.id == job if isinstance(job, int) else one.is_called(job):
@@ -206,7 +206,7 @@ class InSightDevice:
         """Load a job by hand, at once and in either mode; a run under way ends without a result.
 
         Raises:
-            ConfigurationError: there is none, or another one is being loaded.
+            ConfigurationError: there is no such job, or another one is being loaded.
         """
         found = self.find(job)
         if self._loading:
@@ -230,7 +230,7 @@ class InSightDevice:
         """Load the job of an id by hand, and go online or not; False while one is loaded.
 
         Raises:
-            ConfigurationError: there is none.
+            ConfigurationError: there is no such job.
         """
         if self._loading:
             return False

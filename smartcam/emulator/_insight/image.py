@@ -32,7 +32,7 @@ def check_image(image: Any) -> NDArray[np.uint8]:
     """Return a copy of an 8 bit grey image.
 
     Raises:
-        ConfigurationError: it is not valid, is empty, or has more than 8 megapixels.
+        ConfigurationError: the image is not valid, is empty, or has more than 8 megapixels.
     """
     try:
         array: NDArray[Any] = np.asarray(image)

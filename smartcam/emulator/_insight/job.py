@@ -249,7 +249,7 @@ def cell_key(name: str) -> str:
     """Return under what a cell or a cell's name is kept: ``A012``, or the name in lower case.
 
     Raises:
-        ConfigurationError: it is neither; a ValueError, so it counts for pydantic.
+        ConfigurationError: the text is neither; a ValueError, so it counts for pydantic.
     """
     try:
         return words.parse_cell(name).wire
@@ -266,7 +266,7 @@ def shown(value: Any) -> str:
     A number that is not finite is a cell in error.
 
     Raises:
-        TypeError: it is no number and no text.
+        TypeError: the value is no number and no text.
         ValueError: a text that does not fit a line.
     """
     if isinstance(value, str):

@@ -517,7 +517,8 @@ def make_faults(given: Iterable[BaseFault | Mapping[str, Any]]) -> tuple[Fault, 
     """Return faults; mappings are made to them by their ``kind``.
 
     Raises:
-        ConfigurationError: one is wrong; the text says which, counted from 1, and names the field.
+        ConfigurationError: one of the faults is wrong; the text says which, counted from 1, and
+            names the field.
     """
     made: list[Fault] = []
     faults = check_all(given, "faults", "a list of faults", "emulator")

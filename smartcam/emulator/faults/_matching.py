@@ -86,7 +86,7 @@ class FaultQueue:
         """Put faults behind those that wait.
 
         Raises:
-            ConfigurationError: one is wrong, or too many would wait; none was added.
+            ConfigurationError: one of the faults is wrong, or too many would wait; none was added.
         """
         faults = make_faults(given)
         for number, fault in enumerate(faults, start=1):

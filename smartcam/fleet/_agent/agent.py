@@ -377,7 +377,7 @@ class Agent:
         """Raise where the fleet has a camera under another name already.
 
         Raises:
-            ConfigurationError: it has; says which and whose that is.
+            ConfigurationError: the fleet has it; says which camera and whose that is.
         """
         await self._claims.refuse_taken({name: settings})
 

@@ -52,7 +52,7 @@ def decode_bundle(payload: bytes, what: str) -> Bundled:
     """Return the bundle in ``payload``.
 
     Raises:
-        RemoteProtocolError: it is not valid; ``what`` is said to be broken.
+        RemoteProtocolError: the payload is not valid; the text names ``what``.
     """
     try:
         magic, epoch, number, following, count = _HEAD.unpack_from(payload)

@@ -92,7 +92,8 @@ class Claims:
         """Raise where an agent of this name is there; before anything is said under it.
 
         Raises:
-            ConfigurationError: one is there, and stays for longer than one that has died would.
+            ConfigurationError: an agent is there, and stays for longer than one that has died
+                would.
         """
         loop, name = asyncio.get_running_loop(), self._agent.name
         patience = loop.time() + LEASE_TIME + 1.0
@@ -108,7 +109,7 @@ class Claims:
         """Have the agent's name from now on, as long as no agent that was started before has it.
 
         Raises:
-            ConfigurationError: one has it.
+            ConfigurationError: another agent has it.
         """
         keys, bus, name = self._keys, self._bus, self._agent.name
         self._name.append(bus.be_present(keys.start(name, self._start)))
@@ -192,7 +193,7 @@ class Claims:
         that look at the same time do not see each other.
 
         Raises:
-            ConfigurationError: one is taken; says which and by whom.
+            ConfigurationError: one of the addresses is taken; says which and by whom.
         """
         listing = self._keys.listing("**")
         answers = await self._bus.ask(listing, b"", ASK) if cameras else ()

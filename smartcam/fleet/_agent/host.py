@@ -289,7 +289,7 @@ class Host:
         """Refuse a command of a block whose reservation has ended.
 
         Raises:
-            ReservationLostError: it has ended, or was another agent's to keep.
+            ReservationLostError: the reservation has ended, or was another agent's to keep.
         """
         if not self.gate.holds(reservation):
             raise ReservationLostError(

@@ -339,7 +339,7 @@ class FleetServer(Server):
         Raises:
             ConfigurationError: the file is wrong, or changes what wants a restart; says where. All
                 stays as it was.
-            ConnectionClosedError: it is not started, or it ends.
+            ConnectionClosedError: the agent is not started, or it ends.
 
         Cancellation: nothing has changed; or all of it is changed, also when nobody waits for it.
         """
@@ -351,7 +351,7 @@ class FleetServer(Server):
         """Return the source of a camera's session; an emulated camera is started for it.
 
         Raises:
-            SmartCamError: it cannot be done.
+            SmartCamError: the session cannot be done.
         """
         async with contextlib.AsyncExitStack() as stack:
             entry = planned.entry

@@ -37,7 +37,7 @@ def check_name(name: str, what: str = "camera") -> str:
     """Return a camera's name.
 
     Raises:
-        ConfigurationError: it cannot be one.
+        ConfigurationError: the name cannot be one.
     """
     name = check_text(name, what)
     if len(name) > MAX_NAME_CHARACTERS or not _NAME.fullmatch(name):
@@ -52,7 +52,7 @@ def check_word(word: str, what: str) -> str:
     """Return the name of a fleet or an agent.
 
     Raises:
-        ConfigurationError: it cannot be one.
+        ConfigurationError: the name cannot be one.
     """
     word = check_text(word, what)
     if len(word) > MAX_NAME_CHARACTERS or not _WORD.fullmatch(word):
@@ -64,7 +64,7 @@ def check_pattern(pattern: str) -> str:
     """Return a pattern of cameras' names: ``*`` is one part, ``**`` any number of them.
 
     Raises:
-        ConfigurationError: it cannot be one.
+        ConfigurationError: the pattern cannot be one.
     """
     pattern = check_text(pattern, "pattern")
     chunks = pattern.split("/")

@@ -84,7 +84,7 @@ class Bus(abc.ABC):
         """Come to the bus.
 
         Raises:
-            ConnectFailedError: there is none within ``timeout`` seconds.
+            ConnectFailedError: there is no bus within ``timeout`` seconds.
         """
 
     @abc.abstractmethod

@@ -142,10 +142,10 @@ class Feed(Generic[NumberedT]):
 
     Args:
         take: gets each thing once, in order of the numbers.
-        miss: is told how many could not be had any more, and what came next; None where nothing
-            did.
-        lacks: is called where something is missing; then who made the feed is to ask the agent for
-            what follows ``expected``, and to :meth:`fill` it in.
+        miss: function that is told how many could not be had any more, and what came next; None
+            where nothing did.
+        lacks: function that is called where something is missing; then who made the feed is to ask
+            the agent for what follows ``expected``, and to :meth:`fill` it in.
         most_held: bytes that wait for what is missing before them; what comes beyond is dropped,
             and asked for later.
         returns: an epoch that comes again after another one's goes on where it was; what is

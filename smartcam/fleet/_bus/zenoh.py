@@ -97,8 +97,8 @@ class ZenohEnd(ZenohSession, Bus):
         """Come to the bus.
 
         Raises:
-            ConnectFailedError: it cannot listen, or reach anybody, within ``timeout`` seconds; the
-                text says what is wrong with a certificate.
+            ConnectFailedError: this end cannot listen, or reach anybody, within ``timeout``
+                seconds; the text says what is wrong with a certificate.
             ConfigurationError: the certificates cannot work.
         """
         folder = self._link.certificates
@@ -138,8 +138,8 @@ class ZenohEnd(ZenohSession, Bus):
         """Read whose its certificates are, as they are now; warn if they end soon, also later.
 
         Raises:
-            ConnectFailedError: they have expired.
-            ConfigurationError: they cannot work.
+            ConnectFailedError: the certificates have expired.
+            ConfigurationError: the certificates cannot work.
         """
         folder, loop = Path(self._link.certificates or ""), asyncio.get_running_loop()
         identity = await loop.run_in_executor(None, read_identity, folder)

@@ -187,11 +187,11 @@ class FramesEntry(Fields):
         return frames.open(url, camera_info=self.lens(folder), stall=self.stall, linger=self.linger)
 
     def lens(self, folder: Path) -> CameraModel | None:
-        """Return the lens, None where none is said.
+        """Return the lens, None where the file names none.
 
         Raises:
             CalibrationError: the file is no lens.
-            OSError: it cannot be read.
+            OSError: the file cannot be read.
         """
         if self.camera_info is None:
             return None
@@ -215,7 +215,7 @@ def _is_ours(path: Path) -> bool:
     """Return True if a file is a calibration of smartcam's.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: the file cannot be read.
     """
     with path.open("rb") as file:
         return file.read(64).lstrip()[:1] == b"{"

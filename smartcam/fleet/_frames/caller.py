@@ -104,7 +104,7 @@ class FrameCaller:
             fresh: whether the frame is to be exposed after this call.
 
         Raises:
-            FrameTimeoutError: none came in time.
+            FrameTimeoutError: no frame came in time.
             SmartCamError: as the agent says.
         """
         loop = asyncio.get_running_loop()

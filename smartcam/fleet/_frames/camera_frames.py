@@ -160,7 +160,7 @@ class SharedFrames:
 
         Raises:
             UnsupportedError: the camera has none.
-            FrameSourceError: it cannot be opened; the next one tries again.
+            FrameSourceError: the source cannot be opened; the next one tries again.
 
         Cancellation: it is opened all the same, for the next viewer.
         """

@@ -34,7 +34,7 @@ def read_feature(said: object, who: str) -> Feature:
     """Return the feature that an agent's fields describe.
 
     Raises:
-        RemoteProtocolError: they describe none.
+        RemoteProtocolError: the fields describe none.
     """
     try:
         fields = cast("dict[str, Any]", said)
@@ -59,7 +59,7 @@ def read_value(said: object, who: str) -> FeatureValue:
     """Return a value that an agent says.
 
     Raises:
-        RemoteProtocolError: it is not valid.
+        RemoteProtocolError: the value is not valid.
     """
     if isinstance(said, (bool, int, float, str)):
         return said
@@ -112,7 +112,7 @@ class FleetFeatures(DeviceFeatures):
         """Return a list of what an agent says.
 
         Raises:
-            RemoteProtocolError: it is not valid, or has too many items.
+            RemoteProtocolError: the list is not valid, or has too many items.
         """
         found = said.get(name)
         if not isinstance(found, list) or len(found) > MAX_FEATURES:

@@ -75,7 +75,7 @@ class SharedFrameDriver(FrameDriver):
         """Have the agent open the device.
 
         Raises:
-            FrameSourceError: it cannot, or there is no agent.
+            FrameSourceError: the agent cannot, or there is no agent.
             UnsupportedError: the camera has no frames.
             MissingExtraError: what decodes H.264 is not installed here.
         """

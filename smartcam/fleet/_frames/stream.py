@@ -87,9 +87,9 @@ class FrameStream(ABC):
         """Return the next frame, or several frames of H.264.
 
         Raises:
-            TimeoutError: there is none for now.
-            StopAsyncIteration: it has ended.
-            SmartCamError: why it has ended.
+            TimeoutError: there is no frame for now.
+            StopAsyncIteration: the stream has ended.
+            SmartCamError: the stream has ended, and why.
         """
 
     @abstractmethod

@@ -108,7 +108,7 @@ class SharedVideo:
         Raises:
             FrameSourceError: the source ended with it.
             FrameFormatError: its frames cannot become video.
-            StopAsyncIteration: it ended.
+            StopAsyncIteration: the video ended.
         """
         while True:
             if found := self._following(have):

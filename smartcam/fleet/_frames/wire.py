@@ -61,10 +61,10 @@ class FrameForm(NamedTuple):
 
         Args:
             name: the encoding.
-            quality: None where nothing is said.
+            quality: quality of a JPEG; None: not given.
             who: name of the asker, for error texts.
-            bitrate: None where nothing is said.
-            stream: whether it is for a stream, which video can be.
+            bitrate: bits a second; None: not given.
+            stream: whether the order is for a stream, which video can be.
 
         Raises:
             ConfigurationError: there is no such encoding, or it has no such quality or bit rate.

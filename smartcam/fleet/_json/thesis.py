@@ -49,7 +49,7 @@ def new_camera(request: SetupRequest) -> CameraSettings:
     """Return the settings of a camera that Setup adds.
 
     Raises:
-        ConfigurationError: it cannot work.
+        ConfigurationError: the camera cannot work.
     """
     if not request.con_address:
         raise ConfigurationError(

@@ -84,7 +84,7 @@ def require_client() -> Any:
     """Return prometheus-client.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: the package is not installed.
     """
     load("prometheus_client.core")
     return load("prometheus_client")

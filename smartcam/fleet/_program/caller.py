@@ -193,7 +193,7 @@ class Caller:
         """Return the agent.
 
         Raises:
-            ConnectionLostError: it is away.
+            ConnectionLostError: the agent is away.
             ConnectionClosedError: not opened, or closed.
         """
         if self.met is not None:
@@ -380,7 +380,7 @@ class Caller:
         """Return a reservation of ours whose block runs.
 
         Raises:
-            ReservationLostError: it is lost, as far as is known here.
+            ReservationLostError: the reservation is lost, as far as is known here.
         """
         lease, met = self.leases[number], self.met
         if not lease.lost and met is not None and met.epoch != lease.epoch:
@@ -416,7 +416,7 @@ class Caller:
         """Return the reservation in whose block a call is, the oldest; None where there is none.
 
         Raises:
-            ReservationLostError: one of them is lost; nothing was sent.
+            ReservationLostError: one of the reservations is lost; nothing was sent.
         """
         if not self.leases or do not in FENCED:
             return None

@@ -706,7 +706,7 @@ class FleetCamera(Camera[ValueT]):
         """Have the agent confirm that a reservation of ours has not ended; bounded.
 
         Raises:
-            ReservationLostError: it has ended, or nobody knows.
+            ReservationLostError: the reservation has ended, or nobody knows.
         """
         caller = self._caller
         deadline = self._deadline(self.settings.request_timeout)

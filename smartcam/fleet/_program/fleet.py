@@ -424,7 +424,7 @@ class Fleet:
         object once an agent shares it again.
 
         Raises:
-            ConfigurationError: none is called so.
+            ConfigurationError: no camera is called so.
         """
         name = check_text(name, "camera", self.url)
         if name not in self._agents:

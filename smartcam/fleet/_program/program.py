@@ -85,7 +85,7 @@ class Program:
         """Come to the bus.
 
         Raises:
-            ConnectFailedError: there is none within ``timeout`` seconds, or no fleet there.
+            ConnectFailedError: there is no bus within ``timeout`` seconds, or no fleet there.
             ConfigurationError: there are several.
         """
         deadline = asyncio.get_running_loop().time() + timeout

@@ -144,7 +144,7 @@ def x509_module() -> Any:
     """Return the module that reads certificates.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: the package is not installed.
     """
     return load("cryptography.x509")
 
@@ -212,7 +212,7 @@ class Handshake(NamedTuple):
     """The outcome of a handshake.
 
     Attributes:
-        trouble: why it failed; empty where it did not.
+        trouble: why the last reading failed; empty where it did not.
         ends: when the other side's certificate ends, UTC; None where it showed none.
     """
 

@@ -350,7 +350,7 @@ def attach(found: socket.socket, steps: list[_Instruction]) -> None:
     """Have the system filter what comes for a socket.
 
     Raises:
-        OSError: it refuses the filter.
+        OSError: the system refuses the filter.
     """
     packed = b"".join(struct.pack("HBBI", one.code, one.yes, one.no, one.value) for one in steps)
     kept = ctypes.create_string_buffer(packed, len(packed))

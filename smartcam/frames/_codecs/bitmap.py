@@ -25,7 +25,7 @@ def read_bitmap(data: bytes) -> NDArray[np.uint8]:
     Read are 8 bits with a palette and 24 or 32 bits, uncompressed, either row first.
 
     Raises:
-        FrameFormatError: it is cut off, compressed, of other bits, or no bitmap.
+        FrameFormatError: the file is cut off, compressed, of other bits, or no bitmap.
     """
     if len(data) < FILE.size + INFO.size or data[:2] != b"BM":
         raise FrameFormatError(

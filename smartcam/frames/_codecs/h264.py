@@ -87,7 +87,7 @@ class H264Encoder:
         """Return a frame of format ``H264`` with all that was known of the one given.
 
         Raises:
-            FrameFormatError: it cannot become video: see the error for what can.
+            FrameFormatError: the frame cannot become video: see the error for what can.
             LocalProtocolError: the codecs are closed.
 
         Cancellation: safe; the stream begins anew with the next frame.

@@ -46,7 +46,7 @@ def jpeg_header(data: bytes | bytearray | memoryview, what: str) -> tuple[int, i
     """Return width and height, and whether there are colours; nothing is decoded.
 
     Raises:
-        FrameFormatError: it is no JPEG.
+        FrameFormatError: the picture is no JPEG.
         MissingExtraError: simplejpeg is not installed.
     """
     simplejpeg = load("simplejpeg")
@@ -69,7 +69,7 @@ def decode_jpeg(
         what: name of the picture for errors.
 
     Raises:
-        FrameFormatError: it is cut off, damaged, of another size, or none.
+        FrameFormatError: the picture is cut off, damaged, of another size, or none.
         MissingExtraError: simplejpeg is not installed.
     """
     width, height, _ = jpeg_header(data, what)
@@ -120,7 +120,7 @@ def _check_restarts(data: bytes | bytearray | memoryview, what: str, warning: Ex
     """See that no restart mark is missing: libjpeg tells its last warning, not those before it.
 
     Raises:
-        FrameFormatError: they do not follow each other, or the end mark is not there.
+        FrameFormatError: the marks do not follow each other, or the end mark is not there.
     """
     whole = bytes(data)
     scan = whole.rfind(b"\xff\xda")

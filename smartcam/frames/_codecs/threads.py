@@ -71,7 +71,7 @@ class Codecs:
         """Make the threads; each begins with the first picture for it.
 
         Raises:
-            LocalProtocolError: it was entered before.
+            LocalProtocolError: the object was entered before.
         """
         self.begin()
         return self
@@ -80,7 +80,7 @@ class Codecs:
         """Make the threads; the caller ends them by :meth:`close`.
 
         Raises:
-            LocalProtocolError: it was entered before.
+            LocalProtocolError: the object was entered before.
         """
         if self._pool is not None or self._closed:
             raise LocalProtocolError("Codecs: entered before; make new ones")
@@ -128,7 +128,7 @@ class Codecs:
         """Return a frame as a PNG, without loss: grey, RGB, a Bayer pattern or depth as it is.
 
         Raises:
-            FrameFormatError: it is compressed or YUV, or its bytes are wrong.
+            FrameFormatError: the frame is compressed or YUV, or its bytes are wrong.
             LocalProtocolError: these codecs are closed.
             MissingExtraError: the extra ``frames`` is not installed.
         """
@@ -166,7 +166,7 @@ class Codecs:
         Mono8 and RGB8 of more than 8 bits are the 8 highest of those that mean something.
 
         Raises:
-            FrameFormatError: it has no brightness or colours, or its bytes are wrong.
+            FrameFormatError: the frame has no brightness or colours, or its bytes are wrong.
             LocalProtocolError: these codecs are closed.
             MissingExtraError: what reads its format is not installed.
         """
@@ -266,7 +266,7 @@ def at_once(work: Coroutine[Any, Any, T]) -> T:
     """Return the result of a coroutine that never waits.
 
     Raises:
-        RuntimeError: it waits.
+        RuntimeError: the coroutine waits.
     """
     try:
         work.send(None)

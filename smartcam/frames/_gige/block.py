@@ -181,7 +181,7 @@ class Block:
         """Take the leader.
 
         Raises:
-            MessageError: it is none of a picture, or of one that is larger than said.
+            MessageError: the leader is not that of a picture, or tells a larger one than it may.
         """
         leader = decode_leader(payload, self.implied)
         need = picture_bytes(leader, leader.height)

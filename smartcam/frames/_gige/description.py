@@ -82,7 +82,7 @@ def locate(url: str) -> Location:
     """Read a URL as a camera has it: ``Local:name.zip;ADDRESS;LENGTH``, both hexadecimal.
 
     Raises:
-        MessageError: it is another one, or has impossible numbers.
+        MessageError: the URL is another one, or has impossible numbers.
     """
     found = re.fullmatch(
         r"local:/*([^;]*);\s*(?:0x)?([0-9a-f]{1,8});\s*(?:0x)?([0-9a-f]{1,8})(?:\?.*)?",
@@ -103,8 +103,8 @@ def unpack(data: bytes) -> bytes:
     """Return a description's text; ZIP archives are unpacked, of several files the first XML.
 
     Raises:
-        MessageError: it cannot be unpacked, or to more than :data:`MAX_PLAIN_BYTES`; or it is
-            packed in another way than by DEFLATE, of which a few bytes may stand for gigabytes.
+        MessageError: the archive cannot be unpacked, or to more than :data:`MAX_PLAIN_BYTES`; or it
+            is packed in another way than by DEFLATE, of which a few bytes may stand for gigabytes.
     """
     if not data.startswith(b"PK"):
         return data.rstrip(b"\0")
@@ -145,7 +145,7 @@ def parse(text: bytes) -> dict[str, Element]:
     """Return a description's nodes by their names.
 
     Raises:
-        MessageError: it is no XML, has a document type, or is larger than any.
+        MessageError: the text is no XML, has a document type, or is larger than any.
     """
     reader = _XmlReader()
     parser = expat.ParserCreate()

@@ -137,7 +137,7 @@ class GigEDriver(FrameDriver):
         """Return the session that is open; one that was lost is opened anew.
 
         Raises:
-            FrameSourceError: it cannot be opened, or was closed meanwhile.
+            FrameSourceError: the session cannot be opened, or was closed meanwhile.
         """
         async with self._opening:
             if self._session is not None and self._session.lost is not None:

@@ -83,7 +83,7 @@ def decode_events(datagram: bytes) -> EventRequest:
     """Read a message of the message channel.
 
     Raises:
-        MessageError: it is not valid, or its lengths do not fit.
+        MessageError: the message is not valid, or its lengths do not fit.
     """
     if len(datagram) < _REQUEST.size:
         raise MessageError(f"event: expected 8 bytes or more, got {len(datagram)}", data=datagram)
@@ -174,7 +174,7 @@ class EventChannel(asyncio.DatagramProtocol):
 
         Raises:
             UnsupportedError: the camera tells no events.
-            FrameSourceError: it has no such event.
+            FrameSourceError: the camera has no such event.
         """
         known = await self.names()
         label = self._session.label

@@ -176,8 +176,8 @@ def evaluate(formula: str, variables: Mapping[str, Number], *, whole: bool) -> N
         whole: whether all is whole numbers, as in an ``IntSwissKnife``.
 
     Raises:
-        MessageError: it is not valid, has a name that is not known, or no value: a division by
-            zero, a number past its bounds, or two values by two readings.
+        MessageError: the formula is not valid, has a name that is not known, or no value: a
+            division by zero, a number past its bounds, or two values by two readings.
     """
     tree, other = _parsed(formula)
     value = _worked_out(formula, tree, variables, whole)

@@ -123,7 +123,8 @@ class GenicamFeatures:
         """Return a feature's value: of an enumeration the entry's name.
 
         Raises:
-            FrameFeatureError: there is none of that name, it is not available now, or has no value.
+            FrameFeatureError: there is no feature of that name, it is not available now, or has no
+                value.
         """
         async with self._lock:
             node = await self._begin(name)
@@ -189,7 +190,7 @@ class GenicamFeatures:
             writing: called right before the camera's register is written.
 
         Raises:
-            FrameFeatureError: there is none of that name, or the camera refuses.
+            FrameFeatureError: there is no command of that name, or the camera refuses.
         """
         await self.set(name, 1, writing=writing)
 
@@ -197,7 +198,8 @@ class GenicamFeatures:
         """Raise unless a name is that of a command; with ``expected`` False, if it is.
 
         Raises:
-            FrameSourceError: it is not, or there is no feature of that name.
+            FrameSourceError: the name is not that of a command, or there is no feature of that
+                name.
         """
         node = self._named(name)
         if (node.kind == "Command") != expected:
@@ -224,7 +226,7 @@ class GenicamFeatures:
         """Return a feature with its value, range and access as they are now.
 
         Raises:
-            FrameFeatureError: there is none of that name, or the camera does not answer.
+            FrameFeatureError: there is no feature of that name, or the camera does not answer.
         """
         async with self._lock:
             node = self._named(name)

@@ -102,7 +102,7 @@ def checked_mac(mac: str) -> str:
     """Return a hardware address with small letters and colons.
 
     Raises:
-        ConfigurationError: it is not valid.
+        ConfigurationError: the address is not valid.
     """
     given = check_text(mac, "mac", "force_address", most=100)
     digits = re.sub(r"[:.\-]", "", given.strip().lower())
@@ -157,7 +157,7 @@ async def _sent(
     """Send the request in all networks, until it is answered.
 
     Raises:
-        FrameSourceError: it is refused.
+        FrameSourceError: the request is refused.
         FrameTimeoutError: nothing answers.
     """
     loop = asyncio.get_running_loop()

@@ -168,7 +168,7 @@ class DeviceInfo(NamedTuple):
         """Read the payload of the answer to a DISCOVERY.
 
         Raises:
-            MessageError: it is too short.
+            MessageError: the payload is too short.
         """
         if len(payload) < 0xF8:
             raise MessageError(
@@ -209,7 +209,7 @@ def decode_ack(datagram: bytes) -> Ack:
     """Read an answer.
 
     Raises:
-        MessageError: it is not valid.
+        MessageError: the answer is not valid.
     """
     if len(datagram) < _ANSWER.size:
         raise MessageError(f"GVCP: expected 8 bytes or more, got {len(datagram)}", data=datagram)

@@ -169,7 +169,7 @@ def decode_leader(payload: bytes, implied: ImpliedPicture | None = None) -> Lead
         implied: picture of a leader that has no size; None: such a leader is an error.
 
     Raises:
-        MessageError: it is too short, or none of an image.
+        MessageError: the leader is too short, or not that of an image.
     """
     if len(payload) < _LEADER.size:
         raise MessageError(f"leader: expected 12 bytes or more, got {len(payload)}", data=payload)
@@ -203,7 +203,7 @@ def decode_trailer(payload: bytes) -> Trailer:
     """Read a trailer, without its header.
 
     Raises:
-        MessageError: it is too short.
+        MessageError: the trailer is too short.
     """
     if len(payload) < _TRAILER.size:
         raise MessageError(f"trailer: expected 8 bytes, got {len(payload)}", data=payload)

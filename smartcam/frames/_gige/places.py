@@ -31,7 +31,7 @@ def wanted(address: FrameAddress) -> WantedStream:
     """Read a URL's parameters.
 
     Raises:
-        ConfigurationError: one is wrong; the text says what is known.
+        ConfigurationError: one of the parameters is wrong; the text says what is known.
     """
     names = [name for name, _ in parse_qsl(address.query, keep_blank_values=True)]
     features = [name for name in names if name.startswith(FEATURE) and name != FEATURE]

@@ -71,8 +71,8 @@ class GigESession:
         """Take control of a camera and read its description.
 
         Raises:
-            FrameSourceError: it is not there, another application has it, or its description
-                cannot be read.
+            FrameSourceError: the camera is not there, another application has it, or its
+                description cannot be read.
         """
         control = await ControlChannel.connect(host, port, label)
         session = cls(control, label)

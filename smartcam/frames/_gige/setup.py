@@ -102,7 +102,7 @@ async def set_up(session: GigESession, wanted: WantedStream) -> StreamShape:
     """Set a camera, in the order in which the URL says it; return what it streams then.
 
     Raises:
-        FrameSourceError: it has no such feature or value; the text says what it has.
+        FrameSourceError: the camera has no such feature or value; the text says what it has.
     """
     features = session.features
     with contextlib.suppress(FrameSourceError):  # it does not stream, which may be an error
@@ -183,7 +183,7 @@ async def read_shape(session: GigESession) -> StreamShape:
     """Return the shape of the stream as the camera is set now.
 
     Raises:
-        FrameSourceError: it does not tell, or a format that is not known here.
+        FrameSourceError: the camera does not tell, or a format that is not known here.
     """
     features = session.features
     entry = await features.get("PixelFormat")

@@ -94,7 +94,7 @@ class PixelFormat:
         """Return Y, U and V of a format that has them, views; U and V have the size they have.
 
         Raises:
-            FrameFormatError: it has none, or there are too few bytes.
+            FrameFormatError: the format has none, or there are too few bytes.
         """
         return self.layout.planes(RawPicture(self.name, data, width, height, stride))
 
@@ -274,7 +274,7 @@ def find_format(name: str | int) -> PixelFormat:
         name: small letters and blanks at the end do not matter; or 32 bits of PFNC.
 
     Raises:
-        FrameFormatError: there is none; the text lists the known ones.
+        FrameFormatError: there is no such format; the text lists the known ones.
     """
     exact = _BY_EXACT_NAME.get(name) if type(name) is str else None
     if exact is not None:

@@ -119,7 +119,7 @@ class RateControl:
         fps: frames a second, the fewest and the most.
 
     Raises:
-        ConfigurationError: neither of them is said, or one is out of its range.
+        ConfigurationError: neither of them is given, or one is out of its range.
     """
 
     def __init__(

@@ -46,7 +46,7 @@ class Buffers:
         count: how many are asked for; the driver may give more or fewer.
 
     Raises:
-        FrameSourceError: it is in use, or has no memory; nothing streams.
+        FrameSourceError: the device is in use, or has no memory; nothing streams.
     """
 
     def __init__(self, device: CaptureDevice, count: int) -> None:
@@ -76,7 +76,7 @@ class Buffers:
         """Take the oldest picture that is there out of its buffer; the driver gets the buffer back.
 
         Raises:
-            BlockingIOError: none is there.
+            BlockingIOError: no picture is there.
             OSError: the device is gone, or its driver gave up.
         """
         argument, number, ioctl = self._argument, self._device.number, system.ioctl

@@ -122,8 +122,8 @@ def set_control(device: CaptureDevice, name: str, value: int | str) -> int:
         What the device has it set to.
 
     Raises:
-        FrameFeatureError: there is none of that name, it cannot be set, or takes no such value; it
-            lists what there is.
+        FrameFeatureError: there is no control of that name, it cannot be set, or takes no such
+            value; it lists what there is.
     """
     answer = _described(device).get(simple(name))
     if answer is None:

@@ -120,7 +120,7 @@ class CaptureDevice:
         """Return the driver's answer; fields that are not given are 0.
 
         Raises:
-            FrameSourceError: it refuses.
+            FrameSourceError: the driver refuses.
         """
         try:
             return self.try_to(request, *fields)
@@ -192,8 +192,8 @@ class CaptureDevice:
         """Set the device so, and see that it did it.
 
         Raises:
-            FrameFormatError: it took another format, size or rate; it lists what there is.
-            FrameSourceError: it is in use.
+            FrameFormatError: the device took another format, size or rate; it lists what there is.
+            FrameSourceError: the device is in use.
         """
         current = self._layout(self.ask(abi.G_FMT, abi.CAPTURE, tried="reading its format"))
         code = self._code(wanted.format, current.fourcc)

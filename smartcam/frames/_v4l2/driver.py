@@ -145,8 +145,8 @@ class V4L2Driver(FrameDriver):
             What the device has it set to.
 
         Raises:
-            FrameSourceError: there is none of that name, or it takes no such value; it lists what
-                there is, with the range.
+            FrameSourceError: there is no control of that name, or it takes no such value; it lists
+                what there is, with the range.
         """
         return await self._do(
             lambda: self._with_device(lambda device: set_control(device, name, value)),

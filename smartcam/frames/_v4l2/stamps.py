@@ -51,7 +51,7 @@ class BufferStamps:
         self._doubted = False
 
     def queue_is_empty(self, now: float) -> None:
-        """Take that all frames so far were taken out."""
+        """Note that all frames so far were taken out."""
         self._empty = now
 
     def read(self, seconds: float, flags: int, number: int, now: float) -> BufferStamp:

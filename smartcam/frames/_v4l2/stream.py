@@ -67,7 +67,7 @@ class CaptureStream:
         """Give all frames to the sink that are there.
 
         Raises:
-            FrameSourceError: nothing more will come.
+            FrameSourceError: no more frames will come.
         """
         for _ in range(len(self._buffers)):
             try:

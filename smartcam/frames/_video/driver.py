@@ -122,8 +122,8 @@ class VideoDriver(FrameDriver):
         """Read a picture of it, and let it go again.
 
         Raises:
-            FrameFormatError: it is no video, or has pixels that we have no name for.
-            FrameSourceError: it is not there, refuses, or is silent.
+            FrameFormatError: the source is no video, or has pixels that we have no name for.
+            FrameSourceError: the source is not there, refuses, or is silent.
             MissingExtraError: the extra ``video`` is not installed.
         """
         try:
@@ -139,7 +139,7 @@ class VideoDriver(FrameDriver):
         """Connect anew and read; a recording begins at its beginning.
 
         Raises:
-            FrameSourceError: it is gone, or silent.
+            FrameSourceError: the source is gone, or silent.
         """
         try:
             reading, first = await self._begin()

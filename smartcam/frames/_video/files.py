@@ -141,7 +141,7 @@ class PictureReading(ABC):
         """Return the next picture; None at the end, or when it is stopped.
 
         Raises:
-            FrameSourceError: it is gone, silent, or something else than it was.
+            FrameSourceError: the source is gone, silent, or something else than it was.
         """
 
     @abstractmethod
@@ -154,7 +154,7 @@ class VideoReading(PictureReading):
 
     Raises:
         FrameFormatError: there is no video in it.
-        FrameSourceError: it is not there, refuses, or is silent.
+        FrameSourceError: the source is not there, refuses, or is silent.
         MissingExtraError: the extra ``video`` is not installed.
     """
 

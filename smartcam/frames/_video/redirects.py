@@ -92,7 +92,7 @@ def followed(url: str, location: str, peer: str, name: str) -> str:
         name: name of the source, for errors.
 
     Raises:
-        FrameSourceError: it leads to another host or port.
+        FrameSourceError: the redirect leads to another host or port.
     """
     before = urlsplit(url)
     try:
@@ -120,7 +120,7 @@ def _asked(url: SplitResult, end: float, tls: ssl.SSLContext | None) -> _Answer:
     """Return the answer to the requests that FFmpeg begins with: the first redirect, or the last.
 
     Raises:
-        OSError, ValueError: there is none, or it cannot be read.
+        OSError, ValueError: there is no answer, or it cannot be read.
     """
     scheme, host, port = _place(url)
     plain = url._replace(netloc=url.netloc.rpartition("@")[2], fragment="")

@@ -39,8 +39,8 @@ class WebDriver(VideoDriver):
         """Read one picture, and close the connection again.
 
         Raises:
-            FrameFormatError: it is no video, or has pixels that we have no name for.
-            FrameSourceError: it is not there, refuses, or is silent.
+            FrameFormatError: the source is no video, or has pixels that we have no name for.
+            FrameSourceError: the source is not there, refuses, or is silent.
             MissingExtraError: the extra ``video`` is not installed.
         """
         load("av")
@@ -61,7 +61,7 @@ class WebDriver(VideoDriver):
         """Connect anew and read; a recording begins at its beginning.
 
         Raises:
-            FrameSourceError: it is gone, or silent.
+            FrameSourceError: the source is gone, or silent.
         """
         if not self._is_parts:
             await super().start(sink)

@@ -75,7 +75,7 @@ class WebStream:
         Raises:
             FrameSourceError: a redirect elsewhere, or too many.
             OSError: there is no connection.
-            ValueError: it is no web server.
+            ValueError: the address is no web server.
 
         Cancellation: :meth:`close` ends what has begun.
         """

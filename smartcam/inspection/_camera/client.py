@@ -69,7 +69,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
 
     @property
     def judged(self) -> Judged | None:
-        """The last picture that was judged, with what was said about it; None before the first."""
+        """The last picture that was judged, with the findings about it; None before the first."""
         return self._device.eyes.judged
 
     @property
@@ -105,7 +105,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
 
         Raises:
             UnsupportedError: no picture was judged yet.
-            ResponseTimeoutError: it was not drawn in time.
+            ResponseTimeoutError: the picture was not drawn in time.
 
         Cancellation: safe.
         """
@@ -128,7 +128,7 @@ class SoftwareCamera(SmartCamera[ValueT]):
         Raises:
             ConfigurationError: an argument is of another kind.
             UnsupportedError: the result's picture is not known, or not any more.
-            ResponseTimeoutError: it was not made in time.
+            ResponseTimeoutError: the picture was not made in time.
 
         Cancellation: safe.
         """

@@ -186,7 +186,7 @@ class SoftwareDevice(Server):
         A source that is not there is a System Error.
 
         Raises:
-            ConfigurationError: it cannot listen there.
+            ConfigurationError: the device cannot listen there.
 
         Cancellation: leaves it stopped.
         """

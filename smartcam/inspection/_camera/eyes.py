@@ -48,7 +48,7 @@ RETRY: Final = Backoff(initial=0.1, maximum=5.0)
 
 
 class Judged(NamedTuple):
-    """A picture that was judged, and what was said about it.
+    """A picture that was judged, and the findings about it.
 
     Attributes:
         number: sequence number of the run.
@@ -89,7 +89,8 @@ class Eyes(Inspector):
         recorded: the source is a recording: each run takes its next picture, and the first one
             again after the last.
         grey: have the grey levels of each picture made in the thread, for whoever asks for them.
-        on_sight: is called when frames are lost, with the reason, and with "" when they come again.
+        on_sight: function that is called when frames are lost, with the reason, and with "" when
+            they come again.
 
     Attributes:
         name: name of the camera.

@@ -1,4 +1,4 @@
-"""Keeping judged pictures in a folder, with what was said about them."""
+"""Keeping judged pictures in a folder, with the findings about them."""
 
 from __future__ import annotations
 

@@ -40,7 +40,8 @@ class JudgedResults(Observer):
         session: returns the number of the device's session, 0 where it has none, and its last
             report of a run.
         received: returns how many containers the client has got so far.
-        found: is called with each result whose picture is known, before others see the result.
+        found: function that is called with each result whose picture is known, before others see
+            the result.
     """
 
     def __init__(

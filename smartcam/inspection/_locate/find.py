@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from smartcam.inspection._picture import Picture
 
 CONTRAST_SHARE: Final = 0.15
-"""Part of the taught contrast that a found edge has at least, where nothing else is said."""
+"""Part of the taught contrast that a found edge has at least, where nothing else is set."""
 
 MIN_CONTRAST: Final = 8.0
-"""Grey levels of 255 of a found edge at least, where nothing else is said."""
+"""Grey levels of 255 of a found edge at least, where nothing else is set."""
 
 MAX_FITS: Final = 12
 """Places that are fitted at most, besides four for each part that is looked for."""

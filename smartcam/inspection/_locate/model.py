@@ -78,7 +78,7 @@ MAX_LEVEL: Final = 255.0
 """Contrast or noise that may be given at most, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
-"""Grey levels of 255 of a taught edge at least, where nothing else is said."""
+"""Grey levels of 255 of a taught edge at least, where nothing else is set."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,7 +131,7 @@ class PartModel:
 
         Raises:
             TeachingError: the part cannot be taught; its ``why`` says the reason.
-            FrameFormatError: it is no picture.
+            FrameFormatError: the image is no picture.
             MissingExtraError: the extra ``inspection`` is not installed.
         """
         name = check_text(name, "name", "PartModel.teach", least=1)

@@ -59,7 +59,7 @@ def read_chunks(data: bytes) -> list[ImageChunk]:
     """Return the pictures of an answer to ``I01?`` or ``I02?``: nine digits of length, then chunks.
 
     Raises:
-        FrameError: they do not fit together.
+        FrameError: the chunks do not fit together.
     """
     rest = data[9:]
     if not data[:9].isdigit() or int(data[:9]) != len(rest):

@@ -36,7 +36,7 @@ def layout_json(layout: Layout) -> str:
     """Return the layout that a device is given, so that it sends what is declared, in binary.
 
     Raises:
-        ConfigurationError: it has no such type, or counts records by itself.
+        ConfigurationError: the device has no such type, or counts records by itself.
     """
     elements: list[dict[str, Any]] = [{"type": "string", "value": MARK, "id": "start_string"}]
     elements += map(_element, layout.head)

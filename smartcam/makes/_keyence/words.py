@@ -23,7 +23,7 @@ def error_code(line: str) -> int | None:
     """Return the number of ``ER,<command>,nn``, None for another line.
 
     Raises:
-        ValueError: it has no number.
+        ValueError: the line has no number.
     """
     word, _, rest = line.partition(",")
     return int(rest.rpartition(",")[2]) if word == "ER" else None

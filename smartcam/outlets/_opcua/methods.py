@@ -372,7 +372,7 @@ def _text(value: Any) -> str:
     """Return the text of an id: of a structure, a plain text, or nothing.
 
     Raises:
-        MethodArgumentError: it is nothing of these, or too long.
+        MethodArgumentError: the id is nothing of these, or too long.
     """
     text = value if isinstance(value, str) else getattr(value, "Id", None)
     while text is not None and not isinstance(text, str):  # an id of an id

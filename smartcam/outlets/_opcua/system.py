@@ -185,7 +185,7 @@ class VisionSystem:
             why: text that the client gave.
 
         Raises:
-            WrongStateError: it is not allowed in this state.
+            WrongStateError: the method is not allowed in this state.
         """
         self._check(method)
         self._by_client, self._wanted = True, None
@@ -205,7 +205,7 @@ class VisionSystem:
             internal: number as a text; "" where only the name is given.
 
         Raises:
-            UnknownRecipeError: there is none, or both ids are of different ones.
+            UnknownRecipeError: there is no such recipe, or both ids are of different ones.
         """
         found: set[int] = set()
         for text, names in ((external, self.settings.recipes), (internal, {})):
@@ -231,7 +231,8 @@ class VisionSystem:
         A camera may take seconds, and a client's other requests wait while this one does.
 
         Raises:
-            WrongStateError: it is not allowed in this state, or the state changed meanwhile.
+            WrongStateError: the method is not allowed in this state, or the state changed
+                meanwhile.
             BusyError: another recipe is being prepared.
             SmartCamError: the camera did not do it.
         """
@@ -287,7 +288,7 @@ class VisionSystem:
         """Have no recipe ready.
 
         Raises:
-            WrongStateError: it is not allowed in this state.
+            WrongStateError: the method is not allowed in this state.
         """
         self._check("UnprepareRecipe")
         self._by_client, self._wanted = True, None
@@ -322,7 +323,7 @@ class VisionSystem:
             why: text that the client gave.
 
         Raises:
-            WrongStateError: there is none.
+            WrongStateError: there is no job under way.
         """
         self._check(method)
         job = self._end_job(ABORTED, f"{method} {why}".rstrip())

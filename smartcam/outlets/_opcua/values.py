@@ -65,7 +65,7 @@ def plain(value: Any, kind: str) -> Any:
     """Return a value as its type in OPC UA wants it.
 
     Raises:
-        TypeError: it is no value of the type.
+        TypeError: the value is no value of the type.
     """
     of = type_of(kind)
     if of is ua.VariantType.String and (value is None or isinstance(value, str)):

@@ -58,7 +58,7 @@ class MessageRow(NamedTuple):
         message_id: id on the wire.
         type: the message.
         title: the manual's name.
-        source: where it stands, with its grade.
+        source: document that has the fact, with its grade.
         omits: fields of the message that are not on this dialect's wire; they have defaults.
         byte_order: ``struct`` code of the body's byte order.
     """
@@ -275,7 +275,7 @@ class WireQuirk(NamedTuple):
 
     Attributes:
         about: one line for people.
-        source: where it comes from, with its grade.
+        source: document that describes the dialect, with its grade.
         rows: the messages that look different.
         codes: what result codes mean, where that differs.
     """
@@ -375,7 +375,7 @@ class FramedDialect(Dialect):
         """Return the dialect with these deviations, always the same one for the same names.
 
         Raises:
-            ConfigurationError: it knows no such deviation.
+            ConfigurationError: the dialect knows no such deviation.
         """
         key = tuple(sorted({*names, *self.quirks}))
         unknown = [name for name in key if name not in self.wire_quirks]
@@ -404,7 +404,7 @@ class FramedDialect(Dialect):
         """Return the dialect with what a URL says of ``shows_triggers``, always the same one.
 
         Raises:
-            ConfigurationError: it is neither ``yes`` nor ``no``.
+            ConfigurationError: the value is neither ``yes`` nor ``no``.
         """
         said = parameters.get(SHOWS_TRIGGERS, "yes")
         if said not in {"yes", "no"}:
@@ -455,7 +455,7 @@ class FramedDialect(Dialect):
         """Return the id of a message in this dialect.
 
         Raises:
-            UnsupportedError: it has no such message.
+            UnsupportedError: the dialect has no such message.
         """
         if isinstance(message, (UnknownMessage, MalformedMessage)):
             return message.message_id

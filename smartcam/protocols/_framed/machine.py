@@ -197,7 +197,7 @@ class Machine:
         """Speak this one of :attr:`kin`; statuses that :meth:`events` gave before are not redone.
 
         Raises:
-            LocalProtocolError: it is none of them.
+            LocalProtocolError: the dialect is not in :attr:`kin`.
         """
         found = [one for one in self.kin if one is dialect]
         if not found:
@@ -243,7 +243,7 @@ class Machine:
 
     @property
     def pending(self) -> bytes:
-        """Copy of those bytes."""
+        """Copy of the bytes that wait for more."""
         return self._framer.pending
 
     def receive_data(self, data: bytes | bytearray | memoryview) -> None:
@@ -528,7 +528,7 @@ class Machine:
         And the bytes that it is too long, where that is accepted.
 
         Raises:
-            MessageError: it is too short, or too long.
+            MessageError: the body is too short, or too long.
         """
         payload = self._framer.take(begin, end)
         if codec is None:

@@ -182,7 +182,7 @@ class InSightDialect(Dialect):
 
         Raises:
             UnsupportedError: the form of its answer is not known.
-            ConfigurationError: it is no line.
+            ConfigurationError: the text is no line.
         """
         line = f"{message_id}{payload.decode(ENCODING)}"
         if not isinstance(message_id, str) or line[:2].upper() not in COMMANDS:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     """Yields command lines and is sent their answers; what it finds out it tells as messages."""
 
 ONLINE = Status.RUNNING | Status.WAITING_FOR_TRIGGER
-"""Status of a camera that is online: an event 8 is taken. It tells no more of itself."""
+"""Status of a camera that is online and takes event 8; no other state is told."""
 
 READ_SIZE = 1 << 15
 """Bytes that one read takes at most."""
@@ -79,7 +79,7 @@ class Command(m.Request):
     """A command line of any kind that the library knows the answer's form of.
 
     Raises:
-        ConfigurationError: it is not valid, or it cannot be sent.
+        ConfigurationError: the line is not valid, or it cannot be sent.
     """
 
     answer: ClassVar[type[m.Message] | None] = Reply
@@ -179,7 +179,7 @@ class InSightMachine:
 
     @property
     def pending(self) -> bytes:
-        """Copy of those bytes."""
+        """Copy of the bytes that wait for more."""
         return self._reader.pending
 
     def room(self) -> memoryview:
@@ -364,7 +364,7 @@ class InSightMachine:
     def _name_job(self) -> Generator[str, CommandAnswer, int]:
         """Return the active job's id.
 
-        One without an id has none, and so has one that the camera does not name.
+        A job without a number in its name has no id, nor has a job that the camera does not name.
         """
         code, text, _ = yield "GJ"
         if code != StatusCode.DONE:
@@ -398,7 +398,7 @@ class InSightMachine:
     def _trigger(self, _message: m.Message) -> Script:
         """Trigger, and when the cells are up to date, read them.
 
-        Where the camera took none, its status goes first: it may say why.
+        Where the camera took no trigger, its status is told first, since that may say why.
         """
         code = (yield f"SW{TRIGGER_EVENT}").code
         if code == StatusCode.FAILED:

@@ -66,7 +66,7 @@ def write_bag(
         ConfigurationError: no such camera, an option that cannot work, or the folder is there
             already or cannot be made.
         UnsupportedError: a camera whose results cannot be read again from their bytes.
-        RecordingError: it cannot be written to its end; nothing is left of it.
+        RecordingError: the bag cannot be written to its end; nothing is left of it.
         MissingExtraError: a library is not installed.
     """
     conversion = BagConversion(

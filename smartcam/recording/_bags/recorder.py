@@ -29,7 +29,7 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
     """Make a bag's folder, and what writes it.
 
     Raises:
-        ConfigurationError: it cannot be made.
+        ConfigurationError: the folder cannot be made.
         MissingExtraError: a library is not installed.
     """
     types = RosTypes(DISTRIBUTION)

@@ -71,8 +71,8 @@ def make_folder(folder: Path, *, overwrite: bool) -> IO[bytes]:
         overwrite: take the place of a bag that is there.
 
     Raises:
-        ConfigurationError: it is there already, holds something else than a bag, another recorder
-            writes it, or it cannot be made.
+        ConfigurationError: the folder is there already, holds something else than a bag, another
+            recorder writes it, or it cannot be made.
     """
     what = f"bag {folder}"
     try:

@@ -100,7 +100,7 @@ class FleetReplay(Server):
         """The agent.
 
         Raises:
-            ConfigurationError: it is not started.
+            ConfigurationError: the agent is not started.
         """
         if self._server is None:
             raise ConfigurationError(f"recording {self._recording.path}: it is not being played")

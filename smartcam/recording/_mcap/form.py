@@ -163,7 +163,7 @@ def load_extra(name: str) -> Any:
     """Import a module of the extra ``record``.
 
     Raises:
-        MissingExtraError: it is not installed.
+        MissingExtraError: the package is not installed.
     """
     return load(name, "recordings need")
 
@@ -185,7 +185,7 @@ def count_values(data: bytes) -> int:
     """Return the number of values of a message, roughly, and hold it against the bounds.
 
     Raises:
-        ValueError: it goes beyond one.
+        ValueError: the message goes beyond one.
     """
     if len(data) > MAX_MESSAGE:
         raise ValueError(f"a message of {len(data)} bytes, expected {MAX_MESSAGE} at most")
@@ -218,7 +218,7 @@ def message_fields(data: bytes) -> dict[str, Any]:
     """Return the object that a message is.
 
     Raises:
-        ValueError: it is not valid.
+        ValueError: the message is not valid.
     """
     parsed: Any = json.loads(data)
     if not isinstance(parsed, dict):
@@ -269,7 +269,7 @@ def _get(fields: Mapping[str, Any], name: str, kind: type[T]) -> T:
     """Return a field that must be there.
 
     Raises:
-        ValueError: it is not there, or something else.
+        ValueError: the field is not there, or something else.
     """
     value = optional(fields, name, kind)
     if value is None:
@@ -281,7 +281,7 @@ def optional(fields: Mapping[str, Any], name: str, kind: type[T]) -> T | None:
     """Return a field that may be missing.
 
     Raises:
-        ValueError: it is something else.
+        ValueError: the field is something else.
     """
     value: object = fields.get(name)
     if value is None:
@@ -303,7 +303,7 @@ def time_of(text: str) -> datetime:
     """Return the time that a text says, UTC.
 
     Raises:
-        ValueError: it is not valid, or has no time zone.
+        ValueError: the text is not valid, or has no time zone.
     """
     at = datetime.fromisoformat(text)
     if at.tzinfo is None:
@@ -324,7 +324,7 @@ def status_of(names: object) -> Status:
     """Return the status of its bits' names; a bit without a name stands there as ``0x40``.
 
     Raises:
-        ValueError: they are no names of bits.
+        ValueError: the words are no names of bits.
     """
     bits = 0
     for name in cast("list[object]", names) if isinstance(names, list) else [names]:

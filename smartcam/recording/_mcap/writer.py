@@ -94,7 +94,8 @@ class McapWriter:
             at: time of the message, nanoseconds since 1970, UTC.
             data: bytes of the message.
             sequence: the channel's own count.
-            packs: whether it is worth packing; a chunk with a message that is not stays as it is.
+            packs: whether the message is worth packing; a chunk with a message that is not stays as
+                it is.
         """
         self._packs = self._packs and packs
         places = self._places.get(channel)

@@ -17,7 +17,7 @@ def frame_of_image(camera: str, image: bytes, result: Result[Any] | None) -> Fra
     """Return the frame of a bitmap: it was taken before now, and behind its result's trigger.
 
     Raises:
-        FrameFormatError: it is no bitmap.
+        FrameFormatError: the file is no bitmap.
     """
     pixels = read_bitmap(image)
     height, width = pixels.shape[:2]

@@ -132,7 +132,8 @@ def check_readable(frame: Frame) -> None:
     """See that what is written of a frame can be read again.
 
     Raises:
-        FrameFormatError: it cannot be, and the recording would end there for those who read it.
+        FrameFormatError: the message cannot be, and the recording would end there for those who
+            read it.
     """
     said, form = "", find_format(frame.format.name)
     if not (1 <= frame.width <= MAX_SIDE_PX and 1 <= frame.height <= MAX_SIDE_PX):
@@ -158,7 +159,7 @@ def picture_message(picture: RecordedPicture) -> bytes:
     """Return the message of a picture.
 
     Raises:
-        FrameFormatError: it could not be read again.
+        FrameFormatError: the message could not be read again.
     """
     check_readable(picture.frame)
     frame, received = picture.frame, picture.result_received_at
@@ -279,7 +280,7 @@ def picture_of(schema: str, data: memoryview) -> RecordedPicture:
     """Return the picture of a message; its pixels are a view of ``data``.
 
     Raises:
-        ValueError: it is not valid, or has not what its format asks for.
+        ValueError: the message is not valid, or has not what its format asks for.
     """
     values = _values(schema, data)
     said = _Values(values)

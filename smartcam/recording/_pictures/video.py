@@ -67,7 +67,7 @@ class VideoFile:
         """See whether the video can hold a picture.
 
         Raises:
-            ConfigurationError: it is another camera's.
+            ConfigurationError: the video is another camera's.
             FrameFormatError: something of it would be lost.
         """
         if not self._camera:

@@ -135,7 +135,7 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
     """Work out what each line got: what came behind it, or what names it as its question.
 
     Raises:
-        RecordingError: it is more than :data:`MAX_REPLAY`.
+        RecordingError: the recording is more than :data:`MAX_REPLAY`.
     """
     plan = LinesPlan()
     now, place, size = _AskedLine(0.0, pieces=plan.greeting), 0, 0

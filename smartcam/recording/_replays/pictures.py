@@ -143,7 +143,7 @@ class _ResultPictures(FrameDriver):
         """Return the format of the first picture.
 
         Raises:
-            FrameSourceError: there is none.
+            FrameSourceError: there is no picture.
         """
         first = self._pictures.first
         if first is None:

@@ -83,7 +83,7 @@ def compressed_depth_fields(
     Args:
         depth: (H, W), metres; 0: none.
         header: header of the message.
-        encoding: as of :func:`depth_fields`.
+        encoding: as for :func:`depth_fields`.
     """
     a = b = 0.0
     there = depth > 0
@@ -195,7 +195,8 @@ def cloud_from(message: Any) -> CloudPoints:
     """Return the points of a ``sensor_msgs/PointCloud2``, row by row; those with NaN are left out.
 
     Raises:
-        RosMessageError: it has no x, y and z, they are no floats, or there are too few bytes.
+        RosMessageError: the cloud has no x, y and z, they are no floats, or there are too few
+            bytes.
     """
     fields = {field.name: field for field in message.fields}
     if missing := [name for name in "xyz" if name not in fields]:

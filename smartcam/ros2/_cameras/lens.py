@@ -27,7 +27,7 @@ def as_path(url: str) -> Path | None:
     """Return the file of ``camera_info_url``: ``file:///path``, or a path; "" means no file.
 
     Raises:
-        ConfigurationError: it is of another scheme.
+        ConfigurationError: the URL is of another scheme.
     """
     if not url:
         return None

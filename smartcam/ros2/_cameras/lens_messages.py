@@ -56,7 +56,7 @@ def lens_from(message: Any) -> CameraInfo | None:
         None where it was not calibrated.
 
     Raises:
-        RosMessageError: it is of a model that smartcam does not have, binned or of a region.
+        RosMessageError: the lens is of a model that smartcam does not have, binned or of a region.
         CalibrationError: its matrix or coefficients are no lens.
     """
     if not message.k[0]:

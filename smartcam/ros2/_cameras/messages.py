@@ -103,7 +103,7 @@ class ResultMessages:
         """Return the frame of a result's poses.
 
         Raises:
-            RosMessageError: they are in several.
+            RosMessageError: the poses are in several.
         """
         found = localizations_of(result.value)
         frames = {one.pose.header.frame_id for one in found or ()}
@@ -137,7 +137,7 @@ class ResultMessages:
         """Return the ``PoseArray`` of a result.
 
         Raises:
-            RosMessageError: they are in several frames.
+            RosMessageError: the poses are in several frames.
         """
         header = self.header(result.received_at, self.frame_of(result))
         return self._cls.PoseArray(header, [self._pose(one) for one in parts])
@@ -149,7 +149,7 @@ class ResultMessages:
         covariances are 0, which says that they are not known.
 
         Raises:
-            RosMessageError: they are in several frames.
+            RosMessageError: the poses are in several frames.
         """
         cls = self._cls
         header = self.header(result.received_at, self.frame_of(result))

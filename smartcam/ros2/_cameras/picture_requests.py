@@ -33,7 +33,7 @@ async def one_frame(
     """Return a picture: the first that is exposed after this, or the last one of the camera.
 
     Raises:
-        SmartCamError: there is none in time.
+        SmartCamError: there is no picture in time.
     """
     if frames is not None:
         return await frames.after(time.monotonic(), timeout=timeout)
@@ -49,7 +49,7 @@ def frame_of_file(data: bytes, source: str) -> Frame:
     """Return the frame of a file's bytes, a bitmap or a JPEG, that came just now; blocks.
 
     Raises:
-        FrameFormatError: it is neither.
+        FrameFormatError: the file is neither.
     """
     if data[:2] == b"\xff\xd8":
         width, height, _ = jpeg_header(data, source)

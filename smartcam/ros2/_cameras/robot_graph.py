@@ -84,7 +84,7 @@ class CameraGraph:
 
         Raises:
             CalibrationError: NO_PICTURE: none came in time.
-            FrameFormatError: it is no picture.
+            FrameFormatError: the message is no picture.
         """
         full = self._full(topic)
         kind = self._kind(full)
@@ -108,7 +108,8 @@ class CameraGraph:
         None where nobody says it within :data:`LENS_WAIT`, or the lens was not calibrated.
 
         Raises:
-            RosMessageError, CalibrationError: it is no lens, or one that smartcam has no model of.
+            RosMessageError, CalibrationError: the message is no lens, or one that smartcam has no
+                model of.
         """
         beside = f"{self._full(topic).removesuffix('/compressed').rpartition('/')[0]}/camera_info"
         heard = self._node.subscribe(beside, CAMERA_INFO, qos=QoS(reliable=False, depth=1))

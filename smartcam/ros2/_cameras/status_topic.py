@@ -53,7 +53,7 @@ class CameraStatusTopic:
         return "" if full == f"{self._node.full_name}/status" else full
 
     def publish_on(self, topic: str) -> None:
-        """Publish on a topic, instead of the one that was said before; empty for none.
+        """Publish on a topic in place of the one before; empty for none.
 
         Raises:
             ConfigurationError: the topic is not valid.

@@ -106,7 +106,7 @@ class RosThesisFace:
         self._status.resolve(topic)
 
     def publish_status(self, topic: str) -> dict[str, Any]:
-        """Publish the status on this topic, and on none that was said before."""
+        """Publish the status on this topic, and no longer on the one before."""
         self._status.publish_on(topic)
         return {}
 
@@ -205,7 +205,7 @@ class ThesisServices:
         """See that a request is meant for this camera.
 
         Raises:
-            ConfigurationError: it names another one.
+            ConfigurationError: the request names another camera.
         """
         camera, node = self._face.name, self._node
         known = {camera, node.full_name, node.name}

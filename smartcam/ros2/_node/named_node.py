@@ -20,7 +20,7 @@ class NamedNode(Server):
         namespace: namespace of the node, such as ``/line1``.
 
     Raises:
-        ConfigurationError: one of the names is not valid.
+        ConfigurationError: one of the two names of the names is not valid.
     """
 
     def __init__(self, name: str, namespace: str) -> None:

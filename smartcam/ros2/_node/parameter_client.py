@@ -58,7 +58,7 @@ class ParameterClient:
         """Return values by their names; arrays are tuples, None is not set.
 
         Raises:
-            ServiceCallError: one of them is not declared there.
+            ServiceCallError: one of the parameters is not declared there.
         """
         reply = await self._call("get_parameters", "GetParameters", names=names)
         self._check("get_parameters", names, reply.values)
@@ -69,7 +69,7 @@ class ParameterClient:
         """Return the descriptions of parameters by their names.
 
         Raises:
-            ServiceCallError: one of them is not declared there.
+            ServiceCallError: one of the parameters is not declared there.
         """
         reply = await self._call("describe_parameters", "DescribeParameters", names=names)
         self._check("describe_parameters", names, reply.descriptors)

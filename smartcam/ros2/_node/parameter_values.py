@@ -67,7 +67,7 @@ class ParameterDescription:
         """Look whether a number of its type is in the range.
 
         Raises:
-            ConfigurationError: it is not.
+            ConfigurationError: the number is not.
         """
         if not isinstance(value, int | float) or self.minimum is None or self.maximum is None:
             return
@@ -181,7 +181,7 @@ def type_name(number: int) -> str:
     """Return a type's name.
 
     Raises:
-        RosMessageError: there is none of this number.
+        RosMessageError: there is no type of this number.
     """
     if not 0 <= number < len(TYPES):
         raise RosMessageError(
@@ -214,7 +214,7 @@ def typed(name: str, given: object, declared: int = NOT_SET) -> Typed:
         declared: the type of a list without elements.
 
     Raises:
-        ConfigurationError: it can be no parameter.
+        ConfigurationError: the value can be no parameter.
     """
     if isinstance(given, Typed):
         return given

@@ -49,7 +49,7 @@ class _Declared:
         """Return a value as it would be kept.
 
         Raises:
-            ConfigurationError: it is of another type, or out of range, or nobody can set it.
+            ConfigurationError: the value is of another type, or out of range, or nobody can set it.
         """
         name = self.description.name
         if self.description.read_only and not by_node:
@@ -147,12 +147,13 @@ class RosParameters:
             minimum: least value of a number.
             maximum: greatest value of a number.
             step: step of a number, from ``minimum`` on.
-            on_set: is called, and awaited, with a new value before it counts; a
+            on_set: function that is called, and awaited, with a new value before it counts; a
                 :class:`~smartcam.SmartCamError` of it refuses the value, with its text.
             type: name of the type, such as ``string_array``, for a list without elements.
 
         Raises:
-            ConfigurationError: it is declared, or value, name, type or range is not valid.
+            ConfigurationError: the parameter is declared, or value, name, type or range is not
+                valid.
         """
         if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
             raise ConfigurationError(f"parameter {name!r:.80}: expected a name in printable text")
@@ -179,7 +180,7 @@ class RosParameters:
         """Remove a parameter.
 
         Raises:
-            ConfigurationError: there is none of this name.
+            ConfigurationError: there is no parameter of this name.
         """
         gone = self._of(name)
         del self._declared[name]
@@ -193,7 +194,7 @@ class RosParameters:
         """Return a value; arrays are tuples.
 
         Raises:
-            ConfigurationError: there is none of this name.
+            ConfigurationError: there is no parameter of this name.
         """
         return self._of(name).value.value
 
@@ -237,7 +238,7 @@ class RosParameters:
         """Set one, as other nodes do.
 
         Raises:
-            ConfigurationError: there is none of this name, or the value is not valid.
+            ConfigurationError: there is no parameter of this name, or the value is not valid.
             RosError: its ``on_set`` failed, or sets before it took too long.
             SmartCamError: whatever its ``on_set`` raised to refuse it.
 
@@ -249,7 +250,7 @@ class RosParameters:
         """Set several at once, or none of them: what failed half way is taken back.
 
         Raises:
-            ConfigurationError: there is none of a name, or a value is not valid.
+            ConfigurationError: there is no parameter of a name, or a value is not valid.
             RosError: an ``on_set`` failed, or sets before it took too long.
             SmartCamError: whatever an ``on_set`` raised to refuse it.
 
@@ -317,8 +318,8 @@ class RosParameters:
         """Have a hook carry a value out.
 
         Raises:
-            RosError: it failed, or took too long.
-            SmartCamError: it refuses.
+            RosError: the hook failed, or took too long.
+            SmartCamError: the hook refuses.
         """
         if declared.on_set is None:
             return

@@ -97,7 +97,7 @@ class QoS:
 
 
 DEFAULT = QoS()
-"""Quality of ROS 2 where nothing is said: reliable, the last ten messages."""
+"""Quality of ROS 2 where none is given: reliable, the last ten messages."""
 
 DRIVER = QoS(depth=5)
 """Quality of drivers (REP-2003): reliable, the last five messages; consumers take SENSOR_DATA."""

@@ -279,7 +279,7 @@ class RosClient(RosEnd):
             **fields: the fields, where no request is given.
 
         Raises:
-            RosMessageError: it is no request of the type; or the reply cannot be read.
+            RosMessageError: the value is no request of the type; or the reply cannot be read.
             ServiceTimeoutError: nobody serves it, or no reply came in time.
             ServiceCallError: who serves it refused, or went away.
 

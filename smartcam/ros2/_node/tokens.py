@@ -98,7 +98,7 @@ class Entity:
         """Read a token.
 
         Raises:
-            ValueError: it is not valid, with what was expected.
+            ValueError: the token is not valid, with what was expected.
         """
         parts = token.split("/")
         wanted = _NODE_PARTS if parts[5:6] == [NODE] else _ENDPOINT_PARTS

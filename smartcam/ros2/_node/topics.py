@@ -185,7 +185,7 @@ class RosPublisher(RosEnd):
             **fields: the fields, where no message is given.
 
         Raises:
-            RosMessageError: it is no message of the type.
+            RosMessageError: the value is no message of the type.
             RosError: the publisher is closed.
         """
         self.publish_encoded(self.type.encode(said(message, fields)))
@@ -223,7 +223,7 @@ class RosPublisher(RosEnd):
         that is old. It returns when the engine has copied the message; a thread encodes it.
 
         Raises:
-            RosMessageError: it is no message of the type.
+            RosMessageError: the value is no message of the type.
             RosError: the publisher is closed.
 
         Cancellation: the message is published or not.

@@ -82,7 +82,7 @@ def describe(types: RosTypes, name: str) -> Any:
     """Return a ``type_description_interfaces/msg/TypeDescription`` of a message or a service.
 
     Raises:
-        ConfigurationError: it is not known.
+        ConfigurationError: the type is not known.
     """
     definition = service_of(name) if "/srv/" in name else types.definition(name)
     kind = types.message("type_description_interfaces/msg/TypeDescription")

@@ -38,7 +38,7 @@ class MessageField(NamedTuple):
         type: a basic type, or a message's full name.
         limit: the most bytes of a string; 0 is any.
         size: 0 is any for a sequence.
-        default: what it is when nothing is said; None is zero.
+        default: value where none is given; None is zero.
     """
 
     name: str
@@ -115,7 +115,7 @@ def split_name(name: str, kind: str = "") -> tuple[str, str, str]:
     """Return package, kind and name of a type.
 
     Raises:
-        ConfigurationError: it is no name of a type, or not of this kind.
+        ConfigurationError: the text is no name of a type, or not of this kind.
     """
     matched = NAME.fullmatch(name) if isinstance(name, str) else None
     if matched is None or kind not in ("", matched[2]):

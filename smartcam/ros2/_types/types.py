@@ -139,7 +139,7 @@ class MessageType:
         """Return a message, or a mapping of its fields, in CDR: little-endian, with encapsulation.
 
         Raises:
-            RosMessageError: it is of another type, or a field does not fit.
+            RosMessageError: the value is of another type, or a field does not fit.
         """
         if isinstance(message, Mapping):
             message = self._filled(message)
@@ -285,7 +285,7 @@ class RosTypes:
         """Return a type of message, such as ``std_msgs/msg/String``.
 
         Raises:
-            ConfigurationError: there is none of this name, or one within it is not known.
+            ConfigurationError: there is no message of this name, or one within it is not known.
         """
         if (made := self._messages.get(name)) is not None:
             return made
@@ -296,7 +296,8 @@ class RosTypes:
         """Return a type of service, such as ``std_srvs/srv/Trigger``.
 
         Raises:
-            ConfigurationError: there is none of this name, or a message within it is not known.
+            ConfigurationError: there is no service of this name, or a message within it is not
+                known.
         """
         if (made := self._services.get(name)) is not None:
             return made
@@ -341,7 +342,7 @@ class RosTypes:
         """Return the fields of a message.
 
         Raises:
-            ConfigurationError: it is not known.
+            ConfigurationError: the message is not known.
         """
         made = self._definitions.get(name)
         if made is None:

@@ -115,7 +115,7 @@ def zero_maker(kind: MessageType) -> Callable[[], RosMessage]:
 
 
 def _zero(kind: MessageType, field: MessageField) -> Callable[[], Any]:
-    """Return the function that makes what a field is when nothing is said."""
+    """Return the function that makes a field's value where none is given."""
     if field.shape:
         return _zeros(kind, field)
     if field.nested:
@@ -125,7 +125,7 @@ def _zero(kind: MessageType, field: MessageField) -> Callable[[], Any]:
 
 
 def _zeros(kind: MessageType, field: MessageField) -> Callable[[], Any]:
-    """Return the function that makes what a field of many is when nothing is said."""
+    """Return the function that makes the value of a field of many where none is given."""
     count = field.size if field.shape == "array" else 0
     if field.type in NUMBERS:
         dtype = np.dtype(f"={NUMBERS[field.type]}")

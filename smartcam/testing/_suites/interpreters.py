@@ -123,7 +123,7 @@ class InterpreterSuite(SaysWhatWasExpected):
         """Return a new interpreter, with what a user would write behind its name.
 
         Raises:
-            ConfigurationError: it takes no layout, needs one, or not this one.
+            ConfigurationError: the interpreter takes no layout, needs one, or not this one.
         """
         spec = type(self).spec  # of an object a function would be a method
         if layout is None:
@@ -328,7 +328,7 @@ def see(interpreter: Interpreter, data: bytes, **context: Any) -> None:
     """See that bytes give a value without nonsense, or the right kind of error.
 
     Raises:
-        AssertionError: they do not.
+        AssertionError: the bytes do not.
     """
     where = f"{len(data)} bytes {data[:64]!r}, {context}"
     try:
@@ -348,7 +348,7 @@ def see_error(error: InterpretationError, data: bytes) -> None:
     """See that an error says what was expected where, in a few words, and survives pickle.
 
     Raises:
-        AssertionError: it does not.
+        AssertionError: the error does not.
     """
     where = f"{len(data)} bytes {data[:64]!r}: {error!r:.300}"
     assert str(error), f"{where}: it says nothing"

@@ -108,7 +108,7 @@ class LinkProxy:
         """Wait until something stands in the log ``count`` times, counted from the beginning.
 
         Raises:
-            TimeoutError: it did not in ``timeout`` seconds.
+            TimeoutError: the entry did not in ``timeout`` seconds.
 
         Cancellation: safe.
         """
@@ -118,7 +118,7 @@ class LinkProxy:
         """Wait until the proxy sent ``amount`` bytes, or datagrams, in a direction.
 
         Raises:
-            TimeoutError: it did not in ``timeout`` seconds.
+            TimeoutError: the proxy did not in ``timeout`` seconds.
 
         Cancellation: safe.
         """

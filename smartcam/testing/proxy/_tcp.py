@@ -83,7 +83,7 @@ class ProxiedConnection(Proxied):
         self.reset()
 
     def carried(self, direction: Direction) -> None:
-        """Take that bytes went in a direction."""
+        """Note that bytes went in a direction."""
         self._carried.add(direction)
 
     def lost(self, direction: Direction, at: int) -> None:

@@ -27,7 +27,7 @@ class AccessUnit(NamedTuple):
         lost: packets that were lost since the last one that came whole.
         damaged: frames since then of which some packets came, but not all.
         arrived: time of arrival of its first packet; 0.0 where that is not known.
-        begins: whether it is the first one of a stream: nothing before it belongs to that.
+        begins: whether the packet is the first one of a stream: nothing before it belongs to that.
     """
 
     data: bytes

@@ -51,7 +51,7 @@ class UnitSource(Protocol):
         ...
 
     def shown(self) -> None:
-        """Take that a picture could be decoded."""
+        """Note that a picture could be decoded."""
         ...
 
 

@@ -78,7 +78,7 @@ class Depacketizer:
 
         Args:
             packet: packet of the stream.
-            now: when it arrived.
+            now: when the packet arrived.
         """
         if packet.ssrc != self._ssrc:
             self._damage_open()

@@ -30,7 +30,7 @@ def units(access_unit: bytes) -> list[bytes]:
         access_unit: bytes as in a file (ITU-T H.264, annex B).
 
     Raises:
-        FrameFormatError: it begins with none, or has one that is not valid.
+        FrameFormatError: the frame begins with none, or has one that is not valid.
     """
     data = bytes(access_unit)
     place = data.find(b"\0\0\1")
@@ -110,7 +110,7 @@ class H264Packetizer:
             timestamp: timestamp of the frame, in ticks of 90 kHz; its lower 32 bits count.
 
         Raises:
-            FrameFormatError: it is no encoded frame; no sequence number was used.
+            FrameFormatError: the frame is no encoded frame; no sequence number was used.
         """
         payloads = [
             part for group in self._groups(units(access_unit)) for part in self._payloads(group)

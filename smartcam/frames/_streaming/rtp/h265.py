@@ -64,7 +64,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
         sps: the sequence's parameters, with the two bytes of their head.
 
     Raises:
-        FrameFormatError: they are not valid.
+        FrameFormatError: the parameters are not valid.
     """
     return checked_size("H265", sps, lambda: _size(FieldBits(sps[2:257])))
 

@@ -57,7 +57,7 @@ class RtpPacket(NamedTuple):
         """Read a datagram; CSRC, extension and padding are taken off.
 
         Raises:
-            MessageError: it is no RTP packet.
+            MessageError: the datagram is no RTP packet.
         """
         if len(data) < _HEAD.size:
             raise MessageError(f"RTP: expected 12 bytes or more, got {len(data)}", data=data)
@@ -235,8 +235,8 @@ def parse_rtcp(data: bytes) -> list[Report]:
     """Read a datagram of RTCP; kinds of packets that we have no use for are left out.
 
     Raises:
-        MessageError: it is not valid: a length or count that does not fit, or not a report at
-            first.
+        MessageError: the datagram is not valid: a length or count that does not fit, or not a
+            report at first.
     """
     found: list[Report] = []
     place = 0

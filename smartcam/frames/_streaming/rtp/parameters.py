@@ -56,7 +56,7 @@ def picture_size(sps: bytes) -> tuple[int, int]:
             :func:`~smartcam.frames._streaming.rtp.h264.parameter_sets`.
 
     Raises:
-        FrameFormatError: they are not valid.
+        FrameFormatError: the parameters are not valid.
     """
     return checked_size("H264", sps, lambda: _size(FieldBits(sps[1:256])))
 
@@ -65,7 +65,7 @@ def checked_size(codec: str, sps: bytes, read: Callable[[], tuple[int, int]]) ->
     """Return a size read from parameters.
 
     Raises:
-        FrameFormatError: they are not valid.
+        FrameFormatError: the parameters are not valid.
     """
     try:
         width, height = read()

@@ -203,7 +203,7 @@ class StreamReceiver:
             self._say(wire.PictureLost(self._ssrc, self._reception.ssrc))
 
     def shown(self) -> None:
-        """Take that a picture of the stream could be decoded."""
+        """Note that a picture of the stream could be decoded."""
         self._shown_at = self._loop.time()
 
     # what comes

@@ -156,7 +156,7 @@ class RtpSender:
         The parameter sets stand in it from the first frame on; they are in the stream, too.
 
         Raises:
-            LocalProtocolError: it was not entered.
+            LocalProtocolError: the sender was not entered.
         """
         if self._endpoint is None:
             raise LocalProtocolError("RtpSender: not open: use `async with`")
@@ -187,7 +187,7 @@ class RtpSender:
 
         Raises:
             FrameSourceError: there is no such host, or no port is free.
-            LocalProtocolError: it was entered before, or the source is not open.
+            LocalProtocolError: the sender was entered before, or the source is not open.
 
         Cancellation: nothing is sent, nothing stays open.
         """
@@ -244,7 +244,7 @@ class RtpSender:
 
         Raises:
             FrameSourceError: what the source ended with, or its frames cannot be encoded.
-            LocalProtocolError: it was not entered.
+            LocalProtocolError: the sender was not entered.
 
         Cancellation: safe; it goes on sending.
         """

@@ -79,7 +79,7 @@ def host_and_port(text: str) -> tuple[str, int]:
     """Read ``HOST:PORT`` or ``[HOST]:PORT``.
 
     Raises:
-        ConfigurationError: it is something else.
+        ConfigurationError: the text is something else.
     """
     host, colon, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")

@@ -33,7 +33,7 @@ def target_of(url: str) -> RtspTarget:
     """Read a request's URL.
 
     Raises:
-        RtspError: it is none of RTSP's.
+        RtspError: the URL is not one of RTSP.
     """
     try:
         parts = urlsplit(url)

@@ -34,7 +34,7 @@ class Authentication:
         basic: whether the password may come as it is, for clients that know no Digest.
 
     Raises:
-        ConfigurationError: one of the two only, or characters that cannot be said.
+        ConfigurationError: only one of the two is given, or has characters that cannot be sent.
     """
 
     def __init__(self, user: str | None, password: str | None, *, basic: bool = False) -> None:
@@ -96,7 +96,7 @@ class PasswordGate:
         """Let a request pass.
 
         Raises:
-            RtspError: it is nobody's who may look; the last one is fatal.
+            RtspError: the user may not look; the last error is fatal.
         """
         if not self._authentication.wanted or self._authentication.accepts(request, self._nonce):
             return

@@ -62,11 +62,11 @@ class ConnectionOwner(Protocol):
         ...
 
     def served(self, connection: RtspConnection) -> None:
-        """Take that one was served: it is the last that makes room."""
+        """Note that one was served: it is the last that makes room."""
         ...
 
     def unseated(self, connection: RtspConnection) -> None:
-        """Take that one has no session any more."""
+        """Note that one has no session any more."""
         ...
 
     def stream(self, name: str) -> RtspStream:

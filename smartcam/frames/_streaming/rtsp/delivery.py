@@ -181,7 +181,7 @@ def port_pair(host: str, family: socket.AddressFamily) -> tuple[socket.socket, s
     """Return two sockets on an even port and the next one.
 
     Raises:
-        OSError: there is none.
+        OSError: there is no pair of free ports.
     """
     for _ in range(PAIRS):
         first = _bound(host, 0, family)

@@ -118,7 +118,7 @@ class RequestParser:
         """Return the next whole message; None: it is not there yet.
 
         Raises:
-            RtspError: they can be no request; the error is fatal.
+            RtspError: the bytes can be no request; the error is fatal.
         """
         while self._start is None:
             if self._data[:1] == b"$":
@@ -209,7 +209,7 @@ def cseq_of(request: RtspRequest) -> str:
     """Return the number of a request, which its answer repeats.
 
     Raises:
-        RtspError: it has none.
+        RtspError: the request has none.
     """
     cseq = request.headers.get("cseq", "")
     if not _is_number(cseq):

@@ -32,7 +32,7 @@ class UnitCutter:
         """Return a frame's packets: the second byte of the head of each, and its payload.
 
         Raises:
-            FrameFormatError: it is no encoded frame.
+            FrameFormatError: the frame is no encoded frame.
         """
         if unit is not self._unit:
             packets = self._packetizer.packets(bytes(unit.data), 0)

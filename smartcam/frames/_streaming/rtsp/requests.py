@@ -44,7 +44,7 @@ async def answer_to(connection: RtspConnection, request: RtspRequest) -> RtspAns
     """Do what a request asks for.
 
     Raises:
-        RtspError: it is answered with that.
+        RtspError: the request is answered with that.
     """
     method = request.method
     if method not in METHODS:
@@ -170,7 +170,7 @@ async def _teardown(connection: RtspConnection, request: RtspRequest) -> RtspAns
 
 
 async def _parameter(connection: RtspConnection, request: RtspRequest) -> RtspAnswer:
-    """Take that the client is there, which is what it is for; we have no parameters."""
+    """Note that the client is there, which is what it is for; we have no parameters."""
     if request.url != "*":
         target_of(request.url)
     headers: tuple[tuple[str, str], ...] = ()

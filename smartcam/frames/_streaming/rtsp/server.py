@@ -144,7 +144,7 @@ class RtspServer(Server):
         """Open the port; does nothing if it is started already.
 
         Raises:
-            ConfigurationError: it cannot listen there, or a number is out of its range.
+            ConfigurationError: the server cannot listen there, or a number is out of its range.
             MissingExtraError: the extra ``video`` is not installed.
 
         Cancellation: leaves it stopped.

@@ -89,11 +89,11 @@ class RtspServing:
         self._acceptor.leave(connection)
 
     def served(self, connection: RtspConnection) -> None:
-        """Take that a connection was served: it is the last that makes room."""
+        """Note that a connection was served: it is the last that makes room."""
         self._acceptor.move_back(connection)
 
     def unseated(self, connection: RtspConnection) -> None:
-        """Take that a connection has no session any more."""
+        """Note that a connection has no session any more."""
         self._acceptor.move_back(connection)
         self._acceptor.expect(connection, IDLE_TIMEOUT, "no session")
 
@@ -101,7 +101,7 @@ class RtspServing:
         """Return a stream.
 
         Raises:
-            RtspError: there is none of that name.
+            RtspError: there is no stream of that name.
         """
         if name not in self._streams:
             raise RtspError(404, f"expected one of {', '.join(self._streams)}, got {name[:80]!r}")

@@ -121,7 +121,7 @@ class RtspConversation:
         """Have the camera play, and keep the session alive until :meth:`close`.
 
         Raises:
-            FrameSourceError: it refuses, or is silent.
+            FrameSourceError: the camera refuses, or is silent.
         """
         try:
             async with asyncio.timeout(self._plan.timeout):

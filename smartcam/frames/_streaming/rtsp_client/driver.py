@@ -96,7 +96,7 @@ class RtspDriver(FrameDriver):
 
         Raises:
             FrameFormatError: there is no video.
-            FrameSourceError: it is not there, refuses, or is silent.
+            FrameSourceError: the camera is not there, refuses, or is silent.
             MissingExtraError: the extra ``video`` is not installed.
         """
         load("av")
@@ -122,7 +122,7 @@ class RtspDriver(FrameDriver):
         """Connect anew and play.
 
         Raises:
-            FrameSourceError: it is gone, refuses, or is silent.
+            FrameSourceError: the camera is gone, refuses, or is silent.
         """
         if self._other is not None:
             await self._other.start(sink)

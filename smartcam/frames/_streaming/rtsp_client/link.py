@@ -45,7 +45,7 @@ class RtspLink(asyncio.Protocol):
 
     Attributes:
         on_packet: takes a channel and a packet.
-        on_read: is called after the packets that came together.
+        on_read: function that is called after the packets that came together.
         on_end: takes why the server ended it, once.
     """
 
@@ -69,7 +69,7 @@ class RtspLink(asyncio.Protocol):
         """Return a connection to a host and port.
 
         Raises:
-            OSError: there is none.
+            OSError: there is no connection.
         """
         loop = asyncio.get_running_loop()
         _, link = await loop.create_connection(

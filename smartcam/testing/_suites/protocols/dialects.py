@@ -305,7 +305,7 @@ def see_spelled(dialect: Dialect, sender: m.Sender, frame: Frame) -> Spelled:
     """See that a frame can be shown, in JSON as well.
 
     Raises:
-        AssertionError: it cannot.
+        AssertionError: the frame cannot.
     """
     spelled = dialect.spell(sender, frame)
     assert isinstance(spelled, Spelled), f"spell({frame}): expected a Spelled, got {spelled!r}"
@@ -319,7 +319,7 @@ def see_address(address: Address) -> None:
     """See that an address is what its own URL says.
 
     Raises:
-        AssertionError: it is not.
+        AssertionError: the address is not.
     """
     url = address.url
     read = parse_address(url)
@@ -333,7 +333,7 @@ def see_read_back(dialect: FramedDialect, kind: type[m.Message], values: Mapping
     """See that a message with these values on the wire goes through bytes unchanged.
 
     Raises:
-        AssertionError: it does not.
+        AssertionError: the message does not.
     """
     if kind is m.StatusReport:
         values = {**values, "status": dialect.status_bits.read(values["status"])}

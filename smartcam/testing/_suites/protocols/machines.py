@@ -401,7 +401,7 @@ def see_refused(player: Player, message: m.Message, where: str) -> None:
     """See that a machine refuses a message, and that nothing has changed.
 
     Raises:
-        AssertionError: it takes it, or says or tells something.
+        AssertionError: the machine takes it, or says or tells something.
     """
     machine = player.machine
     state = machine.state
