@@ -421,8 +421,6 @@ def test_calibrate_intrinsics_of_a_stretched_sheet_taken_as_exact_says_so() -> N
     assert remark.text.endswith("it is taken as exact all the same, which sheet='auto' does not")
 
 
-@pytest.mark.long
-@pytest.mark.judged
 @pytest.mark.parametrize("fixed", [(), pytest.param(("k2", "k3"), marks=pytest.mark.long)])
 def test_exact_sheet_stays_exact_even_before_a_lens_that_is_not_of_its_model(
     fixed: tuple[str, ...],
@@ -459,8 +457,6 @@ def test_adjust_shape_errors_are_those_that_the_bound_allows() -> None:
     assert np.mean(squares) == pytest.approx(9.0, abs=3.7)  # 3 sigma of the mean
 
 
-@pytest.mark.long
-@pytest.mark.judged
 def test_adjust_shape_shows_the_same_with_place_direction_and_size_as_meant() -> None:
     views = seen(LEFT, poses(8), points=OFF)
     sights = [Sight(0, number, view) for number, view in enumerate(views)]

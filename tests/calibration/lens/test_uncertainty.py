@@ -91,8 +91,6 @@ def test_shape_that_is_none_is_refused(shape: tuple[int, int]) -> None:
     assert caught.value.code == Code.SHAPE
 
 
-@pytest.mark.long
-@pytest.mark.judged
 def test_map_of_a_calibration_is_that_of_its_bound() -> None:
     poses = spread_poses(lenskit.LEFT, 25)
     found = calibrate_intrinsics(lenskit.seen(lenskit.LEFT, poses)).uncertainty(distance=0.5)

@@ -235,8 +235,6 @@ async def test_check_of_a_picture_that_does_not_fit_keeps_the_step(
     session.close()
 
 
-@pytest.mark.long
-@pytest.mark.judged
 async def test_check_of_too_many_touches_keeps_the_step(tmp_path: Path) -> None:
     saved(tmp_path, calibrated())
     bench = Bench([*GRID, *GRID, *GRID[:7]])
