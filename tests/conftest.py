@@ -135,6 +135,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         row, place = divmod(counts[test], every)
         if (row + place) % every:
             item.add_marker(pytest.mark.long)
+            item.add_marker(pytest.mark.judged)
         counts[test] += 1
 
 

@@ -37,7 +37,12 @@ def outcome(call: Any, given: dict[str, Any]) -> str:
 
 LONG, WIDEST = [pytest.mark.long], [pytest.mark.long, pytest.mark.widest]
 
-DEAR = frozenset({"calibrate_intrinsics", "calibrate_sheet", "calibrate_stereo", "fit_plane"})
+DEAR = frozenset(
+    {
+        *("CameraModel", "calibrate_intrinsics", "calibrate_sheet", "calibrate_stereo"),
+        *("fit_corners", "fit_plane", "fit_touches", "suggest_views"),
+    }
+)
 """Those that calculate for long where an odd value is one of theirs."""
 
 

@@ -66,6 +66,7 @@ async def come_in(
     return client, ""
 
 
+@pytest.mark.long
 async def test_users_come_in_encrypted_and_nobody_else(
     tmp_path: Path, identity: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

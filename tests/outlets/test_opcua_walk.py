@@ -209,6 +209,7 @@ def check_results(books: Books, heard: Heard) -> None:
     assert any(one.ResultState == 1 for one in results)
 
 
+@pytest.mark.long
 async def test_random_calls_of_clients_move_along_the_nodeset_and_mix_up_no_results(
     tmp_path: Path,
 ) -> None:

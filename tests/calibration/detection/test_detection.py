@@ -72,6 +72,7 @@ def test_find_target_of_tilted_sheet_has_each_point_where_it_is(target: Target, 
     assert (view.name, view.size, view.target) == ("one", (640, 480), target)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("target", [PLAIN, CHARUCO, DOTS], ids=repr)
 def test_find_target_covariance_is_that_of_its_errors(target: Target) -> None:
     picture = drawn(target, camera=STRAIGHT, tilt=25, roll=10, noise=4)

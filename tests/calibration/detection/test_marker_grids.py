@@ -89,6 +89,7 @@ def test_picture_that_opencv_draws_of_its_board_has_its_corners() -> None:
     assert (first[0] < middle).all()
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("grid", [APRIL, PLAIN], ids=lambda one: one.dictionary)
 def test_grid_of_which_a_part_is_hidden_has_the_rest(grid: MarkerGrid) -> None:
     picture = drawn(grid, camera=STRAIGHT, tilt=20, away=0.4)
