@@ -12,6 +12,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from hypothesis import settings
 from tests import loops
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Callable, Generator
 
 settings.register_profile("few", deadline=None, max_examples=3, derandomize=True)
 settings.register_profile("quick", deadline=None, max_examples=10, derandomize=True)
@@ -30,6 +31,11 @@ settings.register_profile("nightly", deadline=None, max_examples=2000, print_blo
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 
 ROOT = Path(__file__).parent.parent
+
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    # Tests run side by side, and their matrices are small: more threads of one test wait for each
+    # other, at the full cost of a processor. What a test starts has this, too.
+    os.environ.setdefault(threads, "1")
 
 if sys.dont_write_bytecode:
     # Where nothing is to be written beside the sources, workers and the processes that tests start
@@ -75,8 +81,18 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return 0 if few or cores == 1 else cores
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection(session: pytest.Session) -> None:
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection(session: pytest.Session) -> Generator[None, object, object]:
+    """Collect the tests without garbage collections: of what is made here hardly anything goes."""
+    gc.disable()
+    try:
+        _import_from_ones_own_place_on(session)
+        return (yield)
+    finally:
+        gc.enable()
+
+
+def _import_from_ones_own_place_on(session: pytest.Session) -> None:
     """Have each worker import the tests from another place on: they read what another compiled.
 
     Side by side from the first to the last, all would rewrite and compile each file at once.
@@ -101,6 +117,26 @@ def _test_files(path: Path) -> list[Path]:
     if not path.is_relative_to(ROOT / "tests"):
         return []
     return list(path.rglob("test_*.py")) if path.is_dir() else [path] if path.is_file() else []
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as ``long`` the cases of a ``sampled`` test that the short run leaves out.
+
+    Of each row of ``every`` cases one stays, and in the next row the one before its place: so the
+    values of the parameter that changes fastest take turns.
+    """
+    counts: Counter[tuple[Any, str]] = Counter()
+    for item in items:
+        marker = item.get_closest_marker("sampled")
+        if marker is None or item.get_closest_marker("long"):
+            continue
+        test, every = (item.parent, getattr(item, "originalname", "")), marker.kwargs["every"]
+        row, place = divmod(counts[test], every)
+        if (row + place) % every:
+            item.add_marker(pytest.mark.long)
+            item.add_marker(pytest.mark.judged)
+        counts[test] += 1
 
 
 def pytest_collection_finish() -> None:

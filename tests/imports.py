@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import gc
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 from tests import ROOT
@@ -26,7 +28,23 @@ def dotted(path: Path) -> str:
     return ".".join(parts).removesuffix(".__init__")
 
 
-SOURCES = sources("smartcam")
+@cache
+def package() -> dict[str, ast.Module]:
+    """Return the modules of smartcam, parsed once in each process that asks.
+
+    Millions of nodes, of which none goes: each garbage collection would look at all.
+    """
+    gc.collect()
+    gc.disable()
+    try:
+        found = sources("smartcam")
+        gc.freeze()
+    finally:
+        gc.enable()
+    return found
+
+
+MODULES = {dotted(path) for path in (ROOT / "smartcam").rglob("*.py")}
 
 PACKAGES = {dotted(path) for path in (ROOT / "smartcam").rglob("__init__.py")}
 
@@ -57,14 +75,33 @@ def is_door(module: str) -> bool:
     return module in PACKAGES or module.endswith("._inside")
 
 
+BLOCKS = ("body", "handlers", "orelse", "finalbody", "cases")
+"""The fields of a node in which statements stand."""
+
+
+def inner_statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the statements that stand directly in a module or in a statement."""
+    for field in BLOCKS:
+        yield from getattr(node, field, ())
+
+
+@cache
+def statements(tree: ast.Module) -> tuple[ast.AST, ...]:
+    """Return a module and all statements in it, those of functions and classes too."""
+    found: list[ast.AST] = [tree]
+    for node in found:
+        found.extend(inner_statements(node))
+    return tuple(found)
+
+
 def imports(importer: str, tree: ast.AST, *, runs: bool = True) -> Iterator[Import]:
     """Yield what a module imports from smartcam, in functions too."""
-    for node in ast.iter_child_nodes(tree):
+    for node in inner_statements(tree):
         checked_only = isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
-        if isinstance(node, ast.ImportFrom) and node.module in SOURCES:
+        if isinstance(node, ast.ImportFrom) and node.module in MODULES:
             for one in node.names:
                 module = f"{node.module}.{one.name}"
-                if module in SOURCES:
+                if module in MODULES:
                     yield Import(module, None, module, runs)
                 else:
                     home = (
@@ -73,7 +110,7 @@ def imports(importer: str, tree: ast.AST, *, runs: bool = True) -> Iterator[Impo
                     yield Import(node.module, one.name, home, runs)
         elif isinstance(node, ast.Import):
             for one in node.names:
-                if one.name in SOURCES:
+                if one.name in MODULES:
                     yield Import(one.name, None, one.name, runs)
         yield from imports(importer, node, runs=runs and not checked_only)
 
@@ -87,6 +124,6 @@ def home_of(door: str, name: str) -> str:
         return door
     if door not in _homes:
         _homes[door] = {}  # of itself it imports nothing
-        found = [one for one in imports(door, SOURCES[door]) if not one.runs]
+        found = [one for one in imports(door, package()[door]) if not one.runs]
         _homes[door] = {one.name or one.module.rpartition(".")[2]: one.home for one in found}
     return _homes[door].get(name, door)

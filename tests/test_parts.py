@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from parts import CORE, PACKAGE, PARTS, Part, core_project, files_of, part_of
 from tests import ROOT
-from tests.imports import SOURCES, dotted, imports
+from tests.imports import dotted, imports, inner_statements, package
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,7 +22,7 @@ def allowed(part: str) -> set[str]:
 
 def unguarded(tree: ast.AST) -> Iterator[ast.AST]:
     """Yield a module's imports at run time but those below ``with from_part(...)``, one by one."""
-    for node in ast.iter_child_nodes(tree):
+    for node in inner_statements(tree):
         if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
             yield from unguarded(ast.Module(node.orelse, []))
             continue
@@ -40,7 +40,7 @@ def unguarded(tree: ast.AST) -> Iterator[ast.AST]:
 def test_module_imports_from_its_own_part_and_those_that_it_needs() -> None:
     found = {
         (importer, one.home)
-        for importer, tree in SOURCES.items()
+        for importer, tree in package().items()
         for node in unguarded(tree)
         for one in imports(importer, node)
         if PART_OF[one.home] not in allowed(PART_OF[importer])

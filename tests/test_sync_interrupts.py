@@ -10,6 +10,7 @@ import pytest
 from tests.sync_interrupts import CALLS, PATIENCE
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("name", [*CALLS, "open_and_close", "connect"])
 def test_ctrl_c_at_any_line_leaves_a_camera_that_works(name: str) -> None:
     done = subprocess.run(  # noqa: S603

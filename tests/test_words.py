@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import ast
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Iterator
+from functools import cache, wraps
+from typing import NamedTuple
 
 import pytest
 
 from tests import ROOT
-from tests.imports import SOURCES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from tests.imports import package, statements
 
 
 class Text(NamedTuple):
@@ -30,10 +29,16 @@ class Text(NamedTuple):
         return f"{self.module}:{self.line}: {self.text.splitlines()[0]}"
 
 
+def found_once(search: Callable[[], Iterator[Text]]) -> Callable[[], tuple[Text, ...]]:
+    """Have a search through the package be made once for all tests."""
+    return cache(wraps(search)(lambda: tuple(search())))
+
+
+@found_once
 def constants() -> Iterator[Text]:
     """Yield the text behind each assignment of a module or a class."""
-    for module, tree in SOURCES.items():
-        for owner in ast.walk(tree):
+    for module, tree in package().items():
+        for owner in statements(tree):
             if not isinstance(owner, ast.Module | ast.ClassDef):
                 continue
             for before, node in zip(owner.body, owner.body[1:], strict=False):
@@ -48,10 +53,11 @@ def text_of(node: ast.stmt) -> str:
     return found if isinstance(found, str) else ""
 
 
+@found_once
 def docstrings() -> Iterator[Text]:
     """Yield the docstring of each module, class and function."""
-    for module, tree in SOURCES.items():
-        for node in ast.walk(tree):
+    for module, tree in package().items():
+        for node in statements(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 text = ast.get_docstring(node)
                 if text:
@@ -163,8 +169,8 @@ class Named(NamedTuple):
 
 def named_constants() -> Iterator[Named]:
     """Yield each constant in capitals with its text."""
-    for module, tree in SOURCES.items():
-        for owner in ast.walk(tree):
+    for module, tree in package().items():
+        for owner in statements(tree):
             if isinstance(owner, ast.Module | ast.ClassDef):
                 for before, node in zip(owner.body, owner.body[1:], strict=False):
                     target = target_of(before)
@@ -214,8 +220,8 @@ SHOWN = ("smartcam.conformance.", "smartcam.emulator._generators")
 
 def plain_functions() -> Iterator[Text]:
     """Yield the first lines of functions without a decorator, by which others show docstrings."""
-    for module, tree in SOURCES.items():
-        for node in [] if module.startswith(SHOWN) else ast.walk(tree):
+    for module, tree in package().items():
+        for node in [] if module.startswith(SHOWN) else statements(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not node.decorator_list:
                 text = ast.get_docstring(node)
                 if text:

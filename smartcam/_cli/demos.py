@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from smartcam._cli.options import OUTPUT, Options, runs
 from smartcam._extras import from_part
+
+if TYPE_CHECKING:
+    _ParamType = click.ParamType[tuple[int, int, int]]
+else:  # click before 8.4 has no types of values there
+    _ParamType = click.ParamType
+
+
+class PalletSize(_ParamType):
+    """The size of a pallet: ``ROWSxCOLUMNSxLAYERS``."""
+
+    name = "ROWSxCOLUMNSxLAYERS"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int, int]:
+        """Return rows, columns and layers."""
+        found = re.fullmatch(r"(\d{1,3})x(\d{1,3})x(\d{1,3})", str(value))
+        rows, columns, layers = map(int, found.groups()) if found else (0, 0, 0)
+        if not (2 <= rows <= 12 and 2 <= columns <= 12 and 1 <= layers <= 10):
+            self.fail(f"expected {self.name} from 2x2x1 to 12x12x10, got {value!r}", param, ctx)
+        return rows, columns, layers
 
 
 @click.command()
@@ -15,6 +38,19 @@ from smartcam._extras import from_part
     "--pick",
     is_flag=True,
     help="Calibrate a simulated robot against the camera instead, and pick seven parts with it.",
+)
+@click.option(
+    "--plain",
+    is_flag=True,
+    help="With --pick: have a plain camera, in whose drawn pictures a taught part is located, and "
+    'put the parts onto a pallet. Needs the extra "inspection".',
+)
+@click.option(
+    "--pallet",
+    type=PalletSize(),
+    default="2x3x2",
+    show_default=True,
+    help="With --plain: rows, columns and layers of the pallet, 2x2x1 to 12x12x10.",
 )
 @click.option(
     "--fleet",
@@ -39,16 +75,15 @@ from smartcam._extras import from_part
 @click.option(
     "--folder",
     type=click.Path(file_okay=False),
-    default="demo-inspect",
-    show_default=True,
-    help="With --inspect: where the pictures and the cell file go.",
+    help="With --inspect and --plain: where pictures, cell file and models go.  [default: "
+    "demo-inspect, demo-pick]",
 )
 @click.option(
     "--picture",
     type=click.Path(dir_okay=False),
     default="pick.svg",
     show_default=True,
-    help="With --pick: where the picture of the calibration goes (SVG).",
+    help="With --pick alone: where the picture of the calibration goes (SVG).",
 )
 @click.option(
     "--seed",
@@ -60,10 +95,12 @@ from smartcam._extras import from_part
 @runs(*OUTPUT)
 async def demo(
     pick: bool,
+    plain: bool,
+    pallet: tuple[int, int, int],
     shared: bool,
     tower: bool,
     inspected: bool,
-    folder: str,
+    folder: str | None,
     picture: str,
     seed: int,
     options: Options,
@@ -73,11 +110,13 @@ async def demo(
     given = [name for name, wanted in asked.items() if wanted]
     if len(given) > 1:
         raise click.UsageError(f"{' and '.join(given)} do not go together")
+    if plain and not pick:
+        raise click.UsageError("--plain goes with --pick")
     if inspected:
         with from_part("inspection", "smartcam demo --inspect needs"):
             from smartcam._cli import demo_inspect
 
-        await demo_inspect.inspect(options, Path(folder), seed)
+        await demo_inspect.inspect(options, Path(folder or "demo-inspect"), seed)
     elif tower:
         with from_part("depth", "smartcam demo --tower needs"):
             from smartcam._cli import demo_tower
@@ -88,6 +127,12 @@ async def demo(
             from smartcam._cli import demo_fleet
 
         await demo_fleet.demo(options)
+    elif plain:
+        with from_part("inspection", "smartcam demo --plain needs"):
+            from smartcam._cli import demo_pallet
+
+        grid = demo_pallet.Grid(*pallet)
+        await demo_pallet.palletize(options, Path(folder or "demo-pick"), seed, grid)
     elif pick:
         with from_part("calibration", "smartcam demo --pick needs"):
             from smartcam._cli import demo_pick

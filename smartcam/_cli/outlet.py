@@ -50,6 +50,7 @@ async def outlet(url: str, file: str, options: Options) -> None:
         command=source.command,
         tell=source.tell,
         cameras=source.cameras,
+        names=source.names,
     )
     url = await options.located(url)
     with options.cameras(url, reconnect=Backoff()) as make:
@@ -104,6 +105,9 @@ class _OutletSource:
             task.cancel()
         if tasks:
             await asyncio.wait(tasks)
+
+    def names(self, _camera: str) -> Mapping[str, int]:
+        return {} if self.camera is None else self.camera.settings.application_names
 
     def columns(self, _camera: str, application: int) -> Any:
         from smartcam._client._inside import Interpretation

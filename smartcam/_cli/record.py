@@ -139,7 +139,7 @@ class _Plan(NamedTuple):
 
 
 def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
-    """Return the finder of each result's picture; None where the camera tells it.
+    """Return the finder of each result's picture; None if the camera tells which one it is.
 
     Raises UnsupportedError: nobody knows the pictures of the camera's results.
     """

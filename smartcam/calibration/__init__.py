@@ -64,7 +64,7 @@ if TYPE_CHECKING:
     )
     from smartcam.calibration._verdict import CalibrationVerdict
     from smartcam.calibration._views import TargetView
-    from smartcam.geometry import CameraModel, Code, PoseHistory, Remark, Transform
+    from smartcam.geometry import CameraModel, Code, PlacePattern, PoseHistory, Remark, Transform
 
 __all__ = [
     "CalibrationVerdict",
@@ -83,6 +83,7 @@ __all__ = [
     "MarkerGrid",
     "MovingCamera",
     "NextView",
+    "PlacePattern",
     "PlaneCalibration",
     "PlaneProjection",
     "PoseHistory",
@@ -151,6 +152,6 @@ if not TYPE_CHECKING:
             "target_to_data",
             "_verdict": "CalibrationVerdict",
             "_views": "TargetView",
-            "smartcam.geometry": "CameraModel Code PoseHistory Remark Transform",
+            "smartcam.geometry": "CameraModel Code PlacePattern PoseHistory Remark Transform",
         },
     )

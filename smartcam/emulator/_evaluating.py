@@ -121,13 +121,20 @@ class EvaluatingCamera(LineCamera):
         """Numbers of its applications."""
         return list(self._numbers_of_applications)
 
-    def answer_to(self, client: LineClient, line: str, unknown: str) -> str | None:
-        """Return the answer to a request of one of the forms; None where it comes later."""
+    def hear(self, client: LineClient, line: str) -> None:
+        """Answer a request of one of the forms, unless it is answered later."""
         for form, method in self.requests.items():
             found = form.fullmatch(line)
             if found is not None:
-                return method(self, client, *found.groups())
-        return unknown
+                answer = method(self, client, *found.groups())
+                if answer is not None:
+                    client.answer(answer)
+                return
+        client.answer(self.unknown(line))
+
+    def unknown(self, line: str) -> str:
+        """Return the answer to a request of none of the forms."""
+        raise NotImplementedError
 
     # ------------------------------------------------------------------ evaluations
 

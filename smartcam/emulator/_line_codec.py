@@ -105,6 +105,10 @@ class LineCodec:
         """Return the number of the row of a client's line, 0 for none."""
         return next((number for number, one in self._forms if one.read(text) is not None), 0)
 
+    def row_of_word(self, word: str) -> int:
+        """Return the number of the row of what is said under a word, 0 for none."""
+        return next((number for number, one in enumerate(self._rows, 1) if one.word == word), 0)
+
     def request_key(self, data: bytes) -> str:
         """Return the word or ticket of the answer to a line, "" where order alone tells."""
         if self._split is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from smartcam.emulator._line_camera import LineCamera, LineClient
 from smartcam.emulator._line_codec import LineCodec, LineFramer, LineServer
@@ -12,6 +12,8 @@ from smartcam.exceptions import ConfigurationError, FrameError
 from smartcam.protocols import Frame, TicketedDialect
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._line_codec import HeardLine
     from smartcam.protocols import LineRow
@@ -23,17 +25,29 @@ MAX_REQUEST = 1 << 16
 class TicketedClient(LineClient):
     """A client of an emulated camera that speaks in frames.
 
+    A subclass keeps what lasts for a session in attributes of its own, see
+    :attr:`TicketedCamera.client_class`.
+
     Attributes:
         dialect: how the client is spoken to.
         ticket: ticket of the request under way, "" where it has none.
+        number: number of its session, from 1.
+        session: the client itself; of one that :meth:`keep` has returned, the client it is of.
     """
 
     def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
         super().__init__(camera, link, server)
-        dialect = next(iter(camera.protocol.dialects.values()))
-        assert isinstance(dialect, TicketedDialect)  # noqa: S101 - as make_codec has seen to
-        self.dialect: TicketedDialect = dialect
+        self.dialect: TicketedDialect
+        self.speak(next(iter(camera.protocol.dialects)))
         self.ticket: str = ""
+        self.number: int = 0
+        self.session: TicketedClient = self
+
+    def speak(self, name: str) -> None:
+        """Go on in one of the protocol's dialects."""
+        dialect = self._camera.protocol.dialects[name]
+        assert isinstance(dialect, TicketedDialect)  # noqa: S101 - as make_codec has seen to
+        self.dialect = dialect
 
     def pack(self, text: str) -> bytes:
         """Return an answer to the request under way, with its ticket."""
@@ -135,9 +149,12 @@ class TicketedCamera(LineCamera):
 
     Attributes:
         also_hears: requests that other clients ask, beside those of the dialect.
+        client_class: class of its clients.
     """
 
     also_hears: ClassVar[tuple[LineRow, ...]] = ()
+    client_class: ClassVar[type[TicketedClient]] = TicketedClient
+    _sessions: int = 0
 
     def make_codec(self) -> LineCodec:
         """Return the frames of its protocol's first dialect.
@@ -155,7 +172,24 @@ class TicketedCamera(LineCamera):
 
     def make_client(self, link: ClientLink, server: LineServer) -> LineClient:
         """Return a new client."""
-        return TicketedClient(self, link, server)
+        client = self.client_class(self, link, server)
+        client.number = self._sessions = self._sessions + 1
+        return client
+
+    def tell(
+        self, ticket: str, content: Callable[[Any], str], to: Callable[[Any], object] = bool
+    ) -> None:
+        """Say something under a ticket of the camera's own.
+
+        Args:
+            ticket: the ticket, which a row of the dialect has as its word.
+            content: function that returns the content for a client.
+            to: function that tells whether a client gets it; default all.
+        """
+        row = self.lines.row_of_word(ticket)
+        for client in list(self._clients.values()):
+            if isinstance(client, TicketedClient) and to(client):
+                client.say_bytes(client.frame(content(client), ticket), row=row)
 
     def begun(self, client: LineClient, message: HeardLine) -> None:
         """Note the ticket of a request."""

@@ -65,6 +65,7 @@ class FleetOutlets(Server):
             command=self._command,
             tell=tell,
             cameras=self._cameras,
+            names=self._names,
         )
         self._observer = _OutletObserver(self)
         self._readings: dict[str, tuple[CameraEntry, Interpretation]] = {}
@@ -130,6 +131,10 @@ class FleetOutlets(Server):
     def _cameras(self) -> dict[str, bool | None]:
         plan = self._server.reloads.now.plan
         return {name: one.entry.emulated is not None for name, one in plan.items()}
+
+    def _names(self, camera: str) -> Mapping[str, int]:
+        planned = self._server.reloads.now.plan.get(camera)
+        return {} if planned is None else planned.entry.application_names
 
     def _columns(self, camera: str, application: int) -> Any:
         read = self.reading(camera)

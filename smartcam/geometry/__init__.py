@@ -14,9 +14,10 @@ from smartcam._lazy import lazy
 if TYPE_CHECKING:
     from smartcam.geometry._camera_model import CameraModel
     from smartcam.geometry._codes import Code, Remark
+    from smartcam.geometry._places import PlacePattern
     from smartcam.geometry._transforms import PoseHistory, Transform
 
-__all__ = ["CameraModel", "Code", "PoseHistory", "Remark", "Transform"]
+__all__ = ["CameraModel", "Code", "PlacePattern", "PoseHistory", "Remark", "Transform"]
 
 if not TYPE_CHECKING:
     __getattr__ = lazy(
@@ -24,6 +25,7 @@ if not TYPE_CHECKING:
         {
             "_camera_model": "CameraModel",
             "_codes": "Code Remark",
+            "_places": "PlacePattern",
             "_transforms": "PoseHistory Transform",
         },
     )

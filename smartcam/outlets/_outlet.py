@@ -26,6 +26,7 @@ class OutletDesk:
         command: does a command and returns what is answered; None where commands are not allowed.
         cameras: returns the names of the cameras, and whether each is emulated; None where that is
             not known.
+        names: returns the names that a camera's applications have, with their numbers.
     """
 
     def __init__(
@@ -33,10 +34,12 @@ class OutletDesk:
         columns: Callable[[str, int], Sequence[Column]],
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         cameras: Callable[[], Mapping[str, bool | None]] = dict,
+        names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
     ) -> None:
         self.columns = columns
         self.command = command
         self.cameras = cameras
+        self.names = names
 
 
 Column = tuple[str, str, str]

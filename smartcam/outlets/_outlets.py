@@ -60,6 +60,7 @@ class Outlets(Server):
         command: does a command for an outlet that takes them.
         tell: called with an outlet's name and its trouble, and with "" when that is over.
         cameras: returns the cameras' names, and whether each is emulated; None: not known.
+        names: returns the names that a camera's applications have, with their numbers.
 
     Raises:
         ConfigurationError: the section is wrong.
@@ -74,6 +75,7 @@ class Outlets(Server):
         command: Callable[[str, str, Mapping[str, Any]], Awaitable[dict[str, Any]]] | None = None,
         tell: Callable[[str, str], None] = lambda _name, _why: None,
         cameras: Callable[[], Mapping[str, bool | None]] = dict,
+        names: Callable[[str], Mapping[str, int]] = lambda _camera: {},
     ) -> None:
         check_kind(
             section, dict, "section", "a mapping of settings by the outlet's name", "Outlets"
@@ -82,11 +84,12 @@ class Outlets(Server):
         check_callable(columns, "columns", "Outlets")
         check_callable(tell, "tell", "Outlets")
         check_callable(cameras, "cameras", "Outlets")
+        check_callable(names, "names", "Outlets")
         if command is not None:
             check_callable(command, "command", "Outlets")
         for place, text in mistakes_of(section):
             raise ConfigurationError(f"{'.'.join(map(str, place))}: {text}")
-        desk = OutletDesk(columns, command, cameras)
+        desk = OutletDesk(columns, command, cameras, names)
         self._pumps: dict[str, Pump] = {}
         for name, given in section.items():
             kind = outlet_class(name, given)

@@ -188,6 +188,7 @@ def test_render_dots_have_their_areas_and_centroids(*, asymmetric: bool) -> None
             assert (near * y).sum() / near.sum() == pytest.approx(v, abs=0.05)
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(
     ("rows", "legacy"),
     [

@@ -312,6 +312,7 @@ BETWEEN = [
 ]
 
 
+@pytest.mark.sampled(every=5)
 @pytest.mark.parametrize(("dialect", "number", "word", "runs"), BETWEEN)
 async def test_sensors_inspection_between_two_words_is_never_the_triggers(
     dialect: str, number: str, word: int, runs: list[Sequence[Step]]
@@ -350,6 +351,7 @@ MAX_SAID = 6
 """Messages that a camera says of a trigger, at most."""
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("heard", range(MAX_SAID + 1))
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize(
@@ -400,6 +402,7 @@ async def test_trigger_given_up_behind_each_message_of_the_camera_leaves_the_nex
 # ---------------------------------------------------------------------- with a number
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("runs", [998, 999, 1000, 1001])
 @pytest.mark.parametrize("dialect", ["handbook", "b16"])
 async def test_thousandth_run_of_a_sensor_does_not_carry_our_next_number(
@@ -423,6 +426,7 @@ NIGHT = 1_100
 """Runs of a sensor between two triggers, at most; those of a narrow field go round once."""
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("off", [-1, 0, 1])
 @pytest.mark.parametrize("number", WIDTHS)
 async def test_sensors_run_that_carries_our_next_number_is_not_ours(number: str, off: int) -> None:

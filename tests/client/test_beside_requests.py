@@ -172,10 +172,11 @@ async def beside_each_other(made: Any, seed: int) -> tuple[Counter[str], Counter
     return triggers, others
 
 
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 10), marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", CAMERAS)
-def test_trigger_beside_any_request_has_an_outcome_of_the_list(kind: str) -> None:
+def test_trigger_beside_any_request_has_an_outcome_of_the_list(kind: str, seeds: range) -> None:
     triggers = Counter[str]()
-    for seed in range(10):
+    for seed in seeds:
         with asyncio.Runner(loop_factory=lambda: TimedLoop(turn=STEP)) as runner:
             try:
                 some, _ = runner.run(beside_each_other(CAMERAS[kind](), seed))

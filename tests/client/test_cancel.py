@@ -167,6 +167,7 @@ async def works(camera: Camera, box: EmulatedCamera) -> None:
     balance(camera.statistics())
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
 @pytest.mark.parametrize(("dialect", "name"), CALLS_IN)
 async def test_call_cancelled_at_any_step_leaves_a_camera_that_works(
@@ -182,6 +183,7 @@ async def test_call_cancelled_at_any_step_leaves_a_camera_that_works(
     pytest.fail(f"it is not over after {MAX_STEPS} steps")
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("name", CALLS)
 async def test_call_cancelled_at_any_step_leaves_a_camera_whose_state_is_known(name: str) -> None:
     for count in range(MAX_STEPS):
@@ -245,6 +247,7 @@ async def test_fence_cancelled_at_any_step_leaves_the_next_trigger_its_own_resul
                 return
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("application", [None, 3, 7])
 @pytest.mark.parametrize(
     ("dialect", "running"), [("handbook", True), ("handbook", False), ("bid", True)]

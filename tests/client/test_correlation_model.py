@@ -700,5 +700,7 @@ MACHINES: list[type[CameraAndClient]] = [
     CameraAndClientThatAnswers,
 ]
 for _machine in MACHINES:
-    _machine.TestCase.settings = settings(stateful_step_count=100)
+    _machine.TestCase.settings = settings(
+        max_examples=max(1, settings().max_examples // 2), stateful_step_count=100
+    )
     globals()[_machine.__name__.replace("CameraAndClient", "Test")] = _machine.TestCase

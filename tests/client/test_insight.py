@@ -805,6 +805,7 @@ CALLS: dict[str, Call] = {
 }
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("name", CALLS)
 async def test_cancelled_after_any_step_the_camera_goes_on(name: str) -> None:
     runs = itertools.count(1)

@@ -74,6 +74,7 @@ async def stopped_and_started(camera: Camera) -> None:
     await camera.start()
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("name", "application", "running"),
     [

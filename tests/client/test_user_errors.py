@@ -120,6 +120,7 @@ def box(rate: float | None = None) -> EmulatedCamera:
     )
 
 
+@pytest.mark.sampled(every=3)
 @ANY_ERROR
 @pytest.mark.parametrize("read_by", READ_BY.values(), ids=READ_BY)
 async def test_what_reads_a_result_raises_in_its_trigger(

@@ -227,6 +227,7 @@ async def test_bid_switch_voids_the_inspection_under_way(at_21: Rig) -> None:
 # ---------------------------------------------------------------------- lengths and ids
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize(
     ("request_", "answer"),
     [

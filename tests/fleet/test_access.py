@@ -370,6 +370,7 @@ async def test_wide_pattern_does_nothing_at_keys_that_the_role_may_not_use(ends:
     await asyncio.gather(*asking, return_exceptions=True)
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("ends", ["viewer", "operator"], indirect=True)  # others see all
 @pytest.mark.parametrize("pattern", WIDE)
 async def test_wide_pattern_brings_no_operator_what_is_for_agents(ends: Ends, pattern: str) -> None:

@@ -128,6 +128,7 @@ async def test_results_over_a_bad_bus_come_all_in_order_to_each(seed: int, secon
             await reader.end()
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("cut", [0.05, 0.5, pytest.param(3.0, marks=pytest.mark.long)])
 async def test_cut_off_for_less_than_the_history_misses_none(cut: float) -> None:
     async with sending(history=(4000, 1 << 24)) as sender, sender.plant.cameras(2) as cameras:
@@ -148,6 +149,7 @@ async def test_cut_off_for_less_than_the_history_misses_none(cut: float) -> None
             await reader.end()
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("slow", [False, True])
 async def test_cut_off_for_longer_knows_how_many_were_missed(slow: bool) -> None:
     async with sending(history=(300, 1 << 24)) as sender, sender.plant.cameras(2) as cameras:

@@ -484,6 +484,7 @@ async def judge_names(way: Face, folder: Path) -> None:
     assert tree(folder) == before
 
 
+@pytest.mark.sampled(every=3)
 @WITH_TF
 async def test_a_plane_is_calibrated_by_the_tip_in_tf(face: Any, tmp_path: Path) -> None:
     bench = Bench()
@@ -526,6 +527,7 @@ async def judge_frames(way: Face) -> None:
     assert "'moon'" in answer["error"]
 
 
+@pytest.mark.sampled(every=3)
 @WITH_TF
 async def test_a_camera_on_a_robot_is_calibrated_from_a_topic(face: Any, tmp_path: Path) -> None:
     async with asyncio.timeout(PATIENCE), face(tmp_path) as way:

@@ -249,6 +249,7 @@ def lives(name: str) -> Callable[[int], Coroutine[Any, Any, bool]]:
 LIVES = ("open", "close", "fleet open", "fleet trigger", "server start")
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("name", CALLS)
 def test_call_cancelled_at_any_step_leaves_everything_as_it_was(name: str) -> None:
     assert sweep(lambda steps: call_cancelled(name, steps), STRIDE) > 0

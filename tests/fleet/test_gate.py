@@ -214,6 +214,7 @@ async def test_cancelled_at_any_await_leaves_the_gate_open(
     await until(lambda: "c" in work.order)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("seed", range(20))
 async def test_nobody_is_between_whatever_happens(seed: int) -> None:
     """Hundreds of programs that reserve, command, give up and go: nobody is ever between."""

@@ -97,6 +97,7 @@ async def scene_of(way: object, bus: MemoryBus | None = None) -> AsyncIterator[S
             yield Scene(plant, robot, other)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("inside", ["nothing", "trigger", "start", "reserve", "caught", "late"])
 async def test_block_whose_reservation_is_lost_ends_with_an_error(

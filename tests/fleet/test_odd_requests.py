@@ -74,6 +74,7 @@ def request(fields: dict[str, Any], field: str, odd: str) -> str:
     return "{" + ", ".join([*said, f"{json.dumps(field)}: {odd}"]) + "}"
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("service", [*SERVICES, *THESIS])
 async def test_odd_fields_are_refused_and_nothing_is_sent(service: str) -> None:
     plain = service in SERVICES

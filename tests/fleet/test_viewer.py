@@ -385,6 +385,7 @@ async def test_questions_under_way_keep_no_command_out(monkeypatch: pytest.Monke
 # ---------------------------------------------------------------------- with certificates
 
 
+@pytest.mark.long
 @pytest.mark.real_time
 async def test_flood_of_a_viewer_over_tls_has_nothing_of_an_operator_refused(
     tmp_path: Path,

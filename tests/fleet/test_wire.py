@@ -188,6 +188,7 @@ def test_no_part_of_a_message_is_one(length: int) -> None:
         decode(MESSAGE[:length], "a call")
 
 
+@pytest.mark.sampled(every=5)
 @pytest.mark.parametrize("length", range(len(BATCH)))
 def test_no_part_of_runs_is_one(length: int) -> None:
     with pytest.raises(RemoteProtocolError, match=r"^a reply is broken: "):
@@ -202,6 +203,7 @@ def test_nothing_may_stand_behind() -> None:
         decode_order(ORDER + b"\0", "it")
 
 
+@pytest.mark.sampled(every=5)
 @pytest.mark.parametrize("length", range(4, len(OUTCOME)))
 def test_no_part_of_a_trigger_is_one(length: int) -> None:
     with pytest.raises(RemoteProtocolError, match=r"^a reply is broken: "):

@@ -468,12 +468,15 @@ print("ended")
 """
 
 
-async def test_program_that_ends_while_its_bus_opens_is_not_aborted() -> None:
+@pytest.mark.parametrize(
+    "steps", [range(1, 10, 4), pytest.param(range(10), marks=pytest.mark.long)]
+)
+async def test_program_that_ends_while_its_bus_opens_is_not_aborted(steps: range) -> None:
     """The engine's session comes when nobody wants it; its close once ran into Python's end."""
     place = free_place()
     listens = await ZenohEnd(BusLink(listen=(place,))).open(PATIENCE)
     try:
-        for step in range(10):
+        for step in steps:
             text = CANCELLED_WHILE_IT_OPENS.format(place=place, wait=0.003 * step)
             assert await asyncio.to_thread(printed_by, text) == "ended\n"
     finally:

@@ -195,6 +195,7 @@ def test_other_sharing_is_repeated(name: str, across: int, down: int) -> None:
         assert np.array_equal(one, wider[:HEIGHT, :WIDTH])
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(("space", "end"), [(1, "_709"), (2, ""), (5, ""), (6, ""), (9, "_2020")])
 @pytest.mark.parametrize(("told", "full"), [(0, ""), (1, ""), (2, "_full")])
 @pytest.mark.parametrize("name", ["yuv420p", "nv12", "nv21", "yuv420p10le", "p010le", "yuv411p"])
@@ -255,6 +256,7 @@ def write(path: Path, codec: str, video: Any, **options: str) -> None:
             container.mux(packet)
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(
     ("file", "codec", "name"),
     [
@@ -329,6 +331,7 @@ def from_rgb(video: Any) -> Any:
     return came.format.rgb(came.data, came.width, came.height, came.stride)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     "name", [one.name for one in PIXEL_FORMATS if isinstance(one.layout, SampleLayout)]
 )

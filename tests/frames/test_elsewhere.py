@@ -148,6 +148,7 @@ def secret(tmp_path: Path, video: bytes) -> Path:
 # ---------------------------------------------------------------------- playlists
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", PLAYLISTS)
 async def test_a_playlist_of_a_camera_is_not_followed(name: str, way: str, secret: Path) -> None:
@@ -159,6 +160,7 @@ async def test_a_playlist_of_a_camera_is_not_followed(name: str, way: str, secre
                 await opened(f"http://127.0.0.1:{port}/video.{end}#timeout=2")
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", PLAYLISTS)
 async def test_a_file_that_names_others_is_not_followed(name: str, way: str, secret: Path) -> None:

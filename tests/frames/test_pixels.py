@@ -240,6 +240,7 @@ def expected_picture(name: str, data: bytes, width: int, height: int, stride: in
     return np.array(expected_rgb(y.astype(float), u, v, name, found.depth)).transpose(1, 2, 0)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("low", [0, 16])
 @pytest.mark.parametrize("name", COLOURED)
 def test_colours_of_any_picture_are_within_a_level(name: str, low: int) -> None:
@@ -251,6 +252,7 @@ def test_colours_of_any_picture_are_within_a_level(name: str, low: int) -> None:
         assert np.abs(got - wanted).max() < 1
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.usefixtures("numpy_alone")
 @pytest.mark.parametrize("name", COLOURED)
 def test_colours_by_numpy_alone_are_the_nearest(name: str) -> None:

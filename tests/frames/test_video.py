@@ -538,6 +538,7 @@ def test_each_picture_comes_with_its_last_byte(way: str) -> None:
     assert (got, cutter.damaged) == (PICTURES, 0)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("way", PARTS)
 def test_pieces_do_not_matter(way: str) -> None:
     chance = random.Random(1)  # noqa: S311

@@ -70,6 +70,7 @@ def test_corpus_gives_no_finding(target: Target) -> None:
     run_corpus(target)
 
 
+@pytest.mark.sampled(every=2)
 @each_target
 def test_seeds_give_no_finding(target: Target) -> None:
     first = seeds(target.name)

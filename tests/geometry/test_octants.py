@@ -84,6 +84,7 @@ def check(setup: Setup, chain: Chain, random: np.random.Generator) -> None:
         np.testing.assert_allclose(normal, setup.rotation[:, 2], rtol=0, atol=1e-9)
 
 
+@pytest.mark.sampled(every=3)
 @octants
 def test_octant_three_touches_and_the_two_solvers_are_right(octant: tuple[int, int, int]) -> None:
     random = np.random.default_rng(1)
@@ -94,6 +95,7 @@ def test_octant_three_touches_and_the_two_solvers_are_right(octant: tuple[int, i
         check(setup, Chain([camera, RealWorldPosition.from_touches(o, a, b)]), random)
 
 
+@pytest.mark.sampled(every=3)
 @octants
 def test_octant_fitted_plane_as_a_chain_is_right(octant: tuple[int, int, int]) -> None:
     random = np.random.default_rng(2)

@@ -211,6 +211,7 @@ def limited(least: float, most: float, bits: int = 8, noise: float = 0.3) -> Any
     return np.rint(step * levels.clip(16, 235)).astype(kind)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize(
     ("least", "most", "end"),
@@ -344,6 +345,7 @@ def exact_pair() -> tuple[FoundPoint, FoundPoint]:
     )
 
 
+@pytest.mark.long
 def test_sigma_of_a_width_in_millimetres_has_the_calibrations_own_error() -> None:
     true = width(*exact_pair(), plane_of(plane(0, 1e-9)))
     errors, sigmas = [], []

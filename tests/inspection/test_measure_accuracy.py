@@ -20,6 +20,7 @@ SLOW = [
 ]
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(
     "case",
     [*SHORT, *(pytest.param(one, marks=pytest.mark.long) for one in SLOW)],

@@ -93,6 +93,7 @@ def test_edge_beside_any_level_that_cuts_off_is_refused_unless_it_is_allowed(
     find_point(picture, STRIP, replace(settings, cut_off=True), "single")
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("noise", [0.0, 0.2, 0.5, 1.0, 2.0, 4.0])
 def test_level_that_does_not_cut_off_is_none_that_does(noise: float) -> None:
     for seed in range(20):

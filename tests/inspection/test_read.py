@@ -234,6 +234,7 @@ def test_each_rung_says_where_its_pixels_are(rung: object) -> None:
     assert math.dist(centre, (100, 30)) < 1.0
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("kind", ["EAN13", "PDF417"])
 def test_weak_kind_counts_only_if_a_second_reading_is_the_same(
     monkeypatch: pytest.MonkeyPatch, kind: str
@@ -273,6 +274,7 @@ def test_no_rung_begins_after_the_time_is_over() -> None:
     assert tool.read(picture(px=6, dots=0.7), (0, 0)) == []
 
 
+@pytest.mark.long
 def test_ladder_reads_drawn_codes_that_zxing_cpp_alone_misses_and_none_wrong() -> None:
     names = ["1.5 px a module", "4 px, noise 40", "6 px, dots of 70 %", "4 px, contrast 18"]
     count, wrong = codes.drawn(1, looks={name: codes.LOOKS[name] for name in names})

@@ -99,6 +99,7 @@ async def storm(camera: smartcam.Camera[Any], emulator: Any, chance: random.Rand
     return came
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", CAMERAS)
 @pytest.mark.asyncio
@@ -117,6 +118,7 @@ async def test_no_trigger_gets_the_result_of_a_run_from_before_it(name: str, see
         assert account.triggered >= came
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("name", CAMERAS)
 @pytest.mark.asyncio
 async def test_cancelling_at_any_step_leaves_the_next_trigger_its_own_result(name: str) -> None:

@@ -48,6 +48,7 @@ async def cell(
     folder: Path,
     emulator: Mapping[str, Any] | None = None,
     specs: Mapping[int, str] | None = None,
+    names: Mapping[str, int] | None = None,
     **more: Any,
 ) -> AsyncIterator[Cell]:
     """Have an emulated camera, its client and an outlet, as ``smartcam outlet`` has them."""
@@ -77,6 +78,7 @@ async def cell(
             ),
             command=command,
             cameras=lambda: {"line1/cam1": True},
+            names=lambda _camera: dict(names or {}),
         )
         async with outlets:
             tasks = [

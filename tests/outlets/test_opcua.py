@@ -65,7 +65,7 @@ async def test_a_job_gives_its_result_as_structures_events_and_plain_variables(
     tmp_path: Path,
 ) -> None:
     async with ready(tmp_path, recipes={"housing": 1}) as (_, client):
-        heard = await client.hear(1024, 1018, 1013, 1023)
+        heard = await client.hear(1024, 1018, 1013, 1023, 1025)
         job = await client.start_job("m-1", "p-1", "housing")
         await until(lambda: bool(heard.of(1023)))
         (told,) = heard.of(1024)
@@ -99,7 +99,8 @@ async def test_a_job_gives_its_result_as_structures_events_and_plain_variables(
         assert await client.node("Plain.App1.count").read_value() == 1
         assert await client.node("Plain.App1.x").read_value() == pytest.approx(0.0125)
         order = [one.EventType.Identifier for one in heard.events]
-        assert order == [1013, 1018, 1024, 1023, 1018]
+        assert order == [1013, 1018, 1025, 1024, 1023, 1018]
+        assert heard.of(1025)[0].JobId.Id == job
         for told in heard.of(1018):
             assert all(vars(told)[f"{one}/Id"] for one in ("FromState", "ToState", "Transition"))
 
@@ -138,7 +139,8 @@ async def test_clients_without_structures_and_clients_that_only_call_do_the_same
 
 
 async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path: Path) -> None:
-    async with ready(tmp_path, recipes={"housing": 1, "free": 3}) as (there, client):
+    own = {"free": 3, "housing": 3, "lid": 1}  # of the camera: the settings' names win
+    async with ready(tmp_path, names=own, recipes={"housing": 1}) as (there, client):
         heard = await client.hear(1018, 1022)
         prepare, none = "RecipeManagement.PrepareRecipe", None
         internal, _, error = await client.call(prepare, "free", none)

@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("asyncua")
 
 from asyncua import Client, ua
+from asyncua.common.utils import ServiceError
 from asyncua.crypto.cert_gen import (
     dump_private_key_as_pem,
     generate_private_key,
@@ -24,6 +25,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from smartcam.exceptions import ConfigurationError
 from smartcam.fleet import FleetServer, load_fleet
 from smartcam.fleet._inside import FleetOutlets
+from smartcam.outlets import Outlets
 from tests.outlets.opcuakit import Plc, cell, free_port, plc
 from tests.outlets.outletkit import until
 
@@ -46,10 +48,35 @@ def identity(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def user_files(folder: Path, name: str, days: int = 10) -> Path:
+    """Make a user's certificate and key in a folder, and return the folder."""
+    folder.mkdir()
+    key = generate_private_key()
+    made = generate_self_signed_app_certificate(
+        key, name, {}, [], [ExtendedKeyUsageOID.CLIENT_AUTH], days=days
+    )
+    (folder / "key.pem").write_bytes(dump_private_key_as_pem(key))
+    (folder / "user.der").write_bytes(made.public_bytes(Encoding.DER))
+    (folder / "user.pem").write_bytes(made.public_bytes(Encoding.PEM))
+    return folder
+
+
 async def come_in(
-    url: str, identity: Path | None, user: str = "", password: str = ""
+    url: str,
+    identity: Path | None,
+    user: str = "",
+    password: str = "",
+    certificate: tuple[Path, Path] | None = None,
 ) -> tuple[Client, str]:
-    """Try to come in, and return the client and the error's name; "" for none."""
+    """Try to come in, and return the client and the error's name; "" for none.
+
+    Args:
+        url: the server's address.
+        identity: folder of the client's own certificate; None for no encryption.
+        user: name of the user.
+        password: password of the user.
+        certificate: files of the user's certificate and key.
+    """
     client = Client(url, timeout=60)
     client.application_uri = URI
     if identity is not None:
@@ -59,6 +86,9 @@ async def come_in(
     if user:
         client.set_user(user)
         client.set_password(password)
+    if certificate is not None:
+        await client.load_client_certificate(str(certificate[0]))
+        await client.load_private_key(certificate[1])
     try:
         await client.connect()
     except (TimeoutError, ua.UaError, OSError) as exc:
@@ -66,6 +96,7 @@ async def come_in(
     return client, ""
 
 
+@pytest.mark.long
 async def test_users_come_in_encrypted_and_nobody_else(
     tmp_path: Path, identity: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -90,6 +121,87 @@ async def test_users_come_in_encrypted_and_nobody_else(
         assert "geheim" not in caplog.text
         key = tmp_path / "outlets" / "opcua.opcua.pem"
         assert key.stat().st_mode & 0o077 == 0
+
+
+@pytest.mark.long
+async def test_users_come_in_with_certificates_of_their_own(tmp_path: Path, identity: Path) -> None:
+    known, other = user_files(tmp_path / "known", "plc"), user_files(tmp_path / "other", "plc")
+    old = user_files(tmp_path / "old", "old", days=0)
+    users = {"plc": "known/user.pem", "old": "old/user.der"}
+    rules: dict[str, Any] = {"anonymous": "read", "unencrypted": True, "user_certificates": users}
+
+    async def jobs_of(identity: Path | None, certificate: Path, key: Path) -> str:
+        """Start a job, and return why that failed; "" where it did not."""
+        pair = certificate / "user.der", key / "key.pem"
+        client, error = await come_in(there.url, identity, certificate=pair)
+        if error:
+            return error
+        user = Plc(client)
+        await user.learn()
+        await user.wait_for("Ready")
+        await user.start_job("by certificate")
+        await client.disconnect()
+        return ""
+
+    async with cell(tmp_path, **rules) as there:
+        assert [await jobs_of(one, known, known) for one in (identity, None)] == ["", ""]
+        for certificate, key, why in (
+            (other, other, "BadUserAccessDenied"),
+            (old, old, "BadUserAccessDenied"),
+            (known, other, "BadIdentityTokenInvalid"),
+        ):
+            assert await jobs_of(identity, certificate, key) == why
+        reader = Plc((await come_in(there.url, identity))[0])
+        await reader.learn()
+        with pytest.raises(ua.UaStatusCodeError):
+            await reader.start_job()
+        await reader.client.disconnect()
+
+
+@pytest.mark.long
+async def test_passwords_are_not_tried_without_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PLC_WORD", "geheim")
+    rules: dict[str, Any] = {"anonymous": "no", "unencrypted": True}
+    async with cell(tmp_path, **rules, users={"plc": {"variable": "PLC_WORD"}}) as there:
+        pump: Any = there.outlets._pumps["opcua"]
+        logins: Any = pump.outlet._server.server.iserver.failed_logins
+        now = 0.0
+        logins._clock = lambda: now
+        for number in range(10):
+            assert (await come_in(there.url, None, "plc", f"geheim{number}"))[1]
+        assert (await come_in(there.url, None, "plc", "geheim"))[1] == "BadUserAccessDenied"
+        now = 61.0
+        client, error = await come_in(there.url, None, "plc", "geheim")
+        assert error == ""
+        await client.disconnect()
+        for number in range(2000):  # addresses, of which a bounded number is kept
+            with pytest.raises(KeyError), logins.attempt(str(number)):
+                raise KeyError
+        assert len(logins._failed) == 1000
+        for _ in range(9):
+            with pytest.raises(KeyError), logins.attempt("1999"):
+                raise KeyError
+        with logins.attempt("1998"):
+            pass
+        with pytest.raises(ServiceError), logins.attempt("1999"):
+            pass
+
+
+@pytest.mark.parametrize(
+    ("content", "why"), [(None, "No such file"), (b"no certificate", "user_certificates.plc")]
+)
+async def test_a_users_certificate_that_cannot_be_read_is_told(
+    tmp_path: Path, content: bytes | None, why: str
+) -> None:
+    if content is not None:
+        (tmp_path / "plc.der").write_bytes(content)
+    listen = f"opc.tcp://127.0.0.1:{free_port()}"
+    settings = {"listen": listen, "user_certificates": {"plc": "plc.der"}}
+    async with Outlets({"opcua": settings}, tmp_path) as outlets:
+        await until(lambda: bool(outlets.states["opcua"].trouble))
+        assert why in outlets.states["opcua"].trouble
 
 
 @pytest.mark.long

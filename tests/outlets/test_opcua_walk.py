@@ -148,7 +148,7 @@ async def walk(folder: Path, calls: int, clients: int, seed: int) -> tuple[Books
     ):
         plcs = [await stack.enter_async_context(plc(there.url)) for _ in range(clients + 1)]
         listener = plcs.pop()
-        heard = await listener.hear(1018, 1024)
+        heard = await listener.hear(1018, 1024, 1025)
 
         async def play(client: Plc, own: random.Random) -> None:
             while books.calls < calls:
@@ -207,8 +207,18 @@ def check_results(books: Books, heard: Heard) -> None:
     counts = collections.Counter(one.JobId.Id for one in results)
     assert [counts[job] for job in singles] == [1] * len(singles)
     assert any(one.ResultState == 1 for one in results)
+    acquired = collections.Counter[str]()
+    for told in heard.events:
+        job = told.JobId.Id if told.EventType.Identifier in (1024, 1025) else ""
+        if told.EventType.Identifier == 1025:
+            acquired[job] += 1
+        elif job and told.ResultState == 1:
+            acquired[job] -= 1  # each result behind its own acquisition
+            assert acquired[job] >= 0
+    assert all(acquired[job] <= 1 for job in singles)
 
 
+@pytest.mark.long
 async def test_random_calls_of_clients_move_along_the_nodeset_and_mix_up_no_results(
     tmp_path: Path,
 ) -> None:

@@ -20,6 +20,7 @@ def widest(*values: Any) -> Any:
     return pytest.param(*values, marks=[pytest.mark.long, pytest.mark.widest])
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 def test_block_that_ends_without_an_error_had_the_camera_for_itself(variant: Variant) -> None:
     found = visit(replace(variant, depth=SHORT_DEPTH))

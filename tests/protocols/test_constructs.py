@@ -75,6 +75,7 @@ def test_view_fields_cover_every_byte_in_order(dialect: FramedDialect, message: 
     ]
 
 
+@pytest.mark.sampled(every=3)
 @each_dialect
 @pytest.mark.parametrize("sender", m.Sender)
 @given(data=st.data())
@@ -88,6 +89,7 @@ def test_view_fields_are_what_decode_gives(
     assert body(dialect, sender, dialect.encode(message)) == expected
 
 
+@pytest.mark.sampled(every=3)
 @each_dialect
 @pytest.mark.parametrize("sender", m.Sender)
 @given(data=st.data())

@@ -314,6 +314,7 @@ def frame_of(dialect: FramedDialect, payload: bytes, message_id: int = 0x20) -> 
     return dialect.header.pack(message_id, len(payload)) + payload
 
 
+@pytest.mark.sampled(every=4)
 @each_dialect
 @pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 32, 40])
 @pytest.mark.parametrize(

@@ -59,6 +59,7 @@ def outcome(made: Machine, chunks: list[bytes]) -> Outcome:
 # ---------------------------------------------------------------------- round trips
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("dialect", "message_type"),
     [
@@ -108,6 +109,7 @@ def test_any_integer_is_encoded_and_decoded_or_refused(dialect: FramedDialect, v
 # ---------------------------------------------------------------------- chunking
 
 
+@pytest.mark.sampled(every=3)
 @each_dialect
 @each_role
 @given(data=st.data())
@@ -135,6 +137,7 @@ def test_any_cutting_of_any_bytes_gives_the_same_events(
     assert outcome(session(role, dialect, policy=drops), chunks) == whole
 
 
+@pytest.mark.sampled(every=3)
 @each_dialect
 @given(data=st.data())
 def test_client_on_tcp_fails_alike_however_the_bytes_are_cut(
@@ -149,6 +152,7 @@ def test_client_on_tcp_fails_alike_however_the_bytes_are_cut(
 # ---------------------------------------------------------------------- any bytes
 
 
+@pytest.mark.sampled(every=3)
 @each_dialect
 @each_role
 @given(state=st.sampled_from(State), transport=st.sampled_from(Transport), data=st.data())

@@ -143,6 +143,7 @@ def test_written_bytes_give_the_frames_and_errors_of_fed_ones(
         assert not isinstance(one, Frame) or type(one.payload) is bytes
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("most", [1460, 1 << 16, 1 << 30])
 @pytest.mark.parametrize("dialect", [HANDBOOK, THESIS], ids=lambda one: one.name)
 def test_written_frames_around_every_limit_come_out_whole(
@@ -282,6 +283,7 @@ def outcome(made: Machine, events: list[Any]) -> tuple[Any, ...]:
     return plain, made.state, made.buffered, counters
 
 
+@pytest.mark.sampled(every=3)
 @each_dialect
 @given(data=st.data(), limit=st.sampled_from([24, 100, 300]), reads=READS, strict=st.booleans())
 def test_bursts_and_what_came_before_are_the_frames_that_come_one_by_one(

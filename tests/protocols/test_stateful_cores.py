@@ -558,6 +558,7 @@ class UdpCores(Cores):
                 self.deliver(line, way, 0)
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("run", range(RUNS))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("family", FAMILIES)

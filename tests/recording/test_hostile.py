@@ -93,6 +93,7 @@ def written(path: Path, *records: bytes) -> Path:
 # ---------------------------------------------------------------------- bounds
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("how", ["zstd", "lz4"])
 @pytest.mark.parametrize("said", [None, 10, 1 << 60])
 def test_load_recording_chunk_that_unpacks_beyond_the_bound_is_refused(

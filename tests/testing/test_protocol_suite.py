@@ -9,6 +9,8 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
+import pytest
+
 from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import BVS, INSIGHT, Transport
@@ -22,8 +24,6 @@ from tests.protocols.insight_lines import BITMAP, GREETING, IMAGE_LINES
 from tests.testing.acme_page import MODULE, TESTS, acme_is_known
 
 if TYPE_CHECKING:
-    import pytest
-
     from smartcam.protocols import FramedDialect
 
 pytest_plugins = ["pytester"]
@@ -111,6 +111,10 @@ class TestBvs(WireSuite):
         broken(B16, B16.header.pack(0x30, 1) + b"1", MessageError),
         broken(BID, BID.header.pack(0x12, 1) + b"1", MessageError),
     )
+
+    @pytest.mark.sampled(every=3)
+    def test_what_waits_for_more_has_a_bound(self, conversation: Conversation) -> None:
+        super().test_what_waits_for_more_has_a_bound(conversation)
 
 
 LOGGING_IN: list[Step] = [

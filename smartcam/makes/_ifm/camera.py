@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 import struct
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 import numpy as np
 
-from smartcam._arguments import check_integer, check_seconds
+from smartcam._arguments import check_choice, check_integer, check_seconds
 from smartcam.emulator import TicketedCamera, TicketedClient
 from smartcam.emulator._inside import EvaluatingCamera, applications_of, request
 from smartcam.exceptions import ConfigurationError
@@ -20,26 +19,21 @@ from smartcam.makes._ifm.chunks import JPEG, MONO8, ImageChunk
 from smartcam.makes._ifm.dialect import (
     ASYNCHRONOUS,
     ERRORS,
+    MAX_INPUT,
     NOTIFICATIONS,
     OVERRUN,
     PCIC,
     RESULTS,
-    V1,
-    V2,
-    V3,
-    V4,
 )
 from smartcam.makes._ifm.layouts import check_layout, encode
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from smartcam.emulator import LineClient
-    from smartcam.protocols import LineRow, TicketedDialect
+    from smartcam.protocols import LineRow
 
-VERSIONS: Mapping[int, TicketedDialect] = {1: V1, 2: V2, 3: V3, 4: V4}
-SOURCES = ("process", "continuous", "hardware")
-CONTAINERS, MAX_TEXT = 10, 256
+INPUT_CONTAINERS = 10
 _KINDS: Mapping[type, str] = {str: "string", bool: "uint8", int: "int32"}
 _NETWORK = ("255.255.255.0", "0.0.0.0", "00:02:01:00:00:01", "0", "80")  # noqa: S104
 
@@ -68,9 +62,7 @@ class IfmApplication:
         check_integer(self.id, "id", 1, 99)
         check_seconds(self.processing_time, "processing_time")
         check_integer(self.images, "images", 0, 20)
-        if self.trigger not in SOURCES:
-            known = ", ".join(SOURCES)
-            raise ConfigurationError(f"trigger: one of {known} was expected, got {self.trigger!r}")
+        check_choice(self.trigger, "trigger", ("process", "continuous", "hardware"))
         if isinstance(self.jpeg, str):
             try:
                 object.__setattr__(self, "jpeg", Path(self.jpeg).read_bytes())
@@ -89,11 +81,11 @@ class IfmApplication:
 
 
 class IfmClient(TicketedClient):
-    """A client of an emulated sensor: what lasts for its session."""
+    """A client of an emulated sensor: the layout and the outputs of its session."""
 
-    number: int = 0
     outputs: int = 1
     layout: Mapping[str, Any]
+    session: IfmClient
 
 
 class EmulatedIfm(EvaluatingCamera, TicketedCamera):
@@ -112,6 +104,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     """
 
     protocol = PCIC
+    client_class = IfmClient
     also_hears: ClassVar[tuple[LineRow, ...]] = (ASYNCHRONOUS,)
 
     def __init__(
@@ -130,10 +123,9 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         self.error = 0
         self.results: int = 0
         self.good: int = 0
-        self.inputs: list[str] = [""] * CONTAINERS
+        self.inputs: list[str] = [""] * INPUT_CONTAINERS
         self.values: Mapping[str, Any] = {}
         self._outputs: dict[str, str] = {}
-        self._sessions = itertools.count(1)
         super().__init__(**options)
 
     @property
@@ -145,8 +137,8 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     def make_client(self, link: Any, server: Any) -> LineClient:
         """Return a new client, with the device's own layout."""
-        client = IfmClient(self, link, server)
-        client.dialect, client.number = VERSIONS[self.version], next(self._sessions)
+        client = cast("IfmClient", super().make_client(link, server))
+        client.speak(f"v{self.version}")
         client.layout = self.own_layout()
         return client
 
@@ -164,26 +156,12 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     def hear(self, client: LineClient, line: str) -> None:
         """Do what a request says; a long one is answered while the next ones are heard."""
         call = cast("IfmClient", client.keep())
-        if call.dialect.tickets and not call.ticket:
-            call.answer("?")
-            return
-        answer = self.answer_to(call, line, "?")
-        if answer is not None:
-            call.answer(answer)
-        if line.startswith("v") and answer == "*":
-            cast("IfmClient", client).dialect = VERSIONS[int(line[1:])]
+        untold = call.dialect.tickets and not call.ticket
+        call.answer("?") if untold else super().hear(call, line)
 
-    def _tell(self, bit: int, ticket: str, content: Callable[[IfmClient], str], but: int) -> None:
-        row = next(at for at, one in enumerate(V3.rows, 1) if one.word == ticket)
-        for one in list(self._clients.values()):
-            client = cast("IfmClient", one)
-            if client.outputs & bit and client.number != but:
-                client.say_bytes(client.frame(content(client), ticket), row=row)
-
-    def _of(self, call: IfmClient) -> IfmClient:
-        """Return the client whose request a call is."""
-        clients = cast("Iterable[IfmClient]", self._clients.values())
-        return next((one for one in clients if one.number == call.number), call)
+    def unknown(self, line: str) -> str:
+        """Return the answer to an unknown command."""
+        return "?"
 
     # ------------------------------------------------------------------ evaluations
 
@@ -197,9 +175,10 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         self.values = part
         self.results += 1
         self.good += bool(part.get("passed", True))
+        asker = None if call is None else cast("IfmClient", call).session
         if call is not None:
             call.answer(self._encoded(cast("IfmClient", call)))
-        self._tell(1, RESULTS, self._encoded, 0 if call is None else cast("IfmClient", call).number)
+        self.tell(RESULTS, self._encoded, lambda one: one.outputs & 1 and one is not asker)
 
     def _encoded(self, client: IfmClient) -> str:
         try:
@@ -213,13 +192,13 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
     def overrun(self) -> None:
         """Tell that a trigger came too early."""
-        self._tell(2, ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", 0)
+        self.tell(ERRORS, lambda _: f"{OVERRUN}:Trigger overrun", lambda one: one.outputs & 2)
 
     def activate(self, application: int) -> None:
         """Make another application the active one, and notify of it."""
         super().activate(application)
         text = json.dumps({"Index": application})
-        self._tell(4, NOTIFICATIONS, lambda _: f"000500000:{text}", 0)
+        self.tell(NOTIFICATIONS, lambda _: f"000500000:{text}", lambda one: one.outputs & 4)
 
     def activated(self) -> None:
         """Go on by itself where the active application does so."""
@@ -252,7 +231,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     @request(r"p([0-7])")
     def _p(self, call: IfmClient, outputs: str) -> str:
         """Switch results (1), errors (2) and notifications (4) of this session."""
-        self._of(call).outputs = int(outputs)
+        call.session.outputs = int(outputs)
         return "*"
 
     @request(r"A\?")
@@ -310,7 +289,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         if int(length) != len(text):
             return "!"
         try:
-            self._of(call).layout = check_layout(text)
+            call.session.layout = check_layout(text)
         except (ValueError, RecursionError):
             return "!"
         return "*"
@@ -323,7 +302,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     @request(r"j(0\d)(\d{9})(.*)")
     def _j(self, call: IfmClient, number: str, length: str, text: str) -> str:
         """Put a text with its length into an input container, 00 to 09."""
-        if int(length) != len(text) or len(text) > MAX_TEXT:
+        if int(length) != len(text) or len(text) > MAX_INPUT:
             return "!"
         self.inputs[int(number)] = text
         return "*"
@@ -349,11 +328,6 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
         """Tell the state of an output."""
         return pin + self._outputs.get(pin, "0")
 
-    @request(r"[jJoO]\d\d.*")
-    def _no_such(self, call: IfmClient) -> str:
-        """Refuse an input container or an output that the device has not."""
-        return "!"
-
     @request(r"L\?")
     def _session(self, call: IfmClient) -> str:
         """Tell the number of this session."""
@@ -362,13 +336,19 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     @request(r"V\?")
     def _versions(self, call: IfmClient) -> str:
         """Tell the version of the protocol, and those that can be set."""
-        version = next(number for number, one in VERSIONS.items() if one is call.dialect)
+        version = int(call.dialect.name[1:])
         return f"{version:02} 01 02 03" if version < 4 else "04 01 04"
 
-    @request(r"v(\d\d)")
+    @request(r"v0([1-4])")
     def _v(self, call: IfmClient, version: str) -> str:
         """Set the version of the protocol for this session."""
-        return "*" if int(version) in VERSIONS else "!"
+        call.session.speak(f"v{version}")
+        return "*"
+
+    @request(r"v\d\d|[jJoO]\d\d.*")
+    def _no_such(self, call: IfmClient) -> str:
+        """Refuse a version, an input container or an output that the device has not."""
+        return "!"
 
 
 def _counted(text: str) -> str:

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Literal
 
+from smartcam._arguments import check_choice
 from smartcam.exceptions import ConfigurationError, FrameError, UnsupportedError
 from smartcam.makes._ifm.chunks import read_chunks
 from smartcam.makes._ifm.layouts import MARK, layout_json, with_bools
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     Script = Generator[str, str, Told]
 
 DEFAULT_PORT = 50010
+TICKETS = range(1000, 10000)
 RESULTS, ERRORS, NOTIFICATIONS, DEBUG = "0000", "0001", "0010", "0020"
 """Tickets of what a device says by itself."""
 
@@ -89,12 +92,10 @@ def _status(answer: str) -> m.StatusReport:
     """Return the status: an error state of nine digits, or ``!`` in configuration mode."""
     if answer in CODES:
         return m.StatusReport(status=Status(0))
-    return m.StatusReport(status=READY | _bits(int(answer)))
-
-
-def _bits(error: int) -> Status:
-    status = Status.SYSTEM_ERROR if error in FATAL else Status(0)
-    return status | Status.OVERHEAT if error == OVERTEMPERATURE else status
+    error = int(answer)
+    trouble = Status.SYSTEM_ERROR if error in FATAL else Status(0)
+    hot = Status.OVERHEAT if error == OVERTEMPERATURE else Status(0)
+    return m.StatusReport(status=READY | trouble | hot)
 
 
 def _active(answer: str) -> int:
@@ -108,8 +109,7 @@ def _active(answer: str) -> int:
 
 
 def _error(content: str) -> m.Notice:
-    code, text = _numbered(content)
-    return m.Notice(kind="error", code=code, text=text)
+    return _notice("error", content)
 
 
 def _error_or_overrun(content: str) -> tuple[m.Message, ...]:
@@ -121,16 +121,12 @@ def _error_or_overrun(content: str) -> tuple[m.Message, ...]:
     return notice, overrun, m.StatusReport(status=READY)
 
 
-def _notification(content: str) -> m.Notice:
-    code, text = _numbered(content)
-    return m.Notice(kind="notification", code=code, text=text)
-
-
-def _numbered(content: str) -> tuple[int, str]:
+def _notice(kind: Literal["error", "notification"], content: str) -> m.Notice:
+    """Return what a device says of itself: nine digits, a colon and a text."""
     digits, colon, text = content.partition(":")
     if colon and digits.isascii() and digits.isdecimal() and len(digits) <= 9:
-        return int(digits), text
-    return 0, content
+        return m.Notice(kind, int(digits), text)
+    return m.Notice(kind, 0, content)
 
 
 def _reply(answer: str) -> LineReply:
@@ -186,7 +182,9 @@ def _rows(trigger: LineRow, *, tickets: bool, lengths: bool) -> tuple[LineRow, .
     said = (
         LineRow(None, "results", m.ResultContainer, _result, word=RESULTS),
         LineRow(None, "errors", m.Notice, error, word=ERRORS, also=(m.StatusReport,)),
-        LineRow(None, "notifications", m.Notice, _notification, word=NOTIFICATIONS),
+        LineRow(
+            None, "notifications", m.Notice, partial(_notice, "notification"), word=NOTIFICATIONS
+        ),
         LineRow(None, "debug", m.Notice, lambda text: m.Notice("debug", 0, text[:200]), word=DEBUG),
     )
     return (
@@ -232,13 +230,10 @@ class PcicDialect(TicketedDialect):
         Raises:
             ConfigurationError: no such trigger or container.
         """
-        kind = parameters.get("trigger", "sync")
+        kind = check_choice(parameters.get("trigger", "sync"), "trigger", ("sync", "async"))
         container = parameters.get("input", str(self.container))
-        if kind not in {"sync", "async"} or not (container.isdecimal() and len(container) <= 2):
-            raise ConfigurationError(
-                f"trigger: sync or async was expected, got {kind!r}; "
-                f"input: 0 to 99 was expected, got {container!r}"
-            )
+        if not (container.isdecimal() and len(container) <= 2):
+            raise ConfigurationError(f"input: 0 to 99 was expected, got {container!r}")
         trigger = SYNCHRONOUS if kind == "sync" else ASYNCHRONOUS
         rows = _rows(trigger, tickets=bool(self.tickets), lengths=bool(self.digits))
         return replace(self, container=int(container), rows=rows, split=None)
@@ -263,12 +258,10 @@ class PcicDialect(TicketedDialect):
                 "or interpret_as='raw'"
             )
         layout_json(layout)
-        rows = tuple(
-            one
-            if one.answer is not m.ResultContainer
-            else one._replace(read=_read_with(layout, one))
-            for one in self.rows
-        )
+        told = {
+            one: _read_with(layout, one) for one in self.rows if one.answer is m.ResultContainer
+        }
+        rows = tuple(one._replace(read=told.get(one, one.read)) for one in self.rows)
         return replace(self, layout=layout, rows=rows, split=None)
 
     def command(self, line: str) -> str:
@@ -313,26 +306,26 @@ def _read_with(layout: Layout, row: LineRow) -> Callable[[str], Told]:
     return read
 
 
-def _version(name: str, about: str, *, tickets: bool, digits: int, header: bool) -> PcicDialect:
+def _version(name: str, about: str, tickets: range, digits: int) -> PcicDialect:
     return PcicDialect(
         name=name,
         about=about,
         source="docs/ifm.md, published",
         ids=range(1, MAX_APPLICATION + 1),
-        rows=_rows(SYNCHRONOUS, tickets=tickets, lengths=bool(digits)),
+        rows=_rows(SYNCHRONOUS, tickets=bool(tickets), lengths=bool(digits)),
         codes=_MEANINGS,
-        tickets=range(1000, 10000) if tickets else range(0),
-        at_once=tickets,
+        tickets=tickets,
+        at_once=bool(tickets),
         digits=digits,
-        asks_with_length=header,
+        asks_with_length=name == "v3",
     )
 
 
-V3 = _version("v3", "ticket and length in both directions", tickets=True, digits=9, header=True)
-V4 = _version("v4", "answers with their length, no tickets", tickets=False, digits=9, header=False)
-V2 = _version("v2", "tickets, no length: texts only", tickets=True, digits=0, header=False)
-V1 = _version(
-    "v1", "neither: texts only, no results but a trigger's", tickets=False, digits=0, header=False
+_VERSIONS = (
+    _version("v3", "ticket and length in both directions", TICKETS, 9),
+    _version("v4", "answers with their length, no tickets", range(0), 9),
+    _version("v2", "tickets, no length: texts only", TICKETS, 0),
+    _version("v1", "neither: texts only, no results but a trigger's", range(0), 0),
 )
 
 PCIC = Protocol(
@@ -340,13 +333,13 @@ PCIC = Protocol(
     schemes={"pcic": Transport.TCP},
     default_port=DEFAULT_PORT,
     models=("O2D5XX", "O2I5XX", "O2U5XX", "O3D3XX"),
-    dialects={one.name: one for one in (V3, V4, V2, V1)},
+    dialects={one.name: one for one in _VERSIONS},
     machine=LineMachine,
     parameters={
         "trigger": "sync (default): T?, answered by the result; async: t, the result comes later",
         "input": "number of the input container that input data goes to; default 0",
     },
-    detection={Transport.TCP: ((V3,), (V4,), (V2,), (V1,))},
+    detection={Transport.TCP: tuple((one,) for one in _VERSIONS)},
     emulator="smartcam.makes._ifm.camera:EmulatedIfm",
     greeting=b"",
 )

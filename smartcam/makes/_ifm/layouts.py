@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
 from typing import TYPE_CHECKING, Any
@@ -49,12 +50,8 @@ def layout_json(layout: Layout) -> str:
         elements += fields
     else:
         elements.append({"type": "records", "id": layout.group or "records", "elements": fields})
-    described = {
-        "layouter": "flexible",
-        "format": {"dataencoding": "binary", "order": "little"},
-        "elements": elements,
-    }
-    return json.dumps(described)
+    form = {"dataencoding": "binary", "order": "little"}
+    return json.dumps({"layouter": "flexible", "format": form, "elements": elements})
 
 
 def _element(field: Field) -> dict[str, Any]:
@@ -68,27 +65,17 @@ def _element(field: Field) -> dict[str, Any]:
 
 def with_bools(layout: Layout, data: bytes) -> bytes:
     """Return a result's bytes with each bool as smartcam's layouts have it: 1 becomes 0xFF."""
-    heads, fields = _bools(layout.head), _bools(layout.fields)
-    if not heads and not fields:
+    if not any(field.type == "bool" for field in (*layout.head, *layout.fields)):
         return data
-    changed = bytearray(data)
-    size = sum(field.size for field in layout.fields)
-    begin = sum(field.size for field in layout.head)
+    begin, size = (sum(field.size for field in some) for some in (layout.head, layout.fields))
     starts = range(begin, len(data), size) if layout.repeat is not None else (begin,)
-    places = [*heads, *(start + place for start in starts for place in fields)]
-    for place in places:
-        if place < len(data) and data[place] == 1:
-            changed[place] = 0xFF
+    changed = bytearray(data)
+    for start, fields in ((0, layout.head), *((start, layout.fields) for start in starts)):
+        places = itertools.accumulate((field.size for field in fields), initial=start)
+        for at, field in zip(places, fields, strict=False):
+            if field.type == "bool" and data[at : at + 1] == b"\x01":
+                changed[at] = 0xFF
     return bytes(changed)
-
-
-def _bools(fields: tuple[Field, ...]) -> list[int]:
-    places, at = [], 0
-    for field in fields:
-        if field.type == "bool":
-            places.append(at)
-        at += field.size
-    return places
 
 
 def check_layout(text: str) -> dict[str, Any]:
@@ -112,14 +99,8 @@ def _check(elements: object, depth: int) -> None:
 
 
 def encode(described: Mapping[str, Any], values: Mapping[str, Any]) -> bytes:
-    """Return a result as a device sends it in a layout.
-
-    Args:
-        described: the layout.
-        values: values of the elements by their ids; records are lists of such mappings.
-    """
-    default = described.get("format", {})
-    return b"".join(_encode(described["elements"], values, default))
+    """Return a result as a device sends it: values by ids of elements, records as lists of such."""
+    return b"".join(_encode(described["elements"], values, described.get("format", {})))
 
 
 def _encode(

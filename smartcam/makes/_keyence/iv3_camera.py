@@ -75,11 +75,9 @@ class EmulatedIv3(EvaluatingCamera):
         """Refuse a trigger that a switch at the sensor cuts off."""
         call.answer("ER,T2,03")
 
-    def hear(self, client: LineClient, line: str) -> None:
-        """Answer a line; a trigger when its inspection is over, and no other line before it."""
-        answer = self.answer_to(client, line, f"ER,{line.partition(',')[0]},02")
-        if answer is not None:
-            client.answer(answer)
+    def unknown(self, line: str) -> str:
+        """Return the answer to an unknown command."""
+        return f"ER,{line.partition(',')[0]},02"
 
     @request("T2")
     def _trigger(self, client: LineClient) -> str | None:

@@ -247,7 +247,7 @@ class Methods:
     ) -> list[ua.Variant]:
         del timeout  # the list is complete in itself
         ready, name = self._system.prepared, _text(external)
-        known = dict.fromkeys([*self._system.settings.recipes.values()])
+        known = dict.fromkeys(self._system.recipes.values())
         if self._system.application:
             known[self._system.application] = None
         fits = [

@@ -184,6 +184,12 @@ class CameraNodes:
 
         self._outbox.put(publish)
 
+    def acquired(self, job: VisionJob) -> None:
+        """Raise the event that a job has its picture."""
+        kind = "AcquisitionDoneEventType"
+        fields = self._job_fields(kind, job, self.prepared)
+        self._outbox.put(lambda: self._emit(kind, f"job {job.id} has its picture", fields))
+
     def result(
         self,
         result: VisionResult,

@@ -51,7 +51,7 @@ class OpcUaOutlet(Outlet[OpcUaSettings]):
         from smartcam.outlets._opcua.server import VisionServer
 
         self._loop = asyncio.get_running_loop()
-        desk = OutletDesk(self.desk.columns, self._command, self.desk.cameras)
+        desk = OutletDesk(self.desk.columns, self._command, self.desk.cameras, self.desk.names)
         await asyncio.to_thread(self._thread.start)
         self._server = server = VisionServer(self.name, self.settings, self.folder, desk)
         await self._there(server.start())

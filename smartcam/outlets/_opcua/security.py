@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import collections
+import contextlib
 import hmac
 import os
 import socket
+import time
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from asyncua import ua
+from asyncua.common.utils import ServiceError
 from asyncua.crypto import cert_gen
 from asyncua.crypto.permission_rules import SimpleRoleRuleset, User, UserRole
 from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
+from asyncua.server.internal_server import InternalServer
 from cryptography import x509
 from cryptography.hazmat.primitives.serialization import Encoding
 from cryptography.x509.oid import ExtendedKeyUsageOID
@@ -19,12 +25,24 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from smartcam.exceptions import ConfigurationError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from smartcam.outlets._opcua.settings import OpcUaSettings
 
 CERTIFICATE_DAYS = 3650
 """Days for which a certificate is good that the server makes for itself."""
+
+MAX_FAILED_LOGINS = 10
+"""Failed logins from one address in LOGIN_SECONDS, behind which none from there is looked at."""
+
+LOGIN_SECONDS = 60.0
+"""Seconds in which failed logins are counted."""
+
+MAX_ADDRESSES = 1000
+"""Addresses whose failed logins are counted; the one that failed longest ago goes first."""
+
+_SHA1 = "http://www.w3.org/2000/09/xmldsig#rsa-sha1"
 
 _READING = (
     ua.ObjectIds.CreateSessionRequest_Encoding_DefaultBinary,
@@ -70,6 +88,10 @@ class Users:
         for name, password in self._passwords.items():
             if not password:
                 raise ConfigurationError(f"users.{name}: the password is empty")
+        self._certificates = {
+            _certificate(folder / path, name): name
+            for name, path in settings.user_certificates.items()
+        }
 
     def get_user(
         self,
@@ -79,7 +101,12 @@ class Users:
         certificate: Any = None,
     ) -> User | None:
         """Return a user with rights, or None for one who may not come in."""
-        del iserver, certificate  # the channel has looked at it
+        del iserver
+        if isinstance(certificate, ProvenCertificate):
+            made = x509.load_der_x509_certificate(certificate)
+            good = made.not_valid_before_utc <= datetime.now(UTC) <= made.not_valid_after_utc
+            name = self._certificates.get(bytes(certificate))
+            return User(UserRole.User, name) if name and good else None
         if username is not None:
             known = self._passwords.get(username)
             given = (password or "").encode()
@@ -88,6 +115,89 @@ class Users:
         roles = {"read": UserRole.Anonymous, "control": UserRole.User}
         role = roles.get(self._anonymous)
         return None if role is None else User(role, "anonymous")
+
+
+class ProvenCertificate(bytes):
+    """The certificate of a user who has shown to have its key, not only that of the channel."""
+
+
+class FailedLogins:
+    """Counts failed logins by their address, so that nobody tries passwords without end.
+
+    Args:
+        clock: seconds from any origin.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._failed: collections.OrderedDict[str, list[float]] = collections.OrderedDict()
+
+    @contextlib.contextmanager
+    def attempt(self, address: str) -> Iterator[None]:
+        """Let somebody try to log in; an exception counts as a failure.
+
+        Raises:
+            ServiceError: too many have failed from there; the login is not looked at.
+        """
+        now = self._clock()
+        failed = [one for one in self._failed.get(address, ()) if now - one < LOGIN_SECONDS]
+        if len(failed) >= MAX_FAILED_LOGINS:
+            raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
+        try:
+            yield
+        except Exception:
+            self._failed[address] = [*failed, now]
+            self._failed.move_to_end(address)
+            if len(self._failed) > MAX_ADDRESSES:
+                self._failed.popitem(last=False)
+            raise
+
+
+class GuardedServer(InternalServer):  # type: ignore[misc] # asyncua's types are not followed
+    """The inside of a server, with a bound on failed logins.
+
+    Args:
+        users: the users.
+    """
+
+    def __init__(self, users: Users) -> None:
+        super().__init__(user_manager=users)
+        self.failed_logins: FailedLogins = FailedLogins()
+
+    def decrypt_user_token(self, isession: Any, token: Any) -> tuple[str, str]:
+        """Return name and password, if they are right."""
+        with self.failed_logins.attempt(_address(isession)):
+            name, password = super().decrypt_user_token(isession, token)
+            if self.user_manager.get_user(self, name, password) is None:
+                raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
+        return name, password
+
+    def verify_x509_token(self, isession: Any, token: Any, signature: Any) -> ProvenCertificate:
+        """Return a user's certificate, if it is known and its key has signed."""
+        with self.failed_logins.attempt(_address(isession)):
+            if signature.Algorithm == _SHA1:
+                raise ServiceError(ua.StatusCodes.BadSecurityPolicyRejected)
+            proven = ProvenCertificate(super().verify_x509_token(isession, token, signature))
+            if self.user_manager.get_user(self, certificate=proven) is None:
+                raise ServiceError(ua.StatusCodes.BadUserAccessDenied)
+        return proven
+
+
+def _address(isession: Any) -> str:
+    """Return the address that a session comes from, without its port."""
+    name = isession.name
+    return str(name[0] if isinstance(name, tuple) else name)
+
+
+def _certificate(path: Path, name: str) -> bytes:
+    """Return a user's certificate as DER."""
+    try:
+        data = path.read_bytes()
+        pem = data.lstrip().startswith(b"-----BEGIN")
+        made = (x509.load_pem_x509_certificate if pem else x509.load_der_x509_certificate)(data)
+    except (OSError, ValueError) as exc:
+        raise ConfigurationError(f"user_certificates.{name}: {path}: {exc}") from exc
+    return made.public_bytes(Encoding.DER)
 
 
 class Rights(SimpleRoleRuleset):  # type: ignore[misc] # asyncua's types are not followed
@@ -100,8 +210,11 @@ class Rights(SimpleRoleRuleset):  # type: ignore[misc] # asyncua's types are not
 
 def tokens(settings: OpcUaSettings) -> list[type]:
     """Return the ways to log in."""
-    anonymous = [] if settings.anonymous == "no" else [ua.AnonymousIdentityToken]
-    return anonymous + ([ua.UserNameIdentityToken] if settings.users else [])
+    return [
+        *([] if settings.anonymous == "no" else [ua.AnonymousIdentityToken]),
+        *([ua.UserNameIdentityToken] if settings.users else []),
+        *([ua.X509IdentityToken] if settings.user_certificates else []),
+    ]
 
 
 def policies(settings: OpcUaSettings) -> list[ua.SecurityPolicyType]:

@@ -21,7 +21,7 @@ from smartcam.outlets._opcua.methods import Method, Methods, kind_of
 from smartcam.outlets._opcua.nodes import CameraNodes
 from smartcam.outlets._opcua.nodeset import AUTOMATIC, URI, VISION, node_ids, nodeset_text
 from smartcam.outlets._opcua.publishing import PublishQueue
-from smartcam.outlets._opcua.security import Users, secure
+from smartcam.outlets._opcua.security import GuardedServer, Users, secure
 from smartcam.outlets._opcua.system import VisionSystem
 from smartcam.outlets._opcua.values import VisionValues
 from smartcam.outlets._records import picture_of
@@ -80,7 +80,8 @@ class VisionServer:
             ConfigurationError: a secret, a certificate or a key is not there.
             OSError: the port is taken.
         """
-        self.server = server = Server(user_manager=Users(self.settings, self.folder))
+        users = Users(self.settings, self.folder)
+        self.server = server = Server(iserver=GuardedServer(users))
         await server.init()
         server.set_server_name(f"smartcam {self.name}")
         server.product_uri = "urn:smartcam"
@@ -201,6 +202,7 @@ class CameraFace:
             self._command,
             self,
             picture=self._picture,
+            names=lambda: server.desk.names(name),
             new_job=server.new_job,
             simulated=dict(server.desk.cameras()).get(name),
         )
@@ -246,6 +248,10 @@ class CameraFace:
         application = self.system.prepared or 0
         self.nodes.prepared = self.system.recipe_name(application), application
         self.nodes.moved(transition, job, why)
+
+    def acquired(self, job: VisionJob) -> None:
+        """Raise the event that a job's part may move."""
+        self.nodes.acquired(job)
 
     def result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""

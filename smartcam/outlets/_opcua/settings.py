@@ -42,6 +42,11 @@ class OpcUaSettings(OutletSettings):
         max_length=MAX_USERS,
         description="who may log in, and where the password is: {plc: {file: PATH}}",
     )
+    user_certificates: dict[str, Annotated[str, Field(min_length=1)]] = Field(
+        {},
+        max_length=MAX_USERS,
+        description="who may log in with a certificate of their own, and its file: {plc: plc.der}",
+    )
     anonymous: Literal["no", "read", "control"] = Field(
         "no",
         description="what everybody may do who can reach the server: read sees values and events, "
@@ -87,8 +92,11 @@ class OpcUaSettings(OutletSettings):
 
     @model_validator(mode="after")
     def _fits(self) -> Any:
-        if not self.users and self.anonymous == "no":
-            raise ValueError("nobody could log in: expected users:, or anonymous: read or control")
+        if not (self.users or self.user_certificates) and self.anonymous == "no":
+            raise ValueError(
+                "nobody could log in: expected users:, user_certificates:, or anonymous: read or "
+                "control"
+            )
         if (self.certificate is None) != (self.key is None):
             raise ValueError("expected both certificate and key, or neither")
         return self

@@ -61,6 +61,9 @@ class Face(Protocol):
     def moved(self, transition: Transition, job: VisionJob | None, why: str) -> None:
         """Show a transition, and raise its events."""
 
+    def acquired(self, job: VisionJob) -> None:
+        """Raise the event that a job's part may move: its picture is taken."""
+
     def result(self, result: VisionResult) -> None:
         """Show a result, and raise its event."""
 
@@ -81,6 +84,7 @@ class VisionSystem:
         face: the side that clients see.
         picture: returns the file of a result's picture.
         new_job: returns an id for a job.
+        names: returns the names of the camera's own applications, with their numbers.
         simulated: True for an emulated camera, False for a real one, None where that is not known.
     """
 
@@ -93,6 +97,7 @@ class VisionSystem:
         *,
         picture: Callable[[Mapping[str, Any]], Path | None],
         new_job: Callable[[], str],
+        names: Callable[[], Mapping[str, int]] = dict,
         simulated: bool | None = None,
     ) -> None:
         self.name, self.settings, self.face = name, settings, face
@@ -100,6 +105,7 @@ class VisionSystem:
         self.application: int | None = None
         self.job: VisionJob | None = None
         self._command, self._picture, self._new_job = command, picture, new_job
+        self._names = names
         self._simulated = simulated
         self._connected: bool | None = None  # None: not known yet
         self._by_client = False  # clients prepare recipes: no other becomes ready by itself
@@ -197,32 +203,39 @@ class VisionSystem:
         if not self.states.allows(method):
             raise WrongStateError(f"{method} is not allowed in {self.states.both}")
 
+    @property
+    def recipes(self) -> Mapping[str, int]:
+        """Names of applications: the camera's own, and those of the settings, which win."""
+        return {**self._names(), **self.settings.recipes}
+
     def application_of(self, external: str, internal: str = "") -> int:
         """Return the application of a recipe.
 
         Args:
-            external: name from the settings, or the number as a text.
+            external: one of :attr:`recipes`, or the number as a text.
             internal: number as a text; "" where only the name is given.
 
         Raises:
             UnknownRecipeError: there is no such recipe, or both ids are of different ones.
         """
         found: set[int] = set()
-        for text, names in ((external, self.settings.recipes), (internal, {})):
+        recipes = self.recipes
+        for text, names in ((external, recipes), (internal, dict[str, int]())):
             if text in names:
                 found.add(names[text])
             elif text.isascii() and text.isdecimal() and int(text[:11]) <= 0xFFFFFFFF:
                 found.add(int(text))
             elif text:
-                known = ", ".join(self.settings.recipes) or "no names"
+                known = ", ".join(recipes) or "no names"
                 raise UnknownRecipeError(f"there is no recipe {text!r:.80}; known: {known}")
         if len(found) != 1:
             raise UnknownRecipeError(f"expected one recipe, got {external!r:.80}, {internal!r:.80}")
         return found.pop()
 
     def recipe_name(self, application: int | None) -> str:
-        """Return the name of an application: from the settings, else its number."""
-        names = (name for name, number in self.settings.recipes.items() if number == application)
+        """Return the name of an application: the settings' first, else its number."""
+        known = {**self.settings.recipes, **self._names()}
+        names = (name for name in known if self.recipes[name] == application)
         return next(names, "" if application is None else str(application))
 
     async def prepare(self, application: int) -> bool:
@@ -370,6 +383,7 @@ class VisionSystem:
             return
         if self.job is not job:
             return
+        self.face.acquired(job)
         at = done["result"].get("triggered_at")
         job.trigger = datetime.fromisoformat(at) if isinstance(at, str) else at
         if job.trigger is not None:
@@ -472,6 +486,8 @@ class VisionSystem:
         application = said["application"]
         if job is not None and application != job.application:
             error = error or f"it is of application {application}, not {job.application}"
+        if job is not None and not job.single:
+            self.face.acquired(job)
         state = FAILED if error else COMPLETED
         picture = self._picture({**said, "camera": entry.camera})
         made = VisionResult(

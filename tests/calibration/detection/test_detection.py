@@ -60,6 +60,7 @@ OTHERS = [
 TILTED = [one for one in TILTED if one not in OTHERS]
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("target", "roll"), [*TILTED, *(pytest.param(*one, marks=pytest.mark.long) for one in OTHERS)]
 )
@@ -71,6 +72,7 @@ def test_find_target_of_tilted_sheet_has_each_point_where_it_is(target: Target, 
     assert (view.name, view.size, view.target) == ("one", (640, 480), target)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("target", [PLAIN, CHARUCO, DOTS], ids=repr)
 def test_find_target_covariance_is_that_of_its_errors(target: Target) -> None:
     picture = drawn(target, camera=STRAIGHT, tilt=25, roll=10, noise=4)
@@ -315,6 +317,7 @@ def laid_out(points: Array) -> NDArray[np.intp]:
     return places
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(("grid", "count", "proper"), GRIDS, ids=repr)
 def test_arrangements_of_shuffled_points_are_those_that_look_alike(
     grid: CircleGrid, count: int, proper: int

@@ -56,6 +56,7 @@ def test_corners_of_a_grid_board_are_opencvs() -> None:
     np.testing.assert_allclose(PLAIN.points[PLAIN.corners, :2], theirs, atol=1e-7)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("grid", [APRIL, PLAIN, LATER], ids=lambda one: one.dictionary)
 @pytest.mark.parametrize(("tilt", "roll"), [(0, 0), (30, 70), (25, 200)])
 def test_grid_has_each_corner_where_it_is(grid: MarkerGrid, tilt: int, roll: int) -> None:
@@ -88,6 +89,7 @@ def test_picture_that_opencv_draws_of_its_board_has_its_corners() -> None:
     assert (first[0] < middle).all()
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize("grid", [APRIL, PLAIN], ids=lambda one: one.dictionary)
 def test_grid_of_which_a_part_is_hidden_has_the_rest(grid: MarkerGrid) -> None:
     picture = drawn(grid, camera=STRAIGHT, tilt=20, away=0.4)
@@ -111,6 +113,7 @@ def test_grid_with_a_marker_of_another_place_leaves_it_out() -> None:
     assert told.text.endswith(": 11")
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     ("shown", "said", "code"),
     [

@@ -56,6 +56,7 @@ def short(targets: list[Target], *which: int) -> list[Any]:
     ]
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("target", short(TOLD, 0, 4, 6), ids=repr)
 def test_find_target_in_mirror_image_is_refused(target: Target, axis: int) -> None:

@@ -238,6 +238,7 @@ def test_find_checkerboard_leaves_out_the_corners_that_are_covered(hidden: list[
     assert picture.off(view).max() < 0.05
 
 
+@pytest.mark.sampled(every=4)
 @pytest.mark.parametrize("roll", [0, 35, 90, 200])
 @pytest.mark.parametrize("shape", [(9, 7), (7, 6)])
 def test_find_checkerboard_of_a_part_with_the_mark_has_its_numbers(

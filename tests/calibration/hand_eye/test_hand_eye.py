@@ -226,6 +226,8 @@ def test_hand_eye_expects_what_a_sheet_does_that_is_bent_once(bent: float) -> No
     assert 0.7 < ratio(16, known=False, bent=bent, board=board) < 1.4
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> None:
     """A bent sheet leaves more residuals than a lens that is fitted to it as flat."""
     random = np.random.default_rng([0, 41])
@@ -239,6 +241,8 @@ def test_lens_of_the_views_themselves_is_never_said_to_be_another_camera_s() -> 
     assert {one.code for one in found.warnings} == {Code.SHEET_NOT_EXACT}
 
 
+@pytest.mark.long
+@pytest.mark.judged
 @pytest.mark.parametrize("setup", ONE_LONG)
 @pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_hand_eye_numbers_a_target_that_looks_alike_after_half_a_turn(
@@ -277,6 +281,7 @@ def test_hand_eye_of_a_bent_sheet_does_not_bend_its_lens() -> None:
     assert math.sqrt(float(np.mean(np.square(off)))) < 5e-3
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("setup", ONE_LONG)
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.27, 2.0])
 def test_hand_eye_refuses_a_print_of_quite_another_size(setup: Setup, factor: float) -> None:
@@ -287,6 +292,8 @@ def test_hand_eye_refuses_a_print_of_quite_another_size(setup: Setup, factor: fl
     assert caught.value.got == pytest.approx(1 / factor, rel=0.01)
 
 
+@pytest.mark.long
+@pytest.mark.judged
 @pytest.mark.parametrize("setup", ONE_LONG)
 def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> None:
     poses, views = printed(setup, 1.27)
@@ -296,6 +303,7 @@ def test_hand_eye_finds_a_print_of_any_size_that_is_allowed(setup: Setup) -> Non
     assert scene(setup, poses=10).errors(found.camera_pose)[1] < 2e-3
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.05, True)])
 def test_hand_eye_tells_a_size_that_was_not_to_be_adjusted(factor: float, told: bool) -> None:
     poses, views = printed("eye-in-hand", factor)
@@ -329,6 +337,8 @@ def test_hand_eye_does_not_take_noise_for_a_scale() -> None:
     assert truth.errors(found.camera_pose)[1] < 1e-3
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_second_camera_on_the_hand_is_where_the_pair_has_it() -> None:
     truth, random = scene("eye-in-hand", poses=9), np.random.default_rng(5)
     poses, views = measured("eye-in-hand", 0.1, NOISE)

@@ -50,6 +50,7 @@ def _long(*values: object) -> object:
     return pytest.param(*values, marks=pytest.mark.long)
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(
     ("setup", "offset"),
     [

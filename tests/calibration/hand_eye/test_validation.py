@@ -79,6 +79,8 @@ def test_hand_eye_of_transposed_rotations_is_refused(setup: Setup) -> None:
         calibrated(turned, views, setup)
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_of_poses_in_millimetres_is_refused() -> None:
     poses, views = measured("eye-in-hand")
     wrong = [dataclasses.replace(one, translation=1e3 * one.translation) for one in poses]
@@ -127,6 +129,8 @@ def test_hand_eye_told_to_keep_a_pose_of_another_view_says_how_poor_it_is() -> N
     assert texts[Code.BAD_VIEW].endswith("it is used all the same")
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_of_a_poor_robot_says_so() -> None:
     poses, views = measured("eye-in-hand", sigmas=RobotSigmas(math.radians(0.5), 4e-3))
     found = calibrated(poses, views)
@@ -134,6 +138,8 @@ def test_hand_eye_of_a_poor_robot_says_so() -> None:
     assert "of a robot that is 2 mm and 0.25 deg off" in found.warnings[0].text
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_hand_eye_of_four_poses_expects_no_error() -> None:
     poses, views = measured("eye-in-hand", poses=5)
     assert math.isnan(calibrated(poses[:4], views[:4]).translation_error)

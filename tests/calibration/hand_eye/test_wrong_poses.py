@@ -45,6 +45,7 @@ def from_poses(robot: Any, seen: Any = SEEN, **options: Any) -> None:
     calibrate_hand_eye_from_poses(robot, seen, **{"setup": "eye-in-hand", **options})
 
 
+@pytest.mark.sampled(every=2)
 @pytest.mark.parametrize(
     "mirror", [MIRRORS[0], *(pytest.param(one, marks=pytest.mark.long) for one in MIRRORS[1:])]
 )

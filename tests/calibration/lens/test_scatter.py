@@ -58,6 +58,7 @@ def test_predicted_uncertainty_is_found_where_views_err_as_a_whole(
     assert np.sqrt(2 * predicted / observed.mean()) == pytest.approx(1.0, abs=0.15)
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize(
     "views_of",
     [bent_anew, rolled, lambda around, seed: seen(FISHEYE, poses(10, distance=0.2), seed=seed)],

@@ -145,6 +145,7 @@ def test_agreeing_with_two_wrong_of_six_never_takes_one_for_right(count: int) ->
         assert {seed % 6, (seed + 1 + seed % 5) % 6} == set(left_out.tolist()), seed
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("model", ["auto", "similarity", "homography"])
 def test_fit_plane_robust_of_a_tilted_camera_leaves_no_corner_out(model: Any) -> None:
     centred = FIVE_BY_FIVE - (0.15, 0.12)

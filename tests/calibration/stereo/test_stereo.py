@@ -194,6 +194,8 @@ def test_calibrate_stereo_of_a_camera_on_its_head_numbers_alike() -> None:
     assert found.bad_views == ()
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_calibrate_stereo_of_a_bent_sheet_finds_its_shape() -> None:
     bent = BOARD.points + np.random.default_rng(7).normal(size=(54, 3)) * 2e-4
     left, right = pairs(6, sigma=0.02, points=bent)
@@ -206,6 +208,8 @@ def test_calibrate_stereo_of_a_bent_sheet_finds_its_shape() -> None:
     assert found.held_out_epipolar < exact.held_out_epipolar
 
 
+@pytest.mark.long
+@pytest.mark.judged
 def test_calibrate_stereo_of_a_stretched_sheet_adjusts_it_or_says_so() -> None:
     stretched = as_meant(BOARD.points * [1.01, 1.0, 1.0], BOARD.points)
     left, right = pairs(8, points=stretched)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from smartcam.calibration import CameraModel, Folder, HandEyeCalibration, Transform
 from smartcam.calibration._inside import listing
@@ -123,6 +124,8 @@ async def test_view_without_a_sheet_is_taken_again(tmp_path: Path) -> None:
     assert (await say(session))["step"] == "view-2"
 
 
+@pytest.mark.long
+@pytest.mark.judged
 async def test_view_removed_is_calculated_without(tmp_path: Path) -> None:
     session = begin(tmp_path, Cell())
     await say(session)
@@ -163,6 +166,8 @@ async def test_views_are_there_again_after_a_crash(tmp_path: Path) -> None:
     again.close()
 
 
+@pytest.mark.long
+@pytest.mark.judged
 async def test_poses_typed_as_the_robot_writes_them_are_the_same(tmp_path: Path) -> None:
     cell = Cell()
     wizard = hand_eye_wizard(
@@ -212,6 +217,8 @@ def typed(pose: Transform) -> dict[str, float]:
     return dict(zip(ROBOTS["kuka"].numbers, pose_to("kuka", pose), strict=True))
 
 
+@pytest.mark.long
+@pytest.mark.judged
 async def test_touches_of_the_sheet_verify_a_calibration_or_refute_it(tmp_path: Path) -> None:
     session = begin(tmp_path, Cell())
     view = await say(session, {"setup": "eye-in-hand", "allowed": 4.0})

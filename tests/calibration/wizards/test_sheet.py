@@ -124,6 +124,8 @@ async def test_wrong_touch_is_touched_again_or_removed(tmp_path: Path) -> None:
     session.close()
 
 
+@pytest.mark.long
+@pytest.mark.judged
 async def test_print_that_is_smaller_is_told_unless_the_rulers_say_so(tmp_path: Path) -> None:
     cell = Cell(scale=0.97, sigma=0.0)
     session = begin(tmp_path, cell)
@@ -222,6 +224,8 @@ async def test_picture_without_the_sheet_keeps_the_step(
     session.close()
 
 
+@pytest.mark.long
+@pytest.mark.judged
 async def test_origin_that_is_not_marked_is_told(tmp_path: Path) -> None:
     cell = Cell()
     plain = Checkerboard(columns=9, rows=6, square=0.025)

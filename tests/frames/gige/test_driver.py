@@ -154,6 +154,7 @@ async def test_thousands_of_frames_of_a_bad_network_are_whole_or_lost(seed: int)
     assert one.counts.malformed == 0
 
 
+@pytest.mark.sampled(every=3)
 @pytest.mark.parametrize("extended", [False, True])
 @pytest.mark.parametrize("resend", ["answer", "ignore", "refuse"])
 @pytest.mark.parametrize(

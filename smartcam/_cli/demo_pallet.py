@@ -1,0 +1,285 @@
+"""``smartcam demo --pick --plain``: parts located in a plain camera's pictures, onto a pallet.
+
+A part and a mark are taught from drawn pictures. The robot touches the mark at nine places, and
+from these pairs comes the calibration; from then on the tool ``locate`` says each part's pose in
+the robot's frame, and how far off it may be. What the robot then does is compared with the truth,
+which a real cell does not know.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import smartcam
+from smartcam._cli.demo import Steps
+from smartcam._cli.demo_pick import nine_marks
+from smartcam._cli.demo_table import (
+    HEIGHT,
+    NOISE,
+    TOUCH_SIGMA,
+    DrawnTable,
+    Placed,
+    TableDriver,
+    TablePart,
+    TableRobot,
+    radius_of,
+)
+from smartcam._cli.options import naming
+from smartcam._cli.texts import table_text
+from smartcam._extras import load
+from smartcam.emulator import TablePose
+from smartcam.geometry import PlacePattern
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from smartcam._cli.options import Options
+    from smartcam.calibration import PlaneCalibration
+    from smartcam.inspection import PartModel
+
+MARKS_FILE, CELL_FILE = "marks.yaml", "cell.yaml"
+"""Cell files before and after the calibration."""
+
+MAX_PARTS: Final = 8
+"""Parts that are laid onto the table at once."""
+
+DOWN: Final = (0.0, 0.0, -1.0)
+"""Direction of the robot's tool when it touches."""
+
+TAUGHT: Final = TablePart("bracket", TablePose(0.15, 0.125, 0.4))
+"""The part as it lies in the picture that it is taught from."""
+
+MARKS_CELL: Final = """\
+cameras:
+  desk/camera:
+    software:
+      frames: {address} # the demo's own; yours is gige://HOST, v4l2:///dev/video0, rtsp://...
+      applications:
+        1: {{name: mark, locate: {{model: mark.model}}}}
+"""
+
+CELL: Final = """\
+cameras:
+  desk/camera:
+    software:
+      frames: {address} # the demo's own; yours is gige://HOST, v4l2:///dev/video0, rtsp://...
+      calibration: plane.json # results are in the robot's millimetres
+      keep: {{folder: judged, which: all}}
+      applications:
+        1: {{name: brackets, locate: {{model: bracket.model, most: {most}, seconds: 10}}}}
+"""
+
+
+class Grid(NamedTuple):
+    """The size of a pallet."""
+
+    rows: int
+    columns: int
+    layers: int
+
+
+async def palletize(options: Options, folder: Path, seed: int, grid: Grid) -> None:
+    """Teach, calibrate, and move parts from a table onto a pallet until it is full.
+
+    ``folder``: where the models, the calibration, the cell files and the pictures go; ``seed``: of
+    all noise, and of where things are. Raises MissingExtraError: the extra ``inspection`` is not
+    installed; ConfigurationError: the folder cannot be written.
+    """
+    load("scipy", "calibration needs")  # first, since all that comes before would be in vain
+    say = Steps(options)
+    with naming(f"--folder {folder}"):
+        await asyncio.to_thread(folder.mkdir, parents=True, exist_ok=True)
+    table = DrawnTable(seed)
+    TableDriver.tables[table.address] = table
+    try:
+        await _run(_Demo(options, say, folder, table, TableRobot(table, seed), grid))
+    finally:
+        del TableDriver.tables[table.address]
+
+
+class _Demo(NamedTuple):
+    options: Options
+    say: Steps
+    folder: Path
+    table: DrawnTable
+    robot: TableRobot
+    grid: Grid
+
+
+async def _run(demo: _Demo) -> None:
+    say, table = demo.say, demo.table
+    say.step(
+        f"A plain camera above a level table, drawn: {1e3 * table.pixel:g} mm a pixel, noise of "
+        f"{NOISE:g} grey levels. A robot beside it, which does not know where the table is.",
+        address=table.address,
+    )
+    bracket = await _taught(demo)
+    grip = table.shown(TAUGHT, bracket.reference)
+    await _calibrate(demo)
+    pattern = _pattern(demo)
+    await _write(demo, CELL_FILE, CELL.format(address=table.address, most=MAX_PARTS))
+    placed: list[Placed] = []
+    expected: list[float] = []
+    async with smartcam.connect(f"software:{demo.folder / CELL_FILE}") as camera:
+        timeout = demo.options.step(10.0)
+        while len(placed) < len(pattern):
+            if not table.parts:
+                table.lay("bracket", min(MAX_PARTS, len(pattern) - len(placed)))
+            result = await camera.trigger(timeout=timeout)
+            _palletize(demo, result.value, grip, pattern, placed, expected)
+            if not result.value.locate:
+                break
+        empty = (await camera.trigger(timeout=timeout)).value
+        reason = empty.reason or f"{len(empty.locate)} found"
+        say.step(f"Triggered once more: {reason}.", reason=reason, left=len(table.parts))
+    errors = [one.error for one in placed]
+    beside = [one.off_place for one in placed if one.taken]
+    say.detail(
+        f"   error {1e3 * _rms(errors):.3f} mm rms, predicted {1e3 * _rms(expected):.3f} mm; "
+        f"{len(beside)} of {len(pattern)} places filled, parts lie {1e3 * _rms(beside):.2f} mm rms "
+        "beside them",
+        error=_rms(errors),
+        predicted=_rms(expected),
+        filled=len(beside),
+        places=len(pattern),
+    )
+    say.step(
+        f"Models, calibration, cell file and pictures stand in {demo.folder}. Try on them what you "
+        "change:"
+    )
+    say.detail(f"   smartcam inspect {demo.folder / CELL_FILE} desk/camera 1 {demo.folder}/judged")
+
+
+async def _taught(demo: _Demo) -> PartModel:
+    """Teach both kinds of parts, each from one picture; return the model of the bracket."""
+    demo.say.step("Taught from one picture each, by a region around the part:")
+    rows: list[tuple[object, ...]] = []
+    for part in (TablePart("mark", TablePose(0.15, 0.125, 0.0)), TAUGHT):
+        demo.table.parts = [part]
+        with naming(f"--folder {demo.folder}"):
+            model = await asyncio.to_thread(_teach, demo, part)
+        place, angle = model.predicted_sigma()
+        rows.append(
+            (
+                part.kind,
+                model.symmetry.text(),
+                str(len(model.segments.halves)),
+                f"{1e3 * place * demo.table.pixel:.4f} mm",
+                "-" if math.isnan(angle) else f"{math.degrees(angle):.4f} deg",
+            )
+        )
+    head = ("part", "symmetry", "pieces of edges", "a pose is good to", "")
+    demo.say.detail(table_text(head, rows))
+    return model
+
+
+def _teach(demo: _Demo, part: TablePart) -> PartModel:
+    from smartcam.inspection import PartModel, Region
+
+    picture = demo.table.picture()
+    x, y, _ = demo.table.seen(part.pose)
+    reach = radius_of(part.kind) / demo.table.pixel + 12
+    corners = ((-reach, -reach), (reach, -reach), (reach, reach), (-reach, reach))
+    region = Region((x + dx, y + dy) for dx, dy in corners)
+    model = PartModel.teach(picture, region, name=part.kind)
+    model.write(demo.folder / f"{part.kind}.model")
+    return model
+
+
+async def _calibrate(demo: _Demo) -> PlaneCalibration:
+    """Have the camera locate the mark at nine places, and the robot touch it there."""
+    from smartcam.calibration import fit_plane
+
+    await _write(demo, MARKS_FILE, MARKS_CELL.format(address=demo.table.address))
+    seen: list[tuple[float, float]] = []
+    touched: list[list[float]] = []
+    async with smartcam.connect(f"software:{demo.folder / MARKS_FILE}") as camera:
+        for pose in nine_marks().values():
+            demo.table.parts = [TablePart("mark", pose)]
+            result = await camera.trigger(timeout=demo.options.step(10.0))
+            (mark,) = result.value.locate
+            seen.append((mark.x, -mark.y))  # y up, as calibrations have it
+            touched.append(demo.robot.touch_table(pose))
+    demo.table.parts = []
+    calibration = fit_plane(seen, touched, touch_sigma=TOUCH_SIGMA, tool_z=DOWN, y_down=True)
+    with naming(f"--folder {demo.folder}"):
+        await asyncio.to_thread(calibration.save, demo.folder / "plane.json")
+    held_out = calibration.held_out_error or math.nan
+    demo.say.step(
+        f"The mark, located and touched at nine places ({1e3 * TOUCH_SIGMA:g} mm of noise on each "
+        f"axis). Calibrated ({calibration.model}): each touch against a calibration from the "
+        f"others, {1e3 * held_out:.2f} mm rms, the touch's own noise included",
+        model=calibration.model,
+        held_out_error=held_out,
+        warnings=[remark.text for remark in calibration.warnings],
+    )
+    return calibration
+
+
+def _pattern(demo: _Demo) -> PlacePattern:
+    """Have the robot touch three places of the pallet."""
+    rows, columns, layers = demo.grid
+    ends = ((0, 0), (columns - 1, 0), (0, rows - 1))
+    first, row_end, column_end = (demo.robot.touch_pallet(*end) for end in ends)
+    pattern = PlacePattern.from_touches(
+        first, row_end, column_end, rows=rows, columns=columns, layers=layers, height=HEIGHT
+    )
+    across, along, _ = pattern.pitch
+    demo.say.step(
+        f"A pallet of {rows} rows, {columns} columns and {layers} layers, of which the robot "
+        f"touched three corners: {1e3 * across:.2f} mm from column to column, {1e3 * along:.2f} mm "
+        "from row to row",
+        places=len(pattern),
+    )
+    return pattern
+
+
+def _palletize(
+    demo: _Demo,
+    value: Any,
+    grip: TablePose,
+    pattern: PlacePattern,
+    placed: list[Placed],
+    expected: list[float],
+) -> None:
+    """Move every part that was found to the next place, and print how well."""
+    rows: list[tuple[object, ...]] = []
+    for part in value.locate:
+        number = sum(one.taken for one in placed)
+        if number == len(pattern):
+            break
+        found = (part.x, part.y, part.theta)
+        sigma = math.hypot(part.sigma_x, part.sigma_y)
+        one = demo.robot.palletize(found, grip, pattern, number)
+        placed.append(one)
+        expected.append(sigma)
+        rows.append(
+            (
+                *(f"{1e3 * length:.2f}".rjust(8) for length in (part.x, part.y)),
+                *(f"{1e3 * length:.3f}" for length in (one.error, sigma)),
+                f"{math.degrees(one.turned):+.3f}",
+                f"{math.degrees(part.sigma_theta):.3f}",
+                "/".join(str(1 + count) for count in pattern.at(number)) if one.taken else "missed",
+                f"{1e3 * one.off_place:.2f}",
+            )
+        )
+    demo.say.step(
+        f"Triggered: {len(value.locate)} parts in the robot's frame. It moves each of them to the "
+        "next place (row/column/layer), mm and degrees:"
+        if rows
+        else f"Triggered: {value.reason}"
+    )
+    head = ("x", "y", "error", "predicted", "turned by", "predicted", "place", "off it")
+    if rows:
+        demo.say.detail(table_text(head, rows), placed=placed[-len(rows) :])
+
+
+async def _write(demo: _Demo, name: str, text: str) -> None:
+    with naming(f"--folder {demo.folder}"):
+        await asyncio.to_thread((demo.folder / name).write_text, text, encoding="utf-8")
+
+
+def _rms(values: list[float]) -> float:
+    return math.hypot(*values) / math.sqrt(max(len(values), 1))

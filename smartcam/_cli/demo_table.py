@@ -1,0 +1,365 @@
+"""A drawn table for ``smartcam demo --pick --plain``: a plain camera above it, a robot beside it.
+
+Parts lie on the table at true poses that only the comparison looks at. The camera's pictures are
+drawn from them: each pixel is the mean of what a blur makes of the parts, with noise.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import math
+import time
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.emulator import TablePose, TableScene
+from smartcam.emulator._inside import TABLE_SIZE
+from smartcam.exceptions import ConfigurationError
+from smartcam.frames import Frame, FrameDriver, Moment, StreamFormat, find_format
+from smartcam.geometry import Transform
+from smartcam.registry import FRAMES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from smartcam.frames import FrameAddress, FrameSink
+    from smartcam.geometry import PlacePattern
+
+    Array = NDArray[np.float64]
+
+SCHEME: Final = "drawn"
+"""Scheme of the source's address."""
+
+SIZE_PX: Final = (1280, 1024)
+"""Width and height of a picture."""
+
+FRAMES_PER_SECOND: Final = 8.0
+"""Pictures a second while somebody reads."""
+
+DARK, CONTRAST, NOISE = 60.0, 130.0, 2.0
+"""Grey levels: of the table, from it to the parts, and of the noise (standard deviation)."""
+
+BLUR_PX: Final = 0.8
+"""Standard deviation of the lens' blur."""
+
+SAMPLES: Final = 8
+"""Samples along each side of a pixel."""
+
+TOUCH_SIGMA: Final = 2e-4
+"""Standard deviation of a touch along each of the robot's axes, metres."""
+
+GRIP: Final = 2e-3
+"""Metres by which the gripper may miss a part and still take it."""
+
+HEIGHT: Final = 0.008
+"""Thickness of a part, metres."""
+
+PITCH: Final = (0.040, 0.035)
+"""Distances of the true pallet's columns and rows, metres."""
+
+MIN_GAP: Final = 0.004
+"""Metres between the circles around two parts, and around a part and the table's edge."""
+
+
+class PaintedShape(NamedTuple):
+    """A polygon of a part."""
+
+    level: float  # 0 to 1: from the table's grey level to the part's
+    corners: Array  # (K, 2), metres in the part's own frame
+
+
+def _disc(level: float, x: float, y: float, radius: float) -> PaintedShape:
+    turns = np.linspace(0.0, math.tau, 120, endpoint=False)
+    return PaintedShape(
+        level, np.column_stack([x + radius * np.cos(turns), y + radius * np.sin(turns)])
+    )
+
+
+def _polygon(level: float, *corners: tuple[float, float]) -> PaintedShape:
+    return PaintedShape(level, np.array(corners))
+
+
+KINDS: Final[dict[str, tuple[PaintedShape, ...]]] = {
+    "mark": (_disc(1.0, 0, 0, 0.009), _disc(0.0, 0, 0, 0.004)),
+    "bracket": (
+        _polygon(
+            1.0,
+            *((-0.015, -0.010), (0.010, -0.010), (0.010, -0.001)),
+            *((0.0, 0.001), (0.0, 0.010), (-0.015, 0.010)),
+        ),
+        _disc(0.0, -0.0095, 0.0045, 0.003),
+        _disc(0.0, 0.005, -0.0055, 0.0018),
+    ),
+}
+"""Parts by the names of their kinds."""
+
+
+def radius_of(kind: str) -> float:
+    """Return the distance of the farthest edge of a part from its own frame's origin, metres."""
+    return max(float(np.linalg.norm(one.corners, axis=1).max()) for one in KINDS[kind])
+
+
+class TablePart(NamedTuple):
+    """A part on the table."""
+
+    kind: str
+    pose: TablePose
+
+
+class DrawnTable:
+    """Parts on a table, and the camera above it, as a source of frames.
+
+    Args:
+        seed: seed of the noise.
+
+    Attributes:
+        parts: parts on the table; a change is seen in the next picture.
+        address: address of the camera's frames.
+    """
+
+    _numbers: ClassVar[itertools.count[int]] = itertools.count(1)
+
+    def __init__(self, seed: int) -> None:
+        self.parts: list[TablePart] = []
+        self.address: str = f"{SCHEME}://table{next(self._numbers)}"
+        self._camera = TableScene(y_down=True, offset=(45.0, 1010.0))
+        self._random = np.random.default_rng(seed)
+        self._drawn: tuple[list[TablePart], NDArray[np.float32]] | None = None
+
+    @property
+    def pixel(self) -> float:
+        """Side of a pixel on the table, metres."""
+        return 1.0 / self._camera.scale
+
+    def seen(self, pose: TablePose) -> tuple[float, float, float]:
+        """Return the camera's view of a pose: x, y (pixels), angle from x towards y (radians)."""
+        return self._camera.to_pixels(pose)
+
+    def lay(self, kind: str, count: int) -> None:
+        """Clear the table, and lay parts that do not touch anywhere onto it."""
+        reach = radius_of(kind) + MIN_GAP
+        low, high = np.array([reach, reach]), np.array(TABLE_SIZE) - reach
+        places: list[Array] = []
+        for place in self._random.uniform(low, high, (2000, 2)):
+            if all(np.linalg.norm(place - other) > 2 * reach for other in places):
+                places.append(place)
+                if len(places) == count:
+                    break
+        else:
+            raise ConfigurationError(f"demo: the table has no room for {count} parts")
+        turns = self._random.uniform(-math.pi, math.pi, count)
+        self.parts = [
+            TablePart(kind, TablePose(float(x), float(y), float(turn)))
+            for (x, y), turn in zip(places, turns, strict=True)
+        ]
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return a picture of the table as it is now, (H, W), with noise of its own."""
+        parts = list(self.parts)
+        if self._drawn is None or self._drawn[0] != parts:
+            self._drawn = parts, self._levels(parts)
+        levels = self._drawn[1]
+        noise = self._random.standard_normal(levels.shape, np.float32)
+        return np.clip(np.rint(levels + NOISE * noise), 0, 255).astype(np.uint8)
+
+    def _levels(self, parts: list[TablePart]) -> NDArray[np.float32]:
+        """Return the grey levels of the parts without noise."""
+        canvas = np.full(SIZE_PX[::-1], DARK, np.float32)
+        for part in parts:
+            corner, light = self._drawn_part(part)
+            low = np.maximum(corner, 0)
+            high = np.minimum(corner + light.shape[::-1], SIZE_PX)
+            shown = light[low[1] - corner[1] : high[1] - corner[1], low[0] - corner[0] :]
+            canvas[low[1] : high[1], low[0] : high[0]] += CONTRAST * shown[:, : high[0] - low[0]]
+        return canvas
+
+    def _drawn_part(self, part: TablePart) -> tuple[NDArray[np.int_], NDArray[np.float32]]:
+        """Return the first pixel of a part's patch, and the part's light in it, 0 to 1."""
+        cv2 = load("cv2", "inspection needs")
+        u, v, _ = self.seen(part.pose)
+        reach = math.ceil(radius_of(part.kind) / self.pixel + 5 * BLUR_PX + 1)
+        corner = np.array([math.floor(u) - reach, math.floor(v) - reach])
+        side = 2 * reach + 2
+        fine = np.zeros((side * SAMPLES, side * SAMPLES), np.uint8)
+        for shape in KINDS[part.kind]:
+            at = (self._in_picture(part.pose, shape.corners) - corner + 0.5) * SAMPLES - 0.5
+            level = round(255 * shape.level)
+            cv2.fillPoly(fine, [np.rint(16 * at).astype(np.int32)], level, cv2.LINE_8, 4)
+        smooth = cv2.GaussianBlur(fine.astype(np.float32), (0, 0), BLUR_PX * SAMPLES)
+        light = cv2.resize(smooth, (side, side), interpolation=cv2.INTER_AREA) / 255
+        return corner, np.asarray(light, np.float32)
+
+    def _in_picture(self, pose: TablePose, points: Array) -> Array:
+        """Return points (N, 2) of a part as pixels."""
+        cos, sin = math.cos(pose.theta), math.sin(pose.theta)
+        placed = points @ [[cos, sin], [-sin, cos]] + (pose.x, pose.y)
+        return np.array([self.seen(TablePose(x, y, 0.0))[:2] for x, y in placed])
+
+    def shown(self, taught: TablePart, reference: tuple[float, float]) -> TablePose:
+        """Return the pose of a model's reference in its part's own frame.
+
+        ``taught``: the part as it lay in the picture that was taught; ``reference``: the place of
+        the model's reference there, pixels. This is the truth that a real cell does not know.
+        """
+        there = self._on_table(*reference)
+        ahead = self._on_table(reference[0] + 1.0, reference[1])
+        angle = math.atan2(ahead[1] - there[1], ahead[0] - there[0]) - taught.pose.theta
+        cos, sin = math.cos(taught.pose.theta), math.sin(taught.pose.theta)
+        x, y = there[0] - taught.pose.x, there[1] - taught.pose.y
+        return TablePose(cos * x + sin * y, cos * y - sin * x, angle)
+
+    def _on_table(self, u: float, v: float) -> tuple[float, float]:
+        origin, ahead = self.seen(TablePose(0, 0, 0)), self.seen(TablePose(1, 0, 0))
+        along = complex(ahead[0] - origin[0], -(ahead[1] - origin[1]))
+        place = complex(u - origin[0], -(v - origin[1])) / along
+        return place.real, place.imag
+
+
+class TableDriver(FrameDriver):
+    """The pictures of a :class:`DrawnTable`, by its address."""
+
+    times_frames = True
+    tables: ClassVar[dict[str, DrawnTable]] = {}
+
+    def __init__(self, address: FrameAddress) -> None:
+        super().__init__(address)
+        if address.url not in self.tables:
+            raise ConfigurationError(f"frame source {address.url!r}: there is no such table")
+        self._table = self.tables[address.url]
+        self._task: asyncio.Task[None] | None = None
+        self._number = 0
+
+    async def open(self) -> StreamFormat:
+        """Return the format, size and rate of the pictures."""
+        return StreamFormat(find_format("Mono8"), *SIZE_PX, (FRAMES_PER_SECOND,))
+
+    async def start(self, sink: FrameSink) -> None:
+        """Begin to draw."""
+        self._task = asyncio.create_task(self._draw(sink), name=f"frames of {self.name}")
+
+    async def stop(self) -> None:
+        """Draw no longer."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def close(self) -> None:
+        """Have nothing left."""
+        await self.stop()
+
+    async def _draw(self, sink: FrameSink) -> None:
+        while True:
+            captured, utc = time.monotonic(), time.time()
+            picture = await asyncio.to_thread(self._table.picture)
+            self._number += 1
+            sink.frame(
+                Frame(
+                    data=picture.tobytes(),
+                    format=find_format("Mono8"),
+                    width=SIZE_PX[0],
+                    height=SIZE_PX[1],
+                    stride=SIZE_PX[0],
+                    captured=captured,
+                    utc=utc,
+                    moment=Moment.EXPOSURE_START,
+                    sequence=self._number,
+                    source=self.name,
+                )
+            )
+            await asyncio.sleep(max(0.0, captured + 1 / FRAMES_PER_SECOND - time.monotonic()))
+
+
+FRAMES.register(SCHEME, TableDriver)
+
+
+class Placed(NamedTuple):
+    """The outcome of picking a part and putting it onto the pallet."""
+
+    x: float  # where the robot went, metres in the robot's frame
+    y: float  # the same
+    error: float  # distance from there to the part, metres
+    turned: float  # by how much the gripper's heading was off, radians
+    taken: bool  # whether it was near enough
+    off_place: float  # distance of the part from its place on the pallet, metres; NaN: none there
+
+
+class TableRobot:
+    """A robot beside a level table, whose place it does not know; a pallet stands behind it.
+
+    Args:
+        table: the table.
+        seed: seed of where the table and the pallet are, and of the noise of the touches.
+    """
+
+    def __init__(self, table: DrawnTable, seed: int) -> None:
+        self._table = table
+        self._random = np.random.default_rng([seed, 1])
+        self._true = self._level("table", 0.0)
+        self._pallet = self._level("pallet", 0.8)
+
+    def _level(self, name: str, far: float) -> Transform:
+        x, y, z, turn = self._random.uniform([far - 0.2, -0.4, 0, -3], [far + 0.2, 0.4, 0.3, 3])
+        cos, sin = math.cos(turn), math.sin(turn)
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+        return Transform("robot", name, rotation, np.array([x, y, z]))
+
+    def touch_table(self, pose: TablePose) -> list[float]:
+        """Return the robot's reading when its tip touches a place on the table, metres."""
+        return self._touch(self._true.apply([pose.x, pose.y, 0.0]))
+
+    def touch_pallet(self, column: int, row: int) -> list[float]:
+        """Return the robot's reading when its tip touches a place of the pallet, metres."""
+        return self._touch(self._pallet.apply([column * PITCH[0], row * PITCH[1], 0.0]))
+
+    def _touch(self, true: Array) -> list[float]:
+        touched: list[float] = (true + self._random.normal(0.0, TOUCH_SIGMA, 3)).tolist()
+        return touched
+
+    def palletize(
+        self,
+        found: tuple[float, float, float],
+        grip: TablePose,
+        pattern: PlacePattern,
+        number: int,
+    ) -> Placed:
+        """Pick the part that is nearest to a found pose, and put it onto a place of the pallet.
+
+        ``found``: x and y (metres) and heading of the part's reference in the robot's frame;
+        ``grip``: the true pose of the reference in the part's frame.
+        """
+        off, part = min(
+            ((self._off(one, found, grip), one) for one in self._table.parts),
+            key=lambda pair: abs(pair[0][0]),
+        )
+        error, turned = abs(off[0]), off[1]
+        if error > GRIP:
+            return Placed(found[0], found[1], error, turned, False, math.nan)
+        self._table.parts.remove(part)
+        row, column, layer = pattern.at(number)
+        true = self._pallet.apply([column * PITCH[0], row * PITCH[1], layer * HEIGHT])
+        # the part lies in the gripper as it was picked, and moves along with it
+        place = pattern[number]
+        held = place.rotation[:2, :2] @ _turned([off[0].real, off[0].imag], -found[2])
+        off_place = float(np.linalg.norm(place.translation[:2] + held - true[:2]))
+        return Placed(found[0], found[1], error, turned, True, off_place)
+
+    def _off(
+        self, part: TablePart, found: tuple[float, float, float], grip: TablePose
+    ) -> tuple[complex, float]:
+        """Return the offset of a part's reference from a pose, and the angle it is turned by."""
+        pose = part.pose
+        x, y = _turned([grip.x, grip.y], pose.theta).tolist()
+        there = self._true.apply([pose.x + x, pose.y + y, 0.0])
+        heading = pose.theta + grip.theta + math.atan2(*self._true.rotation[1::-1, 0])
+        off = complex(there[0] - found[0], there[1] - found[1])
+        return off, math.remainder(found[2] - heading, math.tau)
+
+
+def _turned(place: Any, angle: float) -> Array:
+    cos, sin = math.cos(angle), math.sin(angle)
+    turned: Array = np.array([[cos, -sin], [sin, cos]]) @ np.asarray(place)
+    return turned
