@@ -18,7 +18,7 @@ class KnowsForks(Protocol):
     """An object that is told of forks."""
 
     def forked(self) -> None:
-        """Be the copy in a fork: no other thread is there, and nothing may be waited for."""
+        """Start anew in a fork: no other thread is there, and nothing may be waited for."""
 
 
 _told: weakref.WeakSet[Any] = weakref.WeakSet()

@@ -2,8 +2,8 @@
 
 One timer, there as long as a wait for a status or a trigger is under way, or statuses or events are
 subscribed to. It asks while no question is open, whoever asked; one that was not answered is
-repeated after a while, since a datagram may be lost. On TCP none is: there a camera that says
-something and answers no question does not say what it should, and the link is given up.
+repeated after a while, since a datagram may be lost. On TCP nothing is lost: if a camera sends
+other messages there but no answer, the link is given up.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Polling:
         self._running = False
         self._triggered = False  # a trigger is under way
         self._timer: asyncio.TimerHandle | None = None
-        self._due = 0.0  # when it fires: what uvloop gives does not tell
+        self._due = 0.0  # when it fires: a timer of uvloop does not tell
         self._open_since = 0.0
         self._heard = -1  # statuses that had come when this timer looked last
 
@@ -125,5 +125,5 @@ class Polling:
 
     @property
     def _may_be_silent(self) -> bool:
-        """Something is loaded or inspected, and one thing may be done after the other."""
+        """The camera loads or inspects, and may answer only after that."""
         return self._waits.owes(SwitchAnswer) or self._waits.owes(TriggerAnswer)

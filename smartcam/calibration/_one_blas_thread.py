@@ -21,8 +21,8 @@ class OneBlasThread(ContextDecorator):
     """Have BLAS use one thread inside of ``with``, or in a function, and afterwards what it did.
 
     Whether that is a matter of the calling thread or of the process depends on the version of
-    threadpoolctl (extra ``calibration``). So each thread limits it, and gives back what the first
-    of those inside found. Without threadpoolctl nothing changes.
+    threadpoolctl (extra ``calibration``). So each thread sets the limit, and the number that the
+    first one found is restored. Without threadpoolctl nothing changes.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class OneBlasThread(ContextDecorator):
         tell_of_forks(self)
 
     def forked(self) -> None:
-        """Be the copy in a fork, which may go on with one thread."""
+        """Start anew in a fork, which may go on with one thread."""
         self._lock = threading.Lock()
         self._inside: Counter[int] = Counter()  # how deep, by thread
         self._before: Any = None

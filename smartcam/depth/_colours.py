@@ -118,7 +118,7 @@ class ColourRange:
         return around_hsv(hsv(picture), x, y, radius, margin)
 
     def as_json(self) -> str:
-        """Return the range as JSON, of which ``ColourRange(**json.loads(text))`` makes it again."""
+        """Return the range as JSON; ``ColourRange(**json.loads(text))`` reads it."""
         return json.dumps(asdict(self))
 
 

@@ -145,7 +145,7 @@ _CHECKS = (
     _DoctorCheck("layout", result_checks.look_at_results, lambda options: 10.0),
     _DoctorCheck("clock", state_checks.look_at_clock, _requests),
 )
-"""In their order, behind those of a camera at the wire or in a fleet. The limits are there for a
+"""The checks in their order, after those of the wire or of the fleet. The limits are there for a
 fault of ours: each step has a bound of its own. Their sum, and a second for the end of the session,
 bounds the whole."""
 
@@ -164,7 +164,7 @@ async def examine(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield what is found, as it is found.
 
-    Connecting takes the camera from another client, which is the first thing that is said. Nothing
+    Connecting takes the camera from another client: the first finding says so. Nothing
     is started, stopped, switched or set, and nothing is triggered, unless ``trigger`` says so.
 
     Args:
@@ -183,8 +183,8 @@ async def examine(
     Raises:
         ConfigurationError: an address, a layout or a number cannot work; nothing was tried.
 
-    Cancellation: the session is ended in order, an application that was loaded goes back. So is it
-    when the generator is closed: use :func:`contextlib.aclosing`.
+    Cancellation: the session is ended in order, and the application that was loaded before is
+    loaded again. The same happens when the generator is closed: use :func:`contextlib.aclosing`.
     """
     if application is not None:
         application = check_application(application, who="doctor")

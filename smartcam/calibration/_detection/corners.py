@@ -59,7 +59,7 @@ class Corners(NamedTuple):
     # (N,), half the step from black to white, grey levels; positive where the squares between the
     # two ways, and opposite, are black
     gains: Array
-    # (N,), whether the fit was good; a corner is where it started elsewhere
+    # (N,), whether the fit was good; otherwise the corner stays where it was
     fitted: NDArray[np.bool_]
 
 

@@ -40,7 +40,7 @@ MIN_TOOL_COSINE = 0.17
 """Cosine between tool and normal below which the tool's axis does not tell the side."""
 
 MAX_POINTS_FOR_PAIRS = 25
-"""Points up to which it is tried what two of them explain; of more, two hardly move the map."""
+"""Points up to which each pair of them is left out in turn; of more, two hardly move the map."""
 
 MIN_POINTS_LEFT = 3
 """More points must be left where some are left out: three fit a similarity nearly always."""
@@ -49,11 +49,11 @@ MIN_DEGREES_OF_FREEDOM = 6
 """An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
 
 TYPICAL_SIGMA = 0.0002
-"""Metres: sigma of a careful touch, for as many degrees of freedom as an estimate of it lacks."""
+"""Metres: sigma of a careful touch, used for the degrees of freedom that an estimate lacks."""
 
 
 class Limit(NamedTuple):
-    """The most that a coordinate of a touch may be off where nobody says: a standard deviation."""
+    """The largest standard deviation of a touch's coordinate, unless the caller gives another."""
 
     touch: float  # of the robot's tip, metres
     part: float  # of the camera, a part of the field
@@ -64,8 +64,8 @@ class Limit(NamedTuple):
 
 
 MAX_SIGMA = Limit(0.0005, 0.001)
-"""Residuals that speak of more may be mistakes: a robot that is led by hand and a camera of 640 x
-480 pixels stay within it."""
+"""Larger residuals may be mistakes: a robot that is led by hand and a camera of 640 x 480 pixels
+stay within it."""
 
 _TINY = 1e-8
 

@@ -88,7 +88,7 @@ class _Agreement(NamedTuple):
     """Points that agree."""
 
     fitted: Fit
-    mask: Mask  # (N,), which they are
+    mask: Mask  # (N,), True for those points
     cost: float  # sum of their squares, and the threshold for each other point
 
     @property
@@ -105,8 +105,8 @@ def agreeing(
     All, where no subset determines a map: what is wrong with such points is for ``check_samples``
     to say. ``camera`` (N, 2), N at least 6; ``robot`` (N, 3), metres; ``weights`` (N,), one over
     the relative variance of each. ``touch_sigma``: of one coordinate, metres; None: from the
-    residuals of those that agree. Then about (N - 3) / 2 wrong points are found, with it all that
-    are fewer than half.
+    residuals of those that agree. Without a sigma about (N - 3) / 2 wrong points are found, with
+    one any number below half of the points.
 
     Raises TOO_FEW, or OUTLIER: no map agrees with more than half of the points;
     MissingExtraError: SciPy is not installed.
@@ -133,7 +133,7 @@ def agreeing(
 
 
 def _about_median(camera: Array, robot: Array, weights: Array) -> tuple[Pairs, float]:
-    """Return the points near to 1, however far off some are, and what 1 is in the robot's space."""
+    """Return the points about their medians in units of their size, and the robot's unit."""
     scaled, size = [], 0.0
     for points in (camera, robot):
         centred = points - np.median(points, axis=0)

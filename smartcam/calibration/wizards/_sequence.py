@@ -16,8 +16,8 @@ whose outcome is written into the journal together with the answers. So the coro
 list of its answers and outcomes, and nothing else. To undo is to run the coroutine again with one
 less; to resume after a crash is to run it again with all of them. Neither repeats an action.
 
-An error keeps the step: of an answer, of an action, and of what the coroutine does with them before
-it asks for the next step. Only a step that was taken is written.
+After an error the step stays the same, whether the answer was wrong, the action failed, or the
+coroutine failed before its next step. Only a step that was taken is written.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Wizard:
 
 
 class _ScriptRun:
-    """The coroutine, brought to where some entries lead."""
+    """The coroutine, run as far as some entries of the journal lead."""
 
     def __init__(
         self, wizard: Wizard, parameters: Mapping[str, Any], entries: list[dict[str, Any]]

@@ -4,11 +4,11 @@ Two agents of one name see each other's starts. The earlier start keeps the name
 gives up its cameras, and says so.
 
 An agent says by its presence that it has a camera. Another one with the same camera either refuses
-to start, or stands by: without a session, until that presence ends. Two that have a camera both,
-behind a split of the network, leave it to the camera, which serves the newcomer: whoever has lost
-its session and sees another's presence asks that agent, and lets it have the camera. Both may let
-go of it at the same time; so who has stopped because the camera was taken, and sees that the other
-one has it no more, stands by again.
+to start, or stands by: without a session, until that presence ends. If a split of the network made
+two agents have one camera, the camera decides, which serves the newcomer: the agent that has lost
+its session and sees the other's presence asks that one, and lets it have the camera. Both may let
+go of it at the same time; so an agent that gave the camera up, and sees that the other one does not
+have it any more, stands by again.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ RESOLVE_TIMEOUT = 2.0
 RETURN_WAIT = 4.0
 """Seconds for others to be back on a bus that was away, before what they had is taken over."""
 
-CONTEST = 30.0
-"""Seconds behind the last word of another agent that has a camera, too, in which it may be that one
-who takes it from us."""
+CONTESTED_SECONDS = 30.0
+"""Seconds after another agent with the same camera came or went, in which that agent may be the one
+that takes the camera from us."""
 
-CALM = 600.0
-"""Seconds in which a camera that was taken is not taken again a second time: it may be no agent who
-takes it, and that one would again, too."""
+TAKE_ONCE_SECONDS = 600.0
+"""Seconds in which a camera that was lost to somebody is not taken back a second time: a client
+that is no agent would take it again, too."""
 
 
 class Claims:
@@ -290,7 +290,7 @@ class Claims:
         (others.add if present else others.discard)(agent)
         now = asyncio.get_running_loop().time()
         if now >= self._calm.get(name, now):
-            self._contested[name] = now + CONTEST
+            self._contested[name] = now + CONTESTED_SECONDS
         return name
 
     def _on_presence(self, key: str, present: bool) -> None:
@@ -395,7 +395,7 @@ class Claims:
             elif self._standby is not None and _is_taken(host):
                 logger.warning("! %s: no agent has it: %s stands by", name, agent.name)
                 self._contested.pop(name, None)
-                self._calm[name] = asyncio.get_running_loop().time() + CALM
+                self._calm[name] = asyncio.get_running_loop().time() + TAKE_ONCE_SECONDS
                 await agent.unshare(name, "another client has taken it")
                 self._again.add(name)
                 return

@@ -148,7 +148,7 @@ class Stream:
             return
         if self._timer is not None:
             self._timer.cancel()
-        self._timer_at = deadline  # what uvloop gives does not tell
+        self._timer_at = deadline  # a timer of uvloop does not tell
         self._timer = self._loop.call_at(deadline, self._due)
 
     def _due(self) -> None:

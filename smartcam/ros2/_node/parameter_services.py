@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_NAMES = 1024
-"""Names in a request; one with more is refused: a list is empty, a set says why."""
+"""Most names in a request; one with more is refused: list gives nothing, set gives the reason."""
 
 MAX_REASON_CHARACTERS = 1000
-"""Characters of why a set did not work."""
+"""Characters of the reason why parameters could not be set."""
 
 NAMES_PER_TURN = 64
 """Names until other things have their turn."""
