@@ -271,7 +271,7 @@ async def test_after_never_gives_a_picture_of_before(camera: Camera) -> None:
                 frame = await source.after(moment)
                 last = max(number for number in sent if number % COUNT == numbers([frame])[0])
                 assert moment <= sent[last]
-                assert time.monotonic() - sent[last] < 0.25, "a picture came with the next one"
+                assert last == max(sent), "a picture came with the next one"
 
 
 async def test_other_places_for_a_track_and_for_play(camera: Camera) -> None:
