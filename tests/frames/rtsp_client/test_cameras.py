@@ -260,7 +260,7 @@ async def test_after_never_gives_a_picture_of_before(camera: Camera) -> None:
         sent[number] = time.monotonic()
         return False
 
-    camera.ends, camera.every = note, 0.3
+    camera.ends, camera.every = note, 0.5
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
         url = f"rtsp://{where}#timeout=3&delay=0.02"
         async with frames.open(url) as source, source.reader():
