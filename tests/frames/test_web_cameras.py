@@ -28,7 +28,7 @@ HEAD = b"HTTP/1.1 200 OK\r\nContent-Type: %s\r\n%s\r\n"
 
 
 class Pace:
-    """When a camera sends a picture: each 0.2 s of the loop's time, or up to the one it may."""
+    """The times at which a camera sends: each 0.2 s of the loop, or up to the one it may."""
 
     def __init__(self) -> None:
         self.most: int | None = None

@@ -417,7 +417,7 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _made_of(self, message: Message) -> _Made:
-        """Return what a message with a body makes; a camera says the same objects again and again.
+        """Return the objects of a message with a body; a camera says the same ones again and again.
 
         Of those with data, such as results, only the last one is known.
         """

@@ -48,7 +48,7 @@ class Bench:
 
     @functools.cached_property
     def views(self) -> list[TargetView]:
-        """What is seen without noise."""
+        """The view without noise."""
         return lenskit.seen(self.camera, self.poses, sigma=1e-9)
 
     @functools.cached_property
