@@ -131,7 +131,6 @@ def _framed(dialect: FramedDialect) -> list[Parser]:
                 functools.partial(_session, dialect, role, Transport.TCP),
                 streamed(_frames(dialect)),
                 DEFAULT_MAX_LENGTH,
-                LineDialect,
                 "protocols._framed.framing.DEFAULT_MAX_LENGTH",
                 size=1 << 14,
             )
