@@ -31,6 +31,8 @@ PACKAGES: Final = {
     "av": Package("PyAV", "video", "video needs"),
     "cryptography": Package("cryptography", "fleet", "certificates need"),
     "cv2": Package("OpenCV", "calibration", "calibration needs"),
+    "ezdxf": Package("ezdxf", "inspection", "outlines in DXF need"),
+    "fontTools": Package("fontTools", "inspection", "outlines in SVG need"),
     "hypothesis": Package("hypothesis", "suites", "smartcam's suites draw bytes with"),
     "imagecodecs": Package("imagecodecs", "frames", "PNG and JPEG XL need"),
     "lz4": Package("lz4", "record", "recordings need"),

@@ -143,8 +143,8 @@ def plain(value: Any) -> Any:
         if _PLAIN.issuperset(map(type, fields.values())):
             return fields
         return {name: plain(one) for name, one in fields.items()}
-    numpy = sys.modules.get("numpy")
-    if numpy is not None and kind is numpy.ndarray:
+    # another thread may be importing numpy just now
+    if kind is getattr(sys.modules.get("numpy"), "ndarray", None):
         rows = _rows(value)
         if rows is not None:
             return rows

@@ -544,7 +544,9 @@ def jsonable(value: object) -> Any:
 
 
 def _jsonable_container(value: Any) -> Any:
-    numpy = sys.modules.get("numpy")  # never imported for JSON's sake
+    # never imported for JSON's sake; another thread may be importing it just now
+    numpy = sys.modules.get("numpy")
+    arrays = getattr(numpy, "ndarray", ()), getattr(numpy, "generic", ())
     if hasattr(value, "_asdict"):
         return {name: jsonable(item) for name, item in value._asdict().items()}
     if dataclasses.is_dataclass(value):
@@ -555,7 +557,7 @@ def _jsonable_container(value: Any) -> Any:
         return [jsonable(item) for item in cast("Iterable[Any]", value)]
     if isinstance(value, datetime):
         return value.isoformat()
-    if numpy is not None and isinstance(value, (numpy.ndarray, numpy.generic)):
+    if isinstance(value, arrays):
         return _jsonable_array(value.tolist(), value.dtype.names)
     if hasattr(value, "model_dump"):
         return jsonable(value.model_dump())

@@ -514,11 +514,15 @@ class WireCamera(Server):
 
     def traced(self, link: ClientLink, sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
         """Note a frame that a machine saw, or bytes that make no frame."""
-        self._traffic.add(self.clock.now, link.peer, sender, what, link.hearing)
+        traffic, now = self._traffic, self.clock.now
+        if isinstance(what, Frame):
+            traffic.entries.append((now, link.peer, sender, what, link.hearing, None))
+            if sender is m.Sender.CLIENT:
+                traffic.count(what)
+        else:
+            traffic.add(now, link.peer, sender, what, link.hearing)
         if _log.isEnabledFor(logging.DEBUG):
             self._show_last()
-        if sender is m.Sender.CLIENT and isinstance(what, Frame):
-            self._traffic.count(what)
 
     def passed(self, link: ClientLink, sender: m.Sender, message: WireMessage) -> None:
         """Note in the log a message that passed or is lost, as faults have made it."""

@@ -36,8 +36,8 @@ from smartcam.frames._streaming.rtsp_client.ways import options_of
 from smartcam.frames._video import multipart as _multipart
 from smartcam.frames._video import redirects as _redirects
 from smartcam.gateway._lines import MAX_LINE_BYTES, NotWritableError, RequestReader
+from smartcam.makes import PCIC
 from smartcam.makes._ifm.chunks import ImageChunk, read_chunks
-from smartcam.makes._ifm.dialect import V3
 from smartcam.makes._ifm.layouts import check_layout
 from smartcam.models import Status
 from smartcam.protocols import (
@@ -210,7 +210,9 @@ def _line_machine(pieces: list[bytes]) -> None:
 
 
 def _ifm_machine(pieces: list[bytes]) -> None:
-    machine = LineMachine(V3, Role.CLIENT, Transport.TCP, max_length=DEFAULT_MAX_LENGTH)
+    dialect = PCIC.dialects["v3"]
+    assert isinstance(dialect, LineDialect)
+    machine = LineMachine(dialect, Role.CLIENT, Transport.TCP, max_length=DEFAULT_MAX_LENGTH)
     for piece in pieces:
         machine.receive_data(piece)
         drain(machine.events())

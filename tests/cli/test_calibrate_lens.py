@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -30,12 +31,17 @@ from tests.processes import Outcome
 
 BOARD = Checkerboard(columns=5, rows=4, square=0.04, origin_mark=True)
 LENS = CameraModel(size=(320, 240), matrix=np.array([[300.0, 0, 159], [0, 301.0, 121], [0, 0, 1]]))
-RANDOM = np.random.default_rng(7)
-IMAGES = [
-    render(BOARD, LENS, pose.inverse(), noise=1.0, random=RANDOM)
-    for pose in around(BOARD, 5, tilt=0.5, distance=0.6, random=RANDOM)
-]
 NOTHING = np.full((240, 320), 128, np.uint8)
+
+
+@functools.cache
+def images() -> list[Any]:
+    """Return what is seen from five sides."""
+    random = np.random.default_rng(7)
+    return [
+        render(BOARD, LENS, pose.inverse(), noise=1.0, random=random)
+        for pose in around(BOARD, 5, tilt=0.5, distance=0.6, random=random)
+    ]
 
 
 @pytest.fixture
@@ -62,7 +68,7 @@ def write(folder: Path, images: list[Any]) -> Path:
 
 
 def test_lens_of_a_folder_leaves_out_what_shows_no_target(tmp_path: Path, target: str) -> None:
-    folder = write(tmp_path / "pictures", [*IMAGES, NOTHING])
+    folder = write(tmp_path / "pictures", [*images(), NOTHING])
     output = tmp_path / "lens.yaml"
     done = calibrating(target, str(folder), "-o", str(output), "--json").done()
     *views, told = done.lines
@@ -79,7 +85,7 @@ def test_lens_of_a_folder_leaves_out_what_shows_no_target(tmp_path: Path, target
 
 @pytest.mark.long
 def test_lens_of_files_has_its_views_in_json(tmp_path: Path, target: str) -> None:
-    folder = write(tmp_path / "pictures", IMAGES)
+    folder = write(tmp_path / "pictures", images())
     files = [str(one) for one in sorted(folder.glob("*.png"))]
     output = tmp_path / "lens.json"
     out = calibrating(target, *files, "-o", str(output)).done().out
@@ -119,7 +125,7 @@ def test_lens_with_wrong_use_is_told(
 
 
 def test_lens_of_too_few_views_is_refused(tmp_path: Path, target: str) -> None:
-    folder = write(tmp_path / "pictures", IMAGES[:2])
+    folder = write(tmp_path / "pictures", images()[:2])
     done = calibrating(target, str(folder), "-o", str(tmp_path / "x.yaml"))
     assert done.code == 2
     assert "expected 3 views or more, got 2" in done.err
@@ -165,7 +171,7 @@ def table(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_lens_of_a_source_takes_a_view_wherever_the_target_is_held(
     tmp_path: Path, target: str, table: Any
 ) -> None:
-    table(*IMAGES[:2], NOTHING, *IMAGES, *IMAGES)
+    table(*images()[:2], NOTHING, *images(), *images())
     output = tmp_path / "lens.json"
     done = calibrating(target, "table://", "-o", str(output), "--count", "3").done()
     assert done.out.startswith("view 1 of 3: hold the target straight from the front")

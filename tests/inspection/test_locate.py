@@ -389,7 +389,7 @@ def test_part_is_taught_from_a_picture_in_the_cell(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("said", "text"),
     [
-        ("most: 1", "either a model or a taught picture"),
+        ("most: 1", "a model, a taught picture or an outline, got none"),
         ("model: none.model", r"none\.model"),
         ("taught: none.png", r"none\.png"),
         ("model: a.model, part: [0, 0, 9, 9]", "with a taught picture only"),

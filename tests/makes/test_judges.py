@@ -110,7 +110,8 @@ async def test_ifms_own_client_gets_each_frame_that_it_triggers(parameters: int)
         lines: list[str] = []
         try:
             async with asyncio.timeout(60):
-                async for said in client.stdout or ():
+                assert client.stdout is not None
+                async for said in client.stdout:
                     lines.append(said.decode().strip())
                     if lines[-1] == "triggered":
                         asked = lines.count("triggered")

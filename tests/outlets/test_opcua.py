@@ -142,6 +142,8 @@ async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path:
     own = {"free": 3, "housing": 3, "lid": 1}  # of the camera: the settings' names win
     async with ready(tmp_path, names=own, recipes={"housing": 1}) as (there, client):
         heard = await client.hear(1018, 1022)
+        assert (await client.call("RecipeManagement.PrepareRecipe", "lid", None))[0].Id == "1"
+        await client.wait_for("Ready")
         prepare, none = "RecipeManagement.PrepareRecipe", None
         internal, _, error = await client.call(prepare, "free", none)
         assert (internal.Id, error) == ("3", 0)
@@ -149,7 +151,7 @@ async def test_recipes_have_names_and_numbers_and_wrong_calls_are_told(tmp_path:
         assert there.camera.active_application == 3
         assert (await client.call(prepare, none, "1"))[0].Id == "1"
         await client.wait_for("Ready")
-        await until(lambda: [one.InternalId.Id for one in heard.of(1022)] == ["3", "1"])
+        await until(lambda: [one.InternalId.Id for one in heard.of(1022)] == ["1", "3", "1"])
         for external, number in (("unknown", none), ("housing", "3"), (none, none)):
             assert (await client.call(prepare, external, number))[-1] == -2
         most = [ua.Variant(one, ua.VariantType.UInt32) for one in (1, 1)]

@@ -237,7 +237,8 @@ async def test_anonymous_clients_that_may_read_call_nothing_and_write_nothing(
 
 FLEET = """
 cameras:
-  line1/cam1: {emulated: {}, application: 7, interpret_as: localizations}
+  line1/cam1:
+    {emulated: {}, application: bolts, application_names: {bolts: 7}, interpret_as: localizations}
   line1/cam2: {emulated: {}, application: 1}
 outlets:
   opcua: {listen: 'URL', anonymous: control, unencrypted: true}
@@ -257,17 +258,19 @@ async def test_two_cameras_of_a_fleet_in_one_server_are_driven_apart(tmp_path: P
         for one in (first, second):
             await one.wait_for("Ready")
         heard, other = await first.hear(1024), await second.hear(1024)
-        jobs = [await one.start_job(one.camera) for one in (first, second)]
+        named = {first: "bolts", second: "1"}  # the first by the fleet file's name
+        jobs = [await one.start_job(one.camera, "", recipe) for one, recipe in named.items()]
         await until(lambda: bool(heard.of(1024) and other.of(1024)))
     told = [heard.of(1024), other.of(1024)]
     assert [[one.JobId.Id for one in some] for some in told] == [[jobs[0]], [jobs[1]]]
     assert [some[0].MeasId.Id for some in told] == ["line1/cam1", "line1/cam2"]
     assert [some[0].ResultState for some in told] == [1, 1]
+    assert [some[0].ExternalRecipeId.Id for some in told] == ["bolts", "1"]
 
 
 def test_a_wrong_server_in_a_fleet_file_is_told_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "fleet.yaml"
     text = FLEET.replace("URL", "opc.tcp://127.0.0.1:4840")
     path.write_text(text.replace("control", "everybody"))
-    with pytest.raises(ConfigurationError, match=r"line 6.*outlets\.opcua\.anonymous"):
+    with pytest.raises(ConfigurationError, match=r"line 7.*outlets\.opcua\.anonymous"):
         load_fleet(path)

@@ -141,7 +141,7 @@ async def walk(folder: Path, calls: int, clients: int, seed: int) -> tuple[Books
     books = Books()
     chance = random.Random(seed)  # noqa: S311 - of a test
     emulator = {"applications": APPLICATIONS, "active": 1}
-    more = {"recipes": {"counted": 1}, "kept_results": 100_000}
+    more: dict[str, Any] = {"recipes": {"counted": 1}, "kept_results": 100_000}
     async with (
         cell(folder, emulator, {1: "n: int32", 3: "n: int32"}, **more) as there,
         contextlib.AsyncExitStack() as stack,

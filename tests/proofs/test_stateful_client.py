@@ -1,6 +1,6 @@
 """A real client and the emulated camera over the loopback in any history, against a plain model.
 
-Long form: ``HYPOTHESIS_PROFILE=nightly pytest tests/proofs/test_stateful_client.py``.
+Long form: ``HYPOTHESIS_PROFILE=nightly pytest -m "" tests/proofs/test_stateful_client.py``.
 
 The rules start calls of the client, meddle as an operator, cut links and let time pass, and look at
 what came of it between any two steps of the loop. Each result carries when its inspection began, so

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import random
 import struct
 from typing import Any
 
@@ -630,6 +631,68 @@ def test_trace_says_nothing_of_what_could_not_be_sent() -> None:
 
 
 # ---------------------------------------------------------------------- messages that came before
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["traced", "plain"])
+@each_transport
+@each_dialect
+def test_camera_hears_a_chunk_that_came_before_as_one_that_did_not(
+    dialect: FramedDialect, transport: Transport, told: bool
+) -> None:
+    chance = random.Random(dialect.label)  # noqa: S311
+    requests = [one for one in examples(dialect) if isinstance(one, m.Request)]
+    answers = [one for one in examples(dialect) if isinstance(one, m.Report)]
+    answers += [one for one in answers if isinstance(one, m.ResultContainer)]
+    seen: tuple[list[Any], list[Any]] = ([], [])
+
+    def hearing(log: list[Any]) -> Machine:
+        def trace(sender: m.Sender, what: Frame | RemoteProtocolError) -> None:
+            log.append((sender, what if isinstance(what, Frame) else str(what)))
+
+        return Machine(dialect, Role.CAMERA, transport, trace=trace if told else None)
+
+    fast, slow = map(hearing, seen)
+    chunks = [dialect.encode(one) for one in requests] * 3
+    chunks += [b"".join(chance.sample(chunks, 2)) for _ in range(6)]
+    if dialect.header.magic or transport is UDP:  # else nothing is heard behind a broken frame
+        chunks += [chance.choice(chunks)[: chance.randint(1, 15)] for _ in range(2)]
+        chunks += [header(1, 0x40) + b"x", b"noise"]
+    for _ in range(500):
+        data = chance.choice(chunks)
+        fast.receive_data(data)
+        slow.receive_data(bytearray(data))  # that is always looked at
+        assert fast.events() == slow.events()
+        for one in chance.choices(answers, k=2):
+            said = [_said(made, one) for made in (fast, slow)]
+            assert said[0] == said[1]
+            if said[0] is not None:
+                assert b"".join(said[0]) == dialect.encode(one)
+        assert (fast.state, fast.pending, fast.counters) == (
+            slow.state,
+            slow.pending,
+            slow.counters,
+        )
+    assert seen[0] == seen[1]
+    assert fast.counters.frames_received > 250
+
+
+def _said(made: Machine, message: m.Message) -> list[bytes] | None:
+    """Return the bytes that saying a message makes, None where it may not be said."""
+    try:
+        made.send(message)
+    except LocalProtocolError:
+        return None
+    return made.data_to_send()
+
+
+def test_camera_says_of_many_messages_what_each_one_is() -> None:
+    made, sizes = camera(), range(3 * MAX_FAMILIAR)
+    for _ in range(2):
+        for number in sizes:  # an object that is gone may have left its id to the next
+            for one in (m.StatusReport(status=Status(number)), result(b"%d" % number, 5)):
+                made.send(one)
+                made.send(one)
+                assert made.data_to_send() == 2 * [HANDBOOK.encode(one)]
 
 
 @pytest.mark.parametrize("dialect", DIALECTS, ids=label)

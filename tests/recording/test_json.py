@@ -6,9 +6,12 @@ import enum
 import json
 import math
 import struct
+import sys
+import types
 from collections import namedtuple
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -93,6 +96,17 @@ def test_text_is_that_of_the_standard_library(fields: dict[str, Any]) -> None:
     text = json.dumps(jsonable(fields), separators=(",", ":"))
     assert object_text(fields) == text_of(fields) == text
     assert object_text(plain(fields)) == text
+
+
+@pytest.mark.parametrize(
+    "value", [[{"x": (1, 2)}], [[1.5], None], {"of": [b"\xff"]}, Fraction(1, 2)]
+)
+def test_text_is_made_while_another_thread_imports_numpy(
+    value: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = text_of(value)
+    monkeypatch.setitem(sys.modules, "numpy", types.ModuleType("numpy"))  # as it is at first
+    assert text_of(value) == json.dumps(jsonable(value), separators=(",", ":")) == text
 
 
 @given(VALUES | st.lists(LOCALIZATIONS) | st.lists(VALUES | LOCALIZATIONS))

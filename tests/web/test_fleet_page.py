@@ -7,11 +7,14 @@ import contextlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import pytest
 import pytest_asyncio
 
+import smartcam
 import smartcam.fleet
 from smartcam.exceptions import InterpretationError
-from smartcam.fleet import FleetFile
+from smartcam.fleet import FleetFile, FleetServer
+from smartcam.fleet._inside import FleetOutlets
 from smartcam.layout import Layout
 from smartcam.models import Status
 from smartcam.web import FleetSite
@@ -41,6 +44,15 @@ CELL = FleetFile.model_validate(
         }
     }
 )
+
+OUTLETS = """\
+listen: tcp/127.0.0.1:PORT
+cameras:
+  line1/cam2: {emulated: {}, application: 1, interpret_as: "n: int64, m: int64, k: int64"}
+outlets:
+  results: {kind: sqlite, file: results.sqlite}
+  broker: {kind: mqtt, broker: 'mqtt://127.0.0.1:NOBODY'}
+"""
 
 MEASURED = """\
 applications:
@@ -94,6 +106,37 @@ async def visible(page: Page) -> list[str]:
         }"""
     )
     return found
+
+
+async def test_outlets_have_their_accounts_and_what_failed_with_whole_texts(
+    page: Page, tmp_path: Path
+) -> None:
+    file = tmp_path / "fleet.yaml"
+    port, nobody = free_port(), free_port()
+    file.write_text(OUTLETS.replace("PORT", str(port)).replace("NOBODY", str(nobody)))
+    server = FleetServer(file)
+    async with (
+        FleetOutlets(server),
+        server,
+        smartcam.fleet.open(f"fleet://127.0.0.1:{port}") as fleet,
+        opened(page, fleet),
+    ):
+        async with smartcam.connect(f"fleet://127.0.0.1:{port}/line1/cam2") as camera:
+            with pytest.raises(InterpretationError):
+                await camera.trigger(timeout=PATIENCE)
+        for name, *numbers, state in (  # results, delivered, spooled, dropped
+            ("broker", 1, 0, 1, 0, "MqttError: [Errno 111] Connection refused"),
+            ("results", 1, 1, 0, 0, "well"),
+        ):
+            await see(page, "#accounts tr", f"{name}{''.join(map(str, numbers))}{state}")
+        await page.click("#failures summary")
+        await see(page, "#counted", "1 of 1 failed, 1 errors, 0 lost in 0 gaps")
+        await see(page, "#failed tr", "expected 24 bytes, got 150: 126 too many from offset 24")
+        for width in (1280, 390):
+            await page.set_viewport_size({"width": width, "height": 800})
+            cut = "(all) => all.filter((one) => one.scrollWidth > one.clientWidth).length"
+            assert await page.eval_on_selector_all(".outlets td, .outlets th", cut) == 0
+        await page.set_viewport_size({"width": 1280, "height": 800})
 
 
 async def test_only_rows_in_sight_are_in_the_document_to_the_last_of_all(page: Page) -> None:

@@ -265,7 +265,7 @@ class Device:
             if self._processing:
                 word |= _BUSY if self.quirks.busy_while_processing else 0
                 word |= _WAITING if self.quirks.hidden_triggers else 0
-            elif self._active.triggered and self._takes_runs:
+            elif self._active.rate is None and not (word & _SYSTEM_ERROR or self._held_busy):
                 word |= _WAITING
         return word
 
@@ -499,7 +499,8 @@ class Device:
     def _obey(self, message: m.Message) -> None:
         match message:
             case m.Trigger():
-                self._acknowledge(message, self._ready_code)
+                if self.behaviour.acknowledges:
+                    self._acknowledge(message, self._ready_code)
                 self._trigger()
             case m.Query():
                 self._say(self._name_active())

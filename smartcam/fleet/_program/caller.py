@@ -659,15 +659,15 @@ class Caller:
         return program.keys.ask(program.role, agent, camera)
 
     def _silence(self, do: str, waited: float) -> SmartCamError:
-        agent = self.met.agent if self.met is not None else "agent"
+        agent = "the agent" if self.met is None else f"the agent {self.met.agent}"
         if do == "trigger":
             return TriggerTimeoutError(
-                f"{self.name}: the {agent} said nothing within {waited:.3g} s; whether the camera "
+                f"{self.name}: {agent} said nothing within {waited:.3g} s; whether the camera "
                 f"was triggered is unknown{self._perhaps(do)}",
                 waited=waited,
             )
         return ResponseTimeoutError(
-            f"{self.name}: the {agent} said nothing to {do} within {waited:.3g} s; whether it was "
+            f"{self.name}: {agent} said nothing to {do} within {waited:.3g} s; whether it was "
             f"done is unknown{self._perhaps(do)}",
             waited=waited,
         )

@@ -1,15 +1,23 @@
-"""Models of taught parts: made of a picture and a region, kept in small files."""
+"""Models of taught parts: made of a picture and a region or of an outline, kept in small files."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from smartcam._arguments import check_kind, check_number, check_path, check_text, wrong_argument
+from smartcam._arguments import (
+    check_choice,
+    check_flag,
+    check_kind,
+    check_number,
+    check_path,
+    check_text,
+    wrong_argument,
+)
 from smartcam._extras import load
 from smartcam._forks import cached_property
 from smartcam._whole_files import replace_file
@@ -17,6 +25,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.inspection._locate.coarse import MAX_LEVELS, MIN_RADIUS_PX, CoarseModel
 from smartcam.inspection._locate.edges import edge_points, fit_segments, segments_of
 from smartcam.inspection._locate.fine import FineSettings, fit_pose
+from smartcam.inspection._locate.outlines import MM, drawn_outline, read_outline
 from smartcam.inspection._locate.segments import Bands, Segments, make_bands
 from smartcam.inspection._locate.symmetry import Symmetry, find_symmetry
 from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
@@ -25,12 +34,14 @@ from smartcam.inspection._picture import Picture
 from smartcam.inspection._places import PixelPose, Region, place
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from smartcam.frames import Frame
     from smartcam.geometry._inside import Array
+    from smartcam.inspection._locate.outlines import Unit
 
 VERSION: Final = 1
 """Version of the files of models."""
@@ -138,6 +149,49 @@ class PartModel:
         if contrast is not None:
             contrast = check_number(contrast, "contrast", 0, MAX_LEVEL, "PartModel.teach")
         return _taught(Picture.of(picture), region, name, contrast)
+
+    @classmethod
+    def from_outline(
+        cls,
+        path: str | Path,
+        pixels_per_mm: float,
+        *,
+        name: str = "part",
+        bright: bool = True,
+        unit: Unit | None = None,
+        layers: Sequence[str] = (),
+    ) -> PartModel:
+        """Return the model of a part whose outline is in a file of DXF or SVG.
+
+        Edges are those of a flat part of one grey level. The ``reference`` of the model is in the
+        file's coordinates then: pixels from the drawing's origin, y down.
+
+        Args:
+            path: file with the ending ``.dxf`` or ``.svg``; its lines make closed outlines. An
+                outline in another one is a hole.
+            pixels_per_mm: pixels of the picture for a millimetre of the part.
+            name: name of the part.
+            bright: whether the part is brighter than what is behind it.
+            unit: unit of the file's coordinates; None: the one that the file says.
+            layers: names of the layers, in SVG ids or labels of the groups, with the outline;
+                none: all.
+
+        Raises:
+            TeachingError: the part cannot be taught; its ``why`` says the reason.
+            ConfigurationError: an argument is wrong.
+            MissingExtraError: the extra ``inspection`` is not installed.
+        """
+        who = "PartModel.from_outline"
+        path = check_path(path, "path", who)
+        scale = check_number(pixels_per_mm, "pixels_per_mm", 0, 1e4, who, above=True)
+        name = check_text(name, "name", who, least=1)
+        bright = check_flag(bright, "bright", who)
+        if unit is not None:
+            check_choice(unit, "unit", tuple(MM), who)
+        layers = [check_text(one, "layers", who, least=1) for one in layers]
+        picture, (x, y) = drawn_outline(read_outline(path, scale, unit, layers), bright=bright)
+        model = _taught(Picture.of(picture), None, name, None)
+        return replace(model, reference=(model.reference[0] + x, model.reference[1] + y))
 
     @classmethod
     def read(cls, path: str | Path) -> PartModel:

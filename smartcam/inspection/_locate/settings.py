@@ -48,6 +48,22 @@ class LocateSettings(ToolSettings):
         description="where the part is in the taught picture: [x, y, width, height] or corners; "
         "default: the whole picture",
     )
+    outline: File | None = Field(
+        None,
+        description="instead of a model: file with the part's outline, DXF or SVG, beside this one",
+    )
+    pixels_per_mm: float | None = Field(
+        None,
+        gt=0,
+        le=10_000,
+        description="with an outline: pixels of the picture for a millimetre of the part",
+    )
+    unit: Literal["mm", "cm", "m", "inch", "px"] | None = Field(
+        None, description="with an outline: unit of its file; default: the one that the file says"
+    )
+    bright: bool = Field(
+        True, description="with an outline: whether the part is brighter than what is behind it"
+    )
     angle: Annotated[tuple[Angle, Angle], AfterValidator(_rising)] = Field(
         (-180.0, 180.0),
         description="degrees that the part may be turned by since it was taught, from and to",
@@ -90,9 +106,14 @@ class LocateSettings(ToolSettings):
 
     @model_validator(mode="after")
     def _goes_together(self) -> LocateSettings:
-        if (self.model is None) == (self.taught is None):
-            got = "neither" if self.model is None else "both"
-            raise ValueError(f"expected either a model or a taught picture, got {got}")
+        given = [name for name in ("model", "taught", "outline") if getattr(self, name) is not None]
+        if len(given) != 1:
+            got = " and ".join(given) or "none of them"
+            raise ValueError(f"expected a model, a taught picture or an outline, got {got}")
+        if (self.outline is None) != (self.pixels_per_mm is None):
+            raise ValueError("expected outline: and pixels_per_mm: together")
+        if self.unit is not None and self.outline is None:
+            raise ValueError("unit: expected it with an outline only")
         if self.part is not None and self.taught is None:
             raise ValueError("part: expected it with a taught picture only")
         if self.angle[1] - self.angle[0] > 360:

@@ -71,6 +71,17 @@ class Locate(Tool[LocateSettings]):
             file = setup.folder / settings.taught
             model = PartModel.teach(Picture.read(file), settings.part, name=file.stem)
             self.models.append(model)
+        if settings.outline is not None and settings.pixels_per_mm is not None:
+            file = setup.folder / settings.outline
+            self.models.append(
+                PartModel.from_outline(
+                    file,
+                    settings.pixels_per_mm,
+                    name=file.stem,
+                    bright=settings.bright,
+                    unit=settings.unit,
+                )
+            )
         for model in self.models:  # worked out now, for the same reason
             _ = model.bands, model.coarse
         kind = getattr(setup.calibration, "kind", None)

@@ -19,7 +19,15 @@ class TeachingTrouble(enum.Enum):
     OPEN = "open"
     """All edges run in one direction, so nothing tells the place along them."""
     TOO_LARGE = "too large"
-    """The region has more pixels than are taught."""
+    """The region or the outline has more pixels, corners or bytes than are taught."""
+    UNREADABLE = "unreadable"
+    """The file with the outline cannot be read."""
+    UNIT = "unit"
+    """The file with the outline does not say its unit."""
+    UNSUPPORTED = "unsupported"
+    """The file with the outline has something that is no line or curve in a plane."""
+    NO_OUTLINE = "no outline"
+    """The file's lines make no closed outline."""
 
 
 class TeachingError(ConfigurationError):

@@ -205,8 +205,10 @@ class VisionSystem:
 
     @property
     def recipes(self) -> Mapping[str, int]:
-        """Names of applications: the camera's own, and those of the settings, which win."""
-        return {**self._names(), **self.settings.recipes}
+        """Names of applications: those of the settings first, which win, then the camera's own."""
+        named = self.settings.recipes
+        own = {name: number for name, number in self._names().items() if name not in named}
+        return {**named, **own}
 
     def application_of(self, external: str, internal: str = "") -> int:
         """Return the application of a recipe.
@@ -233,9 +235,8 @@ class VisionSystem:
         return found.pop()
 
     def recipe_name(self, application: int | None) -> str:
-        """Return the name of an application: the settings' first, else its number."""
-        known = {**self.settings.recipes, **self._names()}
-        names = (name for name in known if self.recipes[name] == application)
+        """Return the first name of an application, else its number."""
+        names = (name for name, number in self.recipes.items() if number == application)
         return next(names, "" if application is None else str(application))
 
     async def prepare(self, application: int) -> bool:

@@ -8,7 +8,7 @@ dropped and counted.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from smartcam.exceptions import (
     FrameError,
@@ -50,6 +50,12 @@ the receive task takes in a turn, so that reading would have to pause after each
 MAX_FAMILIAR = 64
 """Messages of a kind that are known by their frames: of statuses and answers a camera has a handful
 each, and a peer could send any."""
+
+MAX_KNOWN_CHUNKS = 16
+"""Chunks that a camera's machine knows as a whole: a client has a handful of short requests."""
+
+MAX_KNOWN_CHUNK_BYTES = 64
+"""Bytes of the longest of these chunks: a Query, a sequence number and a Trigger have 40."""
 
 
 _SESSION_REQUESTS = (
@@ -131,6 +137,10 @@ _SAID: dict[tuple[State, m.Sender], dict[type[Message], State]] = {
 """:data:`TRANSITIONS` by state and sender, which is faster to look up for each message."""
 
 
+_Made: TypeAlias = "tuple[tuple[bytes, int, int | None], Frame]"
+"""Bytes of a frame, its id and that of its answer; the frame."""
+
+
 class Machine:
     """One link's protocol: bytes to events and messages to bytes.
 
@@ -180,7 +190,7 @@ class Machine:
         self._open: set[int] = set()  # ids of the answers the camera owes (client role)
         # ids of which it owes two: of what was sent ``again``
         self._open_twice: set[int] = set()
-        self._sender = role.receives
+        self._sender, self._says = role.receives, role.sends
         self._asks = role is Role.CLIENT
         self._plain = self._asks and trace is None
         self._decoders: dict[int, Codec] = {}
@@ -189,6 +199,11 @@ class Machine:
         self._statuses: dict[bytes, Message] = {}  # those of statuses
         # by what stands in front of the data: bytes of the frame, what makes the message
         self._results: dict[bytes, tuple[int, Callable[[bytes], Message]]] = {}
+        # of a camera, by chunks that came before in this state: their messages and frames
+        self._chunks: dict[bytes, tuple[list[Message], list[Frame]]] = {}
+        # of a camera, by the id of a message object that it said before: the message and its frame
+        self._said: dict[int, tuple[Message, _Made]] = {}
+        self._said_data = 0  # the key of the last one with data
         self._status_id = self._status_size = 0
         self.state = State.IDLE
         self._take_up(dialect)
@@ -218,6 +233,7 @@ class Machine:
         status = dialect.encoder(m.StatusReport)
         self._status_id, self._status_size = status.message_id, dialect.header.size + status.size
         self._takes_bursts = self._plain and result.size > 0
+        self._said = {}
         self._forget_familiar()
 
     @property
@@ -231,7 +247,7 @@ class Machine:
         self._deaf = state is State.FAILED or state is State.CLOSED
         self._narrows = state is State.CONNECTING
         self._may_come = _SAID[state, self._sender]
-        self._may_go = _SAID[state, self.role.sends]
+        self._may_go = _SAID[state, self._says]
         self._forget_familiar()
 
     # ------------------------------------------------------------------ bytes in
@@ -254,11 +270,47 @@ class Machine:
         if self._deaf:
             return
         self.counters.bytes_received += len(data)
+        if (
+            self._asks
+            or type(data) is not bytes
+            or len(data) > MAX_KNOWN_CHUNK_BYTES
+            or self._framer.buffered
+        ):
+            self._receive(data)
+            return
+        known = self._chunks.get(data)
+        if known is None:
+            self._receive_chunk(data)
+            return
+        messages, frames = known
+        self._events += messages
+        self.counters.frames_received += len(frames)
+        if self._trace is not None:
+            for frame in frames:
+                self._trace(self._sender, frame)
+
+    def _receive(self, data: bytes | bytearray | memoryview) -> None:
         self._framer.feed(data)
         if self.transport is Transport.UDP:
             self._receive_datagram()
         else:
             self._receive_frames()
+
+    def _receive_chunk(self, data: bytes) -> None:
+        """Take a short chunk where no frame is unfinished; know it from now on if it is plain.
+
+        That is one of whole frames which leave the state as it is, and whose bytes are those that
+        the messages made of them have: then there is nothing more to see in it.
+        """
+        state, before = self._state, len(self._events)
+        self._receive(data)
+        if state is not self._state or self._framer.buffered:
+            return
+        messages = [one for one in self._events[before:] if isinstance(one, m.Message)]
+        if len(self._chunks) < MAX_KNOWN_CHUNKS and messages:
+            frames = [self.dialect.to_frame(one) for one in messages]
+            if b"".join(map(self.dialect.encode_frame, frames)) == data:
+                self._chunks[data] = messages, frames
 
     def room(self) -> memoryview:
         """Return the buffer for a stream's next bytes; call :meth:`filled` next."""
@@ -332,7 +384,11 @@ class Machine:
                 f"in state {self.state.value}"
             )
         constant = self._constant.get(kind)
-        data, message_id, owed = self._frame_of(message) if constant is None else constant
+        if constant is None:
+            constant, frame = self._made_of(message)
+        else:
+            frame = None
+        data, message_id, owed = constant
         if answered is not None:
             owed = message_id if answered else None
         if owed is not None and self._asks:
@@ -349,7 +405,9 @@ class Machine:
         counters.frames_sent += 1
         counters.bytes_sent += len(data)
         if self._trace is not None:
-            self._trace(self.role.sends, Frame(message_id, data[self.dialect.header.size :]))
+            if frame is None:
+                frame = Frame(message_id, data[self._header_size :])
+            self._trace(self._says, frame)
 
     def data_to_send(self) -> list[bytes]:
         """Return the frames to write, in order: one write each on UDP, any on TCP."""
@@ -358,10 +416,25 @@ class Machine:
 
     # ------------------------------------------------------------------ inside
 
-    def _frame_of(self, message: Message) -> tuple[bytes, int, int | None]:
-        """Return a message's frame, its id and that of its answer."""
-        message_id = self.dialect.message_id(message)
-        return self.dialect.encode(message), message_id, self.dialect.answer_id(message_id)
+    def _made_of(self, message: Message) -> _Made:
+        """Return the objects of a message with a body; a camera says the same ones again and again.
+
+        Of those with data, such as results, only the last one is known.
+        """
+        known = self._said.get(id(message))
+        if known is not None:
+            return known[1]
+        dialect = self.dialect
+        message_id = dialect.message_id(message)
+        frame = dialect.to_frame(message)
+        made = (dialect.encode_frame(frame), message_id, dialect.answer_id(message_id)), frame
+        if not self._asks and dialect.has(type(message)):
+            if dialect.encoder(type(message)).has_data:
+                self._said.pop(self._said_data, None)
+                self._said_data = id(message)
+            if len(self._said) < MAX_FAMILIAR:
+                self._said[id(message)] = message, made
+        return made
 
     def _receive_frames(self) -> bool:
         """Make events of the whole frames that are there; return whether a part of one is left."""
@@ -557,7 +630,7 @@ class Machine:
 
     def _forget_familiar(self) -> None:
         """Look at each message again, since it may mean another thing or may be no message now."""
-        self._statuses, self._results = {}, {}
+        self._statuses, self._results, self._chunks = {}, {}, {}
         self._familiar = {self._status_id: self._statuses}
 
     def _narrow(self, message_id: int, size: int) -> None:

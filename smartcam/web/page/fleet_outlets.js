@@ -28,8 +28,9 @@ function showAccounts(outlets) {
 
 function account(one) {
   const dropped = Object.entries(one.dropped).map(([why, count]) => `${count} ${why}`);
-  const cells = [one.agent, one.outlet, ...NUMBERS.map((name) => one[name]), dropped.join(", ") || "0", one.trouble || "well"];
-  return make("tr", { "data-well": String(!one.trouble) }, ...cells.map(cell));
+  const numbers = NUMBERS.map((name) => cell(one[name], name));
+  const cells = [cell(one.agent), cell(one.outlet), ...numbers, cell(dropped.join(", ") || "0", "dropped"), cell(one.trouble || "well")];
+  return make("tr", { "data-well": String(!one.trouble) }, ...cells);
 }
 
 async function showFailures() {
@@ -49,7 +50,8 @@ function counted(store) {
 
 function failure(row) {
   const cells = [new Date(row.at).toLocaleString(), row.camera || "all cameras", row.application ?? "", row.error || row.value || ""];
-  return make("tr", {}, ...cells.map(cell));
+  return make("tr", {}, ...cells.map((text) => cell(text)));
 }
 
-const cell = (text) => make("td", { textContent: String(text) });
+// A cell; where the table has no room for its head, the name stands in front of the text.
+const cell = (text, name) => make("td", { textContent: String(text), ...(name && { "data-name": name }) });

@@ -16,6 +16,7 @@ from smartcam.geometry._inside import Rigid, exp_rotation
 from tests.calibration import lenskit
 
 if TYPE_CHECKING:
+    from smartcam.calibration import TargetView
     from smartcam.geometry._inside import Array
 
 SIGMA = 0.05
@@ -43,12 +44,20 @@ class Bench:
 
     def __init__(self, camera: CameraModel, poses: list[Transform], sigma: float = SIGMA) -> None:
         self.camera, self.poses, self.sigma = camera, poses, sigma
-        self.views = lenskit.seen(camera, poses, sigma=1e-9)
         self.values = 4 + len(camera.distortion)
+
+    @functools.cached_property
+    def views(self) -> list[TargetView]:
+        """The view without noise."""
+        return lenskit.seen(self.camera, self.poses, sigma=1e-9)
+
+    @functools.cached_property
+    def back(self) -> Array:
+        """The change of all that is sought by a change of each coordinate of a pixel."""
         rows = []
-        for number, (pose, view) in enumerate(zip(poses, self.views, strict=True)):
-            at = linearize(pose.apply(view.object_points), camera)
-            row = np.zeros((2 * len(view.ids), self.values + 6 * len(poses)))
+        for number, (pose, view) in enumerate(zip(self.poses, self.views, strict=True)):
+            at = linearize(pose.apply(view.object_points), self.camera)
+            row = np.zeros((2 * len(view.ids), self.values + 6 * len(self.poses)))
             row[:, : self.values] = at.by_lens.reshape(-1, self.values)
             place = self.values + 6 * number
             turned = view.object_points @ pose.rotation.T
@@ -56,10 +65,23 @@ class Bench:
             rows.append(row)
         jacobian = np.concatenate(rows)
         scale = np.linalg.norm(jacobian, axis=0)
-        self.back: Array = np.linalg.pinv(jacobian / scale) / scale[:, None]
-        self.covariance = (sigma**2 * self.back @ self.back.T)[: self.values, : self.values]
-        self.gauge = np.concatenate(
-            [pose.apply(one.object_points) for pose, one in zip(poses, self.views, strict=True)]
+        found: Array = np.linalg.pinv(jacobian / scale) / scale[:, None]
+        return found
+
+    @functools.cached_property
+    def covariance(self) -> Array:
+        """That of the lens."""
+        found: Array = (self.sigma**2 * self.back @ self.back.T)[: self.values, : self.values]
+        return found
+
+    @functools.cached_property
+    def gauge(self) -> Array:
+        """The points that are seen, before the camera."""
+        return np.concatenate(
+            [
+                pose.apply(one.object_points)
+                for pose, one in zip(self.poses, self.views, strict=True)
+            ]
         )
 
     @functools.cache  # noqa: B019 - benches are few, and live as long as the tests

@@ -260,7 +260,7 @@ async def test_after_never_gives_a_picture_of_before(camera: Camera) -> None:
         sent[number] = time.monotonic()
         return False
 
-    camera.ends, camera.every = note, 0.3
+    camera.ends, camera.every = note, 0.5
     async with asyncio.timeout(LIMIT), camera_on(camera) as where:
         url = f"rtsp://{where}#timeout=3&delay=0.02"
         async with frames.open(url) as source, source.reader():
@@ -271,7 +271,7 @@ async def test_after_never_gives_a_picture_of_before(camera: Camera) -> None:
                 frame = await source.after(moment)
                 last = max(number for number in sent if number % COUNT == numbers([frame])[0])
                 assert moment <= sent[last]
-                assert time.monotonic() - sent[last] < 0.25, "a picture came with the next one"
+                assert last == max(sent), "a picture came with the next one"
 
 
 async def test_other_places_for_a_track_and_for_play(camera: Camera) -> None:

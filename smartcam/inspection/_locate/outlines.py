@@ -1,0 +1,437 @@
+"""Outlines of parts in files of DXF and SVG, and the picture that a part of this outline gives.
+
+Curves are read by the libraries ezdxf and fontTools, and are closed here: lines whose ends meet
+make a loop. A loop in a loop is a hole.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from smartcam._extras import load
+from smartcam.inspection._locate.troubles import TeachingError, TeachingTrouble
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from smartcam.geometry._inside import Array
+
+Unit = Literal["mm", "cm", "m", "inch", "px"]
+
+MM: Final[dict[str, float]] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4, "px": 25.4 / 96}
+"""Millimetres of each unit; px is the one of CSS, which SVG takes for a length without a unit."""
+
+DXF_UNITS: Final = {1: "inch", 4: "mm", 5: "cm", 6: "m"}
+"""Units by the numbers that a DXF file has for them in its header, as $INSUNITS."""
+
+SVG_UNITS: Final = {"mm": "mm", "cm": "cm", "in": "inch", "px": "px"}
+"""Units by what stands behind a number in SVG."""
+
+SVG_SILENT: Final = frozenset({"defs", "desc", "metadata", "namedview", "style", "title"})
+"""Elements of SVG that show nothing by themselves."""
+
+MAX_FILE_BYTES: Final = 1 << 24
+"""Bytes of an outline's file at most."""
+
+MAX_POINTS: Final = 200_000
+"""Corners of an outline at most, curves included."""
+
+MAX_NESTED: Final = 30
+"""Groups of SVG in each other at most."""
+
+MAX_OUTLINE_PX: Final = 4_000_000
+"""Pixels of the picture of an outline at most."""
+
+FLATNESS_PX: Final = 0.01
+"""Pixels by which a curve may leave the polygon that stands for it."""
+
+JOIN_PX: Final = 0.1
+"""Pixels between the ends of two lines that are taken for one point."""
+
+MARGIN_PX: Final = 12
+"""Pixels around the part in its picture."""
+
+SUBROWS: Final = 16
+"""Lines across each row of pixels along which the outline's area is taken."""
+
+DARK, CONTRAST, NOISE, BLUR_PX = 60.0, 130.0, 1.0, 0.8
+"""Grey levels of the darker side, from it to the brighter one, and of the noise; and the blur."""
+
+
+class Outline(NamedTuple):
+    """Closed loops of a drawing."""
+
+    loops: list[
+        Array
+    ]  # (K, 2) each, pixels of the part's picture from the drawing's origin, y down
+
+
+def read_outline(
+    path: Path, pixels_per_mm: float, unit: Unit | None, layers: Sequence[str]
+) -> Outline:
+    """Return the outline in a file of DXF or SVG.
+
+    Raises:
+        TeachingError: UNREADABLE, UNIT, UNSUPPORTED, NO_OUTLINE or TOO_LARGE.
+        MissingExtraError: the extra ``inspection`` is not installed.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise TeachingError(
+                TeachingTrouble.TOO_LARGE,
+                f"{path} has {size} bytes, expected {MAX_FILE_BYTES} at most",
+            )
+        data = path.read_bytes()
+    except OSError as exc:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: {exc}") from exc
+    kind = path.suffix.lower()
+    if kind == ".dxf":
+        lines = _dxf_lines(path, data, pixels_per_mm, unit, layers)
+    elif kind == ".svg":
+        lines = _svg_lines(path, data, pixels_per_mm, unit, layers)
+    else:
+        raise TeachingError(
+            TeachingTrouble.UNREADABLE, f"{path}: expected a file with the ending .dxf or .svg"
+        )
+    found: list[Array] = []
+    count = 0
+    for line in lines:
+        count += len(line)
+        if count > MAX_POINTS or not np.isfinite(line).all():
+            raise TeachingError(
+                TeachingTrouble.TOO_LARGE,
+                f"{path}: expected {MAX_POINTS} corners at most, all of them finite numbers",
+            )
+        if len(line) > 1:
+            found.append(line)
+    return Outline(_closed(path, found, pixels_per_mm))
+
+
+def _closed(path: Path, lines: list[Array], pixels_per_mm: float) -> list[Array]:
+    """Return the loops that lines (K, 2) make."""
+    loops: list[Array] = []
+    rest = list(lines)
+    while rest:
+        loop = rest.pop()
+        while np.linalg.norm(loop[0] - loop[-1]) > JOIN_PX or len(loop) < 3:
+            ends = np.array([one[[0, -1]] for one in rest]).reshape(-1, 2)
+            off = np.linalg.norm(ends - loop[-1], axis=1)
+            if not len(off) or off.min() > JOIN_PX:
+                x, y = loop[-1] / pixels_per_mm * [1.0, -1.0]
+                raise TeachingError(
+                    TeachingTrouble.NO_OUTLINE,
+                    f"{path}: expected closed outlines, got a line that ends at {x:.4g}, {y:.4g} mm"
+                    " (y up) and meets no other one there",
+                )
+            nearest = int(np.argmin(off))
+            other = rest.pop(nearest // 2)
+            loop = np.concatenate([loop, other[::-1] if nearest % 2 else other])
+        loops.append(loop)
+    if not loops:
+        raise TeachingError(
+            TeachingTrouble.NO_OUTLINE, f"{path}: expected closed outlines, got no line at all"
+        )
+    return loops
+
+
+# ---------------------------------------------------------------------- DXF
+
+
+def _dxf_lines(
+    path: Path, data: bytes, pixels_per_mm: float, unit: Unit | None, layers: Sequence[str]
+) -> Iterator[Array]:
+    ezdxf, paths = load("ezdxf"), load("ezdxf.path")
+    disassemble = load("ezdxf.disassemble")
+    if b"SECTION" not in data:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: expected DXF")
+    try:
+        drawing = ezdxf.readfile(path)
+        said = unit or DXF_UNITS.get(int(drawing.header.get("$INSUNITS", 0)))
+        if said is None:
+            raise TeachingError(
+                TeachingTrouble.UNIT,
+                f"{path}: its header says no unit that is known here: say unit, one of "
+                f"{', '.join(MM)}",
+            )
+        scale = MM[said] * pixels_per_mm
+        for entity in disassemble.recursive_decompose(drawing.modelspace()):
+            if layers and entity.dxf.layer not in layers:
+                continue
+            try:
+                curve = paths.make_path(entity)
+            except TypeError as exc:
+                raise TeachingError(
+                    TeachingTrouble.UNSUPPORTED,
+                    f"{path}: expected lines, arcs, circles, ellipses, polylines and splines, got "
+                    f"{entity.dxftype()} in the layer {entity.dxf.layer!r}: name the layers with "
+                    "the outline",
+                ) from exc
+            for part in curve.sub_paths():
+                corners = np.array([tuple(one) for one in part.flattening(FLATNESS_PX / scale, 16)])
+                if len(corners) and np.ptp(corners[:, 2]) * scale > JOIN_PX:
+                    raise TeachingError(
+                        TeachingTrouble.UNSUPPORTED,
+                        f"{path}: expected an outline in the plane of x and y, got "
+                        f"{entity.dxftype()} whose z changes",
+                    )
+                yield corners[:, :2] * (scale, -scale)
+    except TeachingError:
+        raise
+    except (ezdxf.DXFError, OSError, ValueError, ArithmeticError, LookupError) as exc:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: {exc!s:.200}") from exc
+
+
+# ---------------------------------------------------------------------- SVG
+
+
+def _svg_lines(
+    path: Path, data: bytes, pixels_per_mm: float, unit: Unit | None, layers: Sequence[str]
+) -> Iterator[Array]:
+    if b"<!ENTITY" in data:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: expected SVG without entities")
+    try:
+        root = ElementTree.fromstring(data)  # noqa: S314 - bounded, and without entities
+        if _tag(root) != "svg":
+            raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: expected SVG")
+        scale = pixels_per_mm * _svg_scale(path, root, unit)
+        reader = _SvgReader(path, scale, layers)
+        yield from reader.read(root, np.diag([scale, scale, 1.0]), not layers, 0)
+    except TeachingError:
+        raise
+    except (ElementTree.ParseError, ValueError, TypeError, ArithmeticError, LookupError) as exc:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: {exc!s:.200}") from exc
+
+
+def _tag(element: ElementTree.Element) -> str:
+    return str(element.tag).rpartition("}")[2]
+
+
+def _svg_scale(path: Path, root: ElementTree.Element, unit: Unit | None) -> float:
+    """Return the millimetres of a user unit, by the drawing's width and what it shows."""
+    if unit is not None:
+        return MM[unit]
+    sizes = [_length(root.get(name, "")) for name in ("width", "height")]
+    box = [float(one) for one in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if one]
+    if None in sizes:
+        raise TeachingError(
+            TeachingTrouble.UNIT,
+            f'{path}: its width and height say no unit, such as width="50mm": say unit, one of '
+            f"{', '.join(MM)}",
+        )
+    millimetres = [(one[0] * MM[one[1]], one[1]) for one in sizes if one is not None]
+    if not box:
+        return MM["px"]
+    across, down = (one[0] / side for one, side in zip(millimetres, box[2:], strict=True))
+    if not (across > 0 and abs(down / across - 1) < 1e-3):
+        raise TeachingError(
+            TeachingTrouble.UNIT,
+            f"{path}: width and height do not have the proportions of the viewBox: "
+            f"{across:.4g} and {down:.4g} mm for a unit",
+        )
+    return across
+
+
+def _length(text: str) -> tuple[float, str] | None:
+    found = re.fullmatch(r"\s*([\d.eE+-]+)\s*(mm|cm|in|px)\s*", text)
+    return None if found is None else (float(found[1]), SVG_UNITS[found[2]])
+
+
+class _SvgReader:
+    """Reads the shapes of an SVG file as lines."""
+
+    def __init__(self, path: Path, scale: float, layers: Sequence[str]) -> None:
+        self._path = path
+        self._scale = scale
+        self._layers = layers
+
+    def read(
+        self, element: ElementTree.Element, matrix: Array, wanted: bool, depth: int
+    ) -> Iterator[Array]:
+        """Yield the lines (K, 2) of an element and those in it, in pixels.
+
+        ``matrix``: from the element's coordinates to pixels; ``wanted``: whether it is in one of
+        the layers that were asked for.
+        """
+        if depth > MAX_NESTED:
+            raise TeachingError(
+                TeachingTrouble.UNSUPPORTED,
+                f"{self._path}: expected {MAX_NESTED} groups in each other at most",
+            )
+        tag = _tag(element)
+        if tag in SVG_SILENT or element.get("display") == "none":
+            return
+        label = element.get("{http://www.inkscape.org/namespaces/inkscape}label")
+        wanted = wanted or element.get("id") in self._layers or label in self._layers
+        matrix = matrix @ _matrix(element.get("transform", ""))
+        if tag in {"svg", "g", "a"} and not (tag == "svg" and depth):
+            for child in element:
+                yield from self.read(child, matrix, wanted, depth + 1)
+        elif wanted:
+            for line in self._shape(tag, element, self._flatness(matrix)):
+                with np.errstate(all="ignore"):
+                    yield line @ matrix[:2, :2].T + matrix[:2, 2]
+
+    def _flatness(self, matrix: Array) -> float:
+        """Return the length that is as long as the flatness, in an element's coordinates."""
+        return FLATNESS_PX / max(math.sqrt(abs(float(np.linalg.det(matrix[:2, :2])))), 1e-9)
+
+    def _shape(self, tag: str, element: ElementTree.Element, flat: float) -> Iterator[Array]:
+        def number(name: str, default: float = 0.0) -> float:
+            return float(element.get(name, default))
+
+        if tag == "path":
+            yield from _path_lines(element.get("d", ""), flat)
+        elif tag in {"polygon", "polyline"}:
+            numbers = [float(one) for one in re.split(r"[\s,]+", element.get("points", "")) if one]
+            corners = np.array(numbers).reshape(-1, 2)
+            yield corners if tag == "polyline" else _loop(corners)
+        elif tag == "line":
+            yield np.array([[number(f"x{end}"), number(f"y{end}")] for end in (1, 2)])
+        elif tag in {"circle", "ellipse"}:
+            radii = [number("r")] * 2 if tag == "circle" else [number("rx"), number("ry")]
+            turns = np.linspace(0, 2 * math.pi, 1 + _steps(max(radii), flat))
+            around = np.column_stack([np.cos(turns), np.sin(turns)]) * radii
+            yield around + np.array([number("cx"), number("cy")])
+        elif tag == "rect" and not (number("rx") or number("ry")):
+            x, y, width, height = map(number, ("x", "y", "width", "height"))
+            right, below = x + width, y + height
+            yield _loop(np.array([[x, y], [right, y], [right, below], [x, below]]))
+        else:
+            raise TeachingError(
+                TeachingTrouble.UNSUPPORTED,
+                f"{self._path}: expected paths, polygons, lines, circles, ellipses and rectangles "
+                f"with sharp corners, got {tag!r:.40}: name the groups with the outline as layers",
+            )
+
+
+def _loop(corners: Array) -> Array:
+    return np.concatenate([corners, corners[:1]])
+
+
+def _steps(radius: float, flat: float) -> int:
+    """Return the corners of a polygon that leaves a circle by the flatness at most."""
+    return max(16, math.ceil(math.pi / math.sqrt(2 * min(flat / max(radius, 1e-9), 0.5))))
+
+
+def _path_lines(text: str, flat: float) -> Iterator[Array]:
+    """Yield the lines of a path's data; curves become polygons."""
+    pen = load("fontTools.pens.recordingPen").RecordingPen()
+    load("fontTools.svgLib.path").parse_path(text, pen)
+    line: list[Any] = []
+    for what, places in pen.value:
+        if what == "moveTo":
+            line = list(places)
+        elif what == "lineTo":
+            line += places
+        elif what in {"curveTo", "qCurveTo"}:
+            line += _curve(np.array([line[-1], *places], np.float64), flat)
+        else:
+            yield _loop(np.array(line)) if what == "closePath" else np.array(line)
+
+
+def _curve(corners: Array, flat: float) -> list[Any]:
+    """Return corners along a Bezier curve behind its first one."""
+    reach = float(np.linalg.norm(np.diff(corners, axis=0), axis=1).sum())
+    count = min(2 * _steps(reach, flat), 2000)
+    part = np.linspace(0, 1, count + 1)[1:, None]
+    order = len(corners) - 1
+    weights = [math.comb(order, k) * part**k * (1 - part) ** (order - k) for k in range(order + 1)]
+    return [*np.sum([one * corner for one, corner in zip(weights, corners, strict=True)], axis=0)]
+
+
+_TRANSFORM: Final = re.compile(r"\s*(\w+)\s*\(([^)]*)\)\s*,?")
+
+
+def _matrix(text: str) -> Array:
+    """Return the matrix (3, 3) of a transform attribute."""
+    matrix = np.eye(3)
+    at = 0
+    while at < len(text):
+        found = _TRANSFORM.match(text, at)
+        if found is None:
+            raise ValueError(f"transform: expected functions, got {text[at:]!r:.60}")
+        at = found.end()
+        matrix = matrix @ _one_matrix(
+            found[1], [float(x) for x in re.findall(r"[^\s,]+", found[2])]
+        )
+    return matrix
+
+
+def _one_matrix(name: str, values: list[float]) -> Array:
+    match name, values:
+        case "matrix", [a, b, c, d, e, f]:
+            return np.array([[a, c, e], [b, d, f], [0, 0, 1]])
+        case "translate", [x, *rest]:
+            return np.array([[1, 0, x], [0, 1, rest[0] if rest else 0], [0, 0, 1]])
+        case "scale", [x, *rest]:
+            return np.diag([x, rest[0] if rest else x, 1.0])
+        case "rotate", [degrees, *middle]:
+            x, y = middle or (0.0, 0.0)
+            cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+            return np.array(
+                [[cos, -sin, x - cos * x + sin * y], [sin, cos, y - sin * x - cos * y], [0, 0, 1]]
+            )
+        case "skewX", [degrees]:
+            return np.array([[1, math.tan(math.radians(degrees)), 0], [0, 1, 0], [0, 0, 1]])
+        case "skewY", [degrees]:
+            return np.array([[1, 0, 0], [math.tan(math.radians(degrees)), 1, 0], [0, 0, 1]])
+        case _:
+            raise ValueError(f"transform: {name} of {len(values)} numbers is not known")
+
+
+# ---------------------------------------------------------------------- picture
+
+
+def drawn_outline(
+    outline: Outline, *, bright: bool
+) -> tuple[NDArray[np.uint8], tuple[float, float]]:
+    """Return the picture (H, W) of a part, and the place of its first pixel from the origin."""
+    points = np.concatenate(outline.loops)
+    low = np.floor(points.min(axis=0)).astype(int) - MARGIN_PX
+    width, height = (np.ceil(points.max(axis=0)).astype(int) + MARGIN_PX + 1 - low).tolist()
+    if width * height > MAX_OUTLINE_PX:
+        raise TeachingError(
+            TeachingTrouble.TOO_LARGE,
+            f"the part has {width} x {height} pixels at this scale, {MAX_OUTLINE_PX} can be taught",
+        )
+    inside = _areas([loop - low + 0.5 for loop in outline.loops], (height, width))
+    smooth = load("cv2", "inspection needs").GaussianBlur(inside, (0, 0), BLUR_PX)
+    levels = DARK + CONTRAST * (smooth if bright else 1.0 - smooth)
+    noise = np.random.default_rng(1).normal(scale=NOISE, size=levels.shape)
+    picture: NDArray[np.uint8] = np.rint(levels + noise).clip(0, 255).astype(np.uint8)
+    return picture, (float(low[0]), float(low[1]))
+
+
+def _areas(loops: list[Array], shape: tuple[int, int]) -> Array:
+    """Return the part of each pixel that lies in an odd number of loops, (H, W)."""
+    rows: list[NDArray[np.int_]] = []
+    crossings: list[Array] = []
+    for loop in loops:
+        for (ax, ay), (bx, by) in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            begin, end = (
+                math.ceil(min(ay, by) * SUBROWS - 0.5),
+                math.ceil(max(ay, by) * SUBROWS - 0.5),
+            )
+            if end > begin:
+                row = np.arange(begin, end)
+                rows.append(row)
+                crossings.append(ax + ((row + 0.5) / SUBROWS - ay) / (by - ay) * (bx - ax))
+    row, across = np.concatenate(rows), np.concatenate(crossings)
+    order = np.lexsort((across, row))
+    row, across = row[order], across[order]
+    # the crossings of a row enter and leave the part in turn; from each one to the right
+    signs = np.where(np.arange(len(row)) % 2, -1.0, 1.0) / SUBROWS
+    first = np.floor(across).astype(int)
+    canvas = np.zeros((shape[0], shape[1] + 2))
+    np.add.at(canvas, (row // SUBROWS, first), signs * (first + 1 - across))
+    np.add.at(canvas, (row // SUBROWS, first + 1), signs * (across - first))
+    return np.cumsum(canvas, axis=1)[:, : shape[1]]
