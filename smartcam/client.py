@@ -92,7 +92,7 @@ class SmartCamera(Camera[ValueT]):
         return CameraState(self.settings.name, self.settings.application, self._listeners)
 
     def _go_to(self, address: Address) -> None:
-        """Have sessions at another address than the settings say; before it is opened."""
+        """Take another address than that of the settings; only before the client is opened."""
         self.settings: CameraSettings = self.settings.model_copy(update={"address": address})
         self._supervisor.go_by(self.settings)
 
@@ -298,7 +298,7 @@ class SmartCamera(Camera[ValueT]):
         if raw.answered if answered is None else answered:
             return dialect.body(await self._requests.exchange(raw.message, raw.answer, deadline))
         if raw.answered and raw.known:
-            # answered it is nevertheless, and that must not pass for the next one's answer
+            # the camera answers all the same, and that must not pass for the next request's answer
             await self._requests.post(raw.message, raw.answer, deadline)
         else:
             await self._requests.tell(raw.message, deadline, answered=False)

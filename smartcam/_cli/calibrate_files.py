@@ -40,7 +40,7 @@ OWN = "wizard"
 
 
 class OwnContext(click.Context):
-    """The context of a command's own action, which bears the name of the command."""
+    """The context of a group's default command: usage texts show it by the group's name."""
 
     @property
     def command_path(self) -> str:
@@ -59,7 +59,7 @@ class WithParts(click.Command):
 
 
 class WithFiles(ListedGroup):
-    """A command with others below it: what names none of them is its own affair."""
+    """A command with others below it; arguments that name none go to its default command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse."""

@@ -153,7 +153,7 @@ async def serve_sources(
 ) -> None:
     """Serve sources until cancelled, or for ``--seconds``; one that fails harms no other.
 
-    Raises ConfigurationError, FrameFormatError, UnsupportedError: all sources fail by them;
+    Raises ConfigurationError, FrameFormatError, UnsupportedError: each source fails by one;
     ConfigurationError: the site cannot listen.
     """
     if len(urls) > MAX_SHOWN:

@@ -49,9 +49,9 @@ class Normal(NamedTuple):
     cost: float  # sum of the squared residuals; infinite where there is no model
     shared: Array  # (S, S), J^T J of the shared unknowns
     shared_right: Array  # (S,), J^T r of them
-    own: Array  # (P, K, K), J^T J of each pose' K unknowns; 0 where nothing moves a pose
+    own: Array  # (P, K, K), J^T J of each pose's K unknowns; 0 where nothing moves a pose
     own_right: Array  # (P, K), J^T r of them
-    mixed: Array  # (P, K, S), J^T J between a pose' unknowns and the shared ones
+    mixed: Array  # (P, K, S), J^T J between a pose's unknowns and the shared ones
 
     @classmethod
     def nothing(cls, shared: int, poses: int, own: int) -> Normal:
@@ -68,7 +68,7 @@ class Normal(NamedTuple):
     def reduced(self, damping: float = 0.0) -> tuple[Array, Array, Array, Array]:
         """Return the shared unknowns' matrix and right side, and what gives the poses back.
 
-        Matrix (S, S) and right side (S,), then (P, K, S) and (P, K): a pose' change is the last
+        Matrix (S, S) and right side (S,), then (P, K, S) and (P, K): a pose's change is the last
         less the one before it times the shared change. ``damping``: part of the diagonal that is
         added to it.
         """

@@ -84,7 +84,7 @@ class LinkOwner(Protocol):
 
     @property
     def codec(self) -> WireCodec:
-        """The words on the wire."""
+        """Return the codec of the messages on the wire."""
         ...
 
     def step(self) -> AbstractContextManager[object]:
@@ -434,7 +434,7 @@ class FaultyLink:
 
 @dataclass(eq=False)
 class SecondClientSession:
-    """The second client of a fault: it has the session and nothing behind it."""
+    """The second client of a fault: it has the session, and no program behind it reads anything."""
 
     _dialect: FramedDialect
     _traced: Callable[[Frame], None]  # told of all the camera says to it; none of it is on a wire

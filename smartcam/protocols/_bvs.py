@@ -353,7 +353,7 @@ BID = FramedDialect(
 
 
 class _Bvs(Protocol):
-    """With the dialects as what they are."""
+    """A protocol whose dialects are of the type that they are here."""
 
     dialects: Mapping[str, FramedDialect]
 

@@ -30,7 +30,7 @@ class ThreadedSite(Site):
         await super().start()
 
     async def stop(self) -> None:
-        """Close the port, and end the threads; what has not begun in them never does."""
+        """Close the port, and end the threads; work that waits for one of them is not begun."""
         try:
             await super().stop()
         finally:

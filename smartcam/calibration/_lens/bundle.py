@@ -32,9 +32,9 @@ SETTLED_COST_RATIO: Final = 1e-7
 a hundredth of a standard deviation."""
 
 LOOSE_SIGMA_RATIO: Final = 0.01
-"""Standard deviation that a sheet's point is thought to be off, in parts of its distance to the
-next: of six recorded views a tenth makes the held-out error 1.7 times as large as an exact sheet
-does, a hundredth 1.1, and of many both the same (measured)."""
+"""Assumed standard deviation of a sheet's point, in parts of its distance to the next. With six
+recorded views a tenth makes the held-out error 1.7 times as large as an exact sheet does, a
+hundredth 1.1; with many views both give the same (measured)."""
 
 TIGHT_SIGMA_RATIO: Final = 1e-4
 """Standard deviation of the place, direction and size of all of a sheet's points as a whole, which
@@ -44,14 +44,14 @@ SETTLED_REFIT_RATIO: Final = 1e-5
 """Part of the weighted squares by which the last step lowers them, in a fit without a pose."""
 
 MAX_FEW_POSES: Final = 5
-"""Poses up to which a fit without one of them is no small step away."""
+"""Poses up to which leaving one out changes the fit too much for one step."""
 
 MAX_BEND: Final = 1.2
-"""Squares of a pose that was left out over those that one step foretells, beyond which the way is
-too bent for one step: lenses whose coefficients make up for each other."""
+"""Cost without a pose over the cost that one step predicts, beyond which one step does not do: as
+with lenses whose coefficients make up for each other."""
 
 Indices: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
-"""Numbers of things."""
+"""An array of indices."""
 
 
 class Sight(NamedTuple):
@@ -249,7 +249,7 @@ class LeftOut(NamedTuple):
 
 
 def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut]:
-    """Return each pose that is seen left out once; where one step does not do, fitted anew."""
+    """Leave out each pose that is seen, one after the other: by one step, or else by a new fit."""
     # At the solution the normal equations without a pose are all less its own, both with their
     # poses eliminated: their solution is Gauss' and Newton's step from the whole fit to that
     # without the pose. What it leaves is of second order in how far the pose pulls the others.
@@ -278,7 +278,7 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
 def _fitted_without(
     adjusted: AdjustedBundle, sights: Sequence[Sight], pose: int, own: Sequence[Sight]
 ) -> Bundle:
-    """Return the cameras as they are fitted to all views but a pose' own, and its pose to these."""
+    """Return the cameras as fitted to all views but a pose's own, and its pose to these."""
     others = [one for one in sights if one.pose != pose]
     anew = adjust(adjusted.bundle, others, adjusted.more, SETTLED_REFIT_RATIO).bundle
     without = dataclasses.replace(anew, poses=adjusted.bundle.poses.taken([pose]))
@@ -390,7 +390,7 @@ class BundleEquations:
         Whitened, (N, 2, ...): by the pose, by these unknowns, and the residuals in one; by the
         points on the target (N, 2, 3).
         """
-        # p = R_c (R m + t) + t_c moves with a pose' turn by R_c (w x R m), with the rig's by
+        # p = R_c (R m + t) + t_c moves with a pose's turn by R_c (w x R m), with the rig's by
         # w x (R_c (R m + t)), with the point by R_c R; see pose_changes.
         number, rig, pose = group.camera, bundle.from_first(group.camera), bundle.poses
         points, rotation = self._meant if bundle.points is None else bundle.points, pose.rotation

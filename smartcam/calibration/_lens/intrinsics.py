@@ -45,7 +45,7 @@ Bar = Annotated[storage.NonNegative, Field(le=1)]
 BARS = storage.row(tuple[Bar, Bar, Bar, Bar], Coverage._make)
 
 MIN_VIEWS: Final = 3
-"""Two tell a lens without noise; one more tells of noise."""
+"""Two views without noise determine a lens; a third one shows the noise."""
 
 MIN_TILT_RADIANS: Final = math.radians(5.0)
 """Least angle between the steepest two planes; parallel ones leave the focal length open."""
@@ -100,15 +100,15 @@ class IntrinsicCalibration(storage.SavedCalibration):
     Attributes:
         camera: the lens.
         covariance: (4 + K, 4 + K), of fx, fy, cx, cy and the coefficients, from how much each view
-            changes them (a jackknife): what a view has wrong as a whole is in it, as where the
-            sheet bends anew. 0 for what was not fitted. Of V views it has the rank V at most, and
-            of few it is rough: of ten by a quarter.
+            changes them (a jackknife): errors that all points of a view share are in it, as where
+            the sheet bends anew. 0 for what was not fitted. Of V views it has the rank V at most,
+            and of few it is rough: of ten by a quarter.
         views: one for each given view, in their order.
         rms: rms of the residuals of the used views, their freedom taken off: the standard deviation
             of a coordinate, pixels. It is no accuracy: see ``held_out``.
-        sigma: what the residuals show beside the points' covariance, standard deviation of a
-            coordinate, pixels: the lens or the sheet is not quite as modelled, or the points have
-            more noise than they say.
+        sigma: standard deviation of a coordinate that the points' covariance does not explain,
+            pixels: the lens or the sheet is not quite as modelled, or the points have more noise
+            than they say.
         held_out: held-out error, rms of a coordinate over all used views, pixels; see
             :attr:`ViewFit.held_out`. The six parameters of each held-out pose are taken off the
             freedom. NaN where there were too few views.
@@ -158,11 +158,11 @@ class IntrinsicCalibration(storage.SavedCalibration):
     ) -> ProjectionUncertainty:
         """Return the uncertainty of where the lens projects, as a map over its field.
 
-        It is what ``covariance`` leads to for a point that does not move, without the small motion
-        of the camera that fits best to the target's points where they were seen: every pose that
-        is found with this lens has that motion in it. It is least at the distances at which the
-        target was. Where it never was, the map shows what the lens' model makes of that, and no
-        covariance knows whether a model fits there.
+        It follows from ``covariance`` for a fixed point. A small motion of the camera, the one that
+        fits best to the target's points where they were seen, is taken off, since every pose that
+        is found with this lens makes up for it. It is least at the distances at which the target
+        was. Where it never was, the map shows what the lens' model makes of that, and no covariance
+        knows whether a model fits there.
 
         Args:
             distance: distance of the points from the camera, metres; None: infinity.
@@ -243,8 +243,8 @@ def calibrate_intrinsics(
 
     The reprojection error is made least, each point weighted by its covariance and by what the
     residuals show beside it. The order of the views does not matter. Points that are far from where
-    the others of their view have them are left out and named (``OUTLIER``). From which end a view
-    numbers a target that looks the same after half a turn does not matter.
+    the others of their view have them are left out and named (``OUTLIER``). A view of a
+    target that looks the same after half a turn may number its points from either end.
 
     Where *all* pictures were flipped and the target looks the same in a mirror, as a checkerboard
     does, nothing tells: the lens is that of the flipped pictures, and right for those alone.
@@ -256,11 +256,11 @@ def calibrate_intrinsics(
             ``equidistant`` for fisheyes.
         fixed: coefficients that stay 0, such as ``k3``; ``aspect`` makes fx and fy the same.
         sheet: ``auto``: whether the target's points are adjusted, too, is chosen by the held-out
-            error, and they are where it is less by more than chance between views is; printers
-            stretch, and paper bends. As far as few views tell of them they stay where they were
-            meant to be. ``exact``: they are there. ``free``: they are adjusted. Where the held-out
-            error denies that they are where they were meant to be, ``SHEET_NOT_EXACT`` among the
-            warnings says so. Targets of more than 1000 points are taken as exact, untested.
+            error, and they are where that lessens it by more than chance; printers stretch, and
+            paper bends. Points that few views show stay near where they were meant to be.
+            ``exact``: they are there. ``free``: they are adjusted. Where the held-out error denies
+            that they are where they were meant to be, ``SHEET_NOT_EXACT`` among the warnings says
+            so. Targets of more than 1000 points are taken as exact, untested.
         drop_bad: whether views that fit far worse than the others are left out (and named), at
             most a third of them; else they are only named.
 

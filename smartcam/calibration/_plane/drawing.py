@@ -20,26 +20,26 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
-WIDTH: Final = 900.0
+FIELD_WIDTH_PX: Final = 900.0
 """The field is drawn this wide, pixels; its height follows from the points."""
 
 BORDER: Final = 60.0
-FOOT: Final = 130.0
-"""Pixels around the field, and for the legend below it."""
+LEGEND_HEIGHT_PX: Final = 130.0
+"""Pixels below the field, for the legend."""
 
-MARGIN: Final = 0.15
-"""A margin of this part of the extent of what is shown stays free around it."""
+MARGIN_RATIO: Final = 0.15
+"""Free margin around the points that are shown, in parts of their extent."""
 
 MAX_COLUMNS: Final = 30
 """Cells of the heat map across; as many down as make them square, at most twice that."""
 
-ELLIPSE: Final = math.sqrt(-2.0 * math.log(0.05))
+ELLIPSE_SIGMAS: Final = math.sqrt(-2.0 * math.log(0.05))
 """Standard deviations in which 95 % of a plane's normal distribution lie."""
 
-OUTLINE: Final = 24
+ELLIPSE_POINTS: Final = 24
 """Points of an ellipse."""
 
-TINY: Final = 1e-9
+MIN_ENLARGED_RATIO: Final = 1e-9
 """Errors below this part of the field's width are not drawn larger."""
 
 LOW, HIGH = (240, 247, 252), (246, 196, 140)
@@ -73,11 +73,11 @@ class _DrawnPlane:
 
     def __init__(self, shown: Array) -> None:
         low, high = shown.min(axis=0), shown.max(axis=0)
-        margin = MARGIN * float((high - low).max())
+        margin = MARGIN_RATIO * float((high - low).max())
         self.low: Array = low - margin
         self.high: Array = high + margin
         width, height = (self.high - self.low).tolist()
-        self.zoom: float = WIDTH / width
+        self.zoom: float = FIELD_WIDTH_PX / width
         self.height: float = height * self.zoom
         self.foot: float = 2 * BORDER + self.height
 
@@ -94,14 +94,14 @@ def draw(
     """Return a picture of a calibration.
 
     Grey is the camera's frame, blue the directions of the robot's axes as they lie in the plane:
-    the longer, the flatter they lie. Black points were touched; from each a red line goes to where
-    the touch says that it is, its residual. The background is the predicted error, violet ellipses
-    hold 95 % of it. Where nothing tells how well points were touched, both are missing. Points that
-    a robust fit left out are grey crosses, without residual and ellipse; one that lies far beyond
-    the others is not shown.
+    an axis that rises from the plane is shorter. Black points were touched; from each a red line
+    goes to where the touch says that it is, its residual. The background is the predicted error,
+    violet ellipses hold 95 % of it. Where nothing tells how well points were touched, both are
+    missing. Points that a robust fit left out are grey crosses, without residual and ellipse; one
+    that lies far beyond the others is not shown.
 
     ``parts``: localizations in the camera's frame that are shown, too, in green. ``title``: a line
-    on top. The SVG document has a size of its own and no parts elsewhere; lines end with a line
+    on top. The SVG document says its size and refers to no other file; lines end with a line
     feed.
     """
     found = list(parts)
@@ -116,7 +116,11 @@ def draw(
     outlines = _outlines(calibration, both)
     sizes = np.concatenate([residuals, outlines[: len(points)].reshape(-1, 2)])
     largest = field.zoom * float(np.linalg.norm(sizes, axis=1).max())
-    larger = round_down(0.06 * WIDTH / largest) if largest > TINY * WIDTH else 1.0
+    larger = (
+        round_down(0.06 * FIELD_WIDTH_PX / largest)
+        if largest > MIN_ENLARGED_RATIO * FIELD_WIDTH_PX
+        else 1.0
+    )
     shapes = [
         f"<defs>{HEADS}</defs>",
         *_heat(calibration, field),
@@ -129,36 +133,36 @@ def draw(
         *(_part(part, place) for part, place in zip(found, field.pixels(places), strict=True)),
         *_legend(calibration, field, larger, title),
     ]
-    return document(WIDTH + 2 * BORDER, field.foot + FOOT, shapes, STYLE)
+    return document(FIELD_WIDTH_PX + 2 * BORDER, field.foot + LEGEND_HEIGHT_PX, shapes, STYLE)
 
 
 def _outlines(calibration: PlaneCalibration, points: Array) -> Array:
     """Return the outlines of the 95 % ellipses about points, as the camera would see them.
 
-    They are (N, OUTLINE, 2), from each point; none where nothing tells how well points were
+    They are (N, ELLIPSE_POINTS, 2), from each point; none where nothing tells how well points were
     touched.
     """
     if calibration.touch_sigma is None:
-        return np.zeros((0, OUTLINE, 2))
+        return np.zeros((0, ELLIPSE_POINTS, 2))
     inside = calibration.rotation[:, :2]
     covariances = inside.T @ calibration.covariance_at(points) @ inside
     values, vectors = np.linalg.eigh(covariances)
-    lengths = ELLIPSE * np.sqrt(np.maximum(values, 0.0))
+    lengths = ELLIPSE_SIGMAS * np.sqrt(np.maximum(values, 0.0))
     # the symmetric root: axes alone may point to either side
     half = (vectors * lengths[:, None, :]) @ vectors.swapaxes(1, 2)
-    angles = np.linspace(0.0, math.tau, OUTLINE, endpoint=False)
+    angles = np.linspace(0.0, math.tau, ELLIPSE_POINTS, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)])
     outlines = (half @ circle).swapaxes(1, 2) @ inside.T  # metres in the robot's space
     centres = calibration.transform(points)
     seen = calibration.inverse((centres[:, None] + outlines).reshape(-1, 3))
-    return seen.reshape(len(points), OUTLINE, 2) - points[:, None]
+    return seen.reshape(len(points), ELLIPSE_POINTS, 2) - points[:, None]
 
 
 def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     """Yield the predicted error as coloured cells."""
     if calibration.touch_sigma is None:
         return
-    cell = WIDTH / MAX_COLUMNS
+    cell = FIELD_WIDTH_PX / MAX_COLUMNS
     rows = min(2 * MAX_COLUMNS, max(1, round(field.height / cell)))
     tall = field.height / rows
     corners = [[x * cell, y * tall] for y in range(rows) for x in range(MAX_COLUMNS)]
@@ -194,7 +198,7 @@ def _axes(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
     start = field.pixels(np.clip(np.zeros(2), field.low, field.high))
     yield from _axis(start, np.array([70.0, 0.0]), "camera", "camera x")
     yield from _axis(start, np.array([0.0, -70.0]), "camera", "y")
-    start = np.array([BORDER + WIDTH - 90, field.foot + 35])
+    start = np.array([BORDER + FIELD_WIDTH_PX - 90, field.foot + 35])
     for axis, name in zip(calibration.rotation[:, :2], ("robot x", "y", "z"), strict=True):
         if np.linalg.norm(axis) < 0.05:  # it stands on the plane
             yield circle(start, 4, "robot")
@@ -250,8 +254,8 @@ def _legend(
         f"{'; crosses: left out' if left_out else ''}",
     )
     per_metre = field.zoom / calibration.scale
-    metres = round_down(0.2 * WIDTH / per_metre)
-    end = np.array([BORDER + WIDTH - 220, field.foot])
+    metres = round_down(0.2 * FIELD_WIDTH_PX / per_metre)
+    end = np.array([BORDER + FIELD_WIDTH_PX - 220, field.foot])
     start = end - [metres * per_metre, 0.0]
     yield line(start, end, "camera")
     yield _text(start, f"{1e3 * metres:g} mm", beside=(0, 18))

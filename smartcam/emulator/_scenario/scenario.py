@@ -121,7 +121,7 @@ class Scenario(EmulatorData):
 
 
 class ScenarioFile(Scenario):
-    """A scenario file: one camera, or what several have in common, and these."""
+    """A scenario file: one camera; or several, and the fields that they have in common."""
 
     cameras: tuple[Scenario, ...] = Field(
         default=(),

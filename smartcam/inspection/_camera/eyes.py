@@ -79,8 +79,8 @@ class _OrderedRun:
 class Eyes(Inspector):
     """Inspects the first frame that is exposed after a run has begun.
 
-    One thread of its own runs the tools, one picture at a time; what a tool does for a run that was
-    given up goes on in another.
+    One thread of its own runs the tools, one picture at a time. If a run is given up while a tool
+    is at work, that thread is left to the tool, and a new one has the next picture.
 
     Args:
         name: name of the camera, for logs.
@@ -131,7 +131,7 @@ class Eyes(Inspector):
     # ------------------------------------------------------------------ life
 
     async def start(self) -> None:
-        """Open the source, and wait a moment for its first frame; without one it is told, too.
+        """Open the source, and wait a moment for a first frame; ``on_sight`` hears if none comes.
 
         Cancellation: leaves it stopped.
         """
@@ -184,7 +184,7 @@ class Eyes(Inspector):
             loop.call_soon(self._tell, self.trouble)
 
     def cancel(self) -> None:
-        """Give up the inspection under way; what its thread has begun keeps no later one."""
+        """Give up the inspection under way; a later one does not wait for its thread."""
         order, self._order = self._order, None
         self._wanted.clear()
         if order is not None:

@@ -118,7 +118,7 @@ class CameraControls:
     async def _refresh(self, source: FrameSource) -> None:
         """Have all parameters be as the device has their features: setting one may change others.
 
-        The refresh waits until the setting that caused it counts.
+        It waits first until the device has taken over the setting that caused it.
         """
         await asyncio.sleep(REFRESH_DELAY)
         for parameter, name in [*self._features.items()]:

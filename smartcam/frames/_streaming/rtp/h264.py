@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 MTU_PAYLOAD: Final = 1380
-"""Bytes of a packet behind its 12: with UDP, IP and a tunnel they fit into Ethernet's 1500."""
+"""Bytes of a packet behind its header: with UDP, IP and a tunnel they fit into Ethernet's 1500."""
 
 SLICES, KEY, SPS, PPS, DELIMITER = range(1, 6), 5, 7, 8, 9
 """Kinds of units (ITU-T H.264, table 7-1)."""
@@ -30,7 +30,7 @@ def units(access_unit: bytes) -> list[bytes]:
         access_unit: bytes as in a file (ITU-T H.264, annex B).
 
     Raises:
-        FrameFormatError: the frame begins with none, or has one that is not valid.
+        FrameFormatError: the frame begins with no start code, or has a unit of no known kind.
     """
     data = bytes(access_unit)
     place = data.find(b"\0\0\1")
@@ -63,7 +63,7 @@ class H264Packetizer:
     """Makes the packets of one stream.
 
     Args:
-        payload_type: 0 to 127; what has no number of its own takes 96 to 127.
+        payload_type: 0 to 127; formats without a number of their own, as H.264, take 96 to 127.
         ssrc: SSRC of the stream; None: a random one.
         sequence: number of the first packet; None: a random one.
         mtu_payload: bytes of a packet's payload.
@@ -178,13 +178,13 @@ class H264Unit(NalUnit):
 
 
 class H264Units:
-    """The kind of a stream of H.264."""
+    """The units of a stream of H.264, as seen in its packets."""
 
     open = H264Unit
 
     @staticmethod
     def begins(payload: bytes) -> bool:
-        """Return True if a packet has what only begins frames, or a key frame's first slice."""
+        """Return True if a packet begins a frame: by its kind, or as a key frame's first slice."""
         kind = payload[0] & 0x1F if payload else 0
         if kind == STAP_A and len(payload) > 3:
             payload = payload[3:]
