@@ -258,9 +258,10 @@ def _plain(protocol: str, *, shown: bool) -> Scenario:
     from smartcam.emulator import Scenario
     from smartcam.emulator._inside import emulated_class
 
-    if not (shown and emulated_class(protocol).state_options(SHOWN, running=True)):
-        return Scenario(protocol=protocol)
-    return Scenario(protocol=protocol, active=SHOWN, running=True)
+    camera = emulated_class(protocol)
+    running = Scenario(protocol=protocol, active=SHOWN, running=True)
+    able = shown and camera.state_options(SHOWN, running=True) and camera.mistake(running) is None
+    return running if able else Scenario(protocol=protocol)
 
 
 def _quirk(text: str) -> tuple[str, Any]:

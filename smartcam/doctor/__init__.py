@@ -26,7 +26,7 @@ from smartcam.doctor import _state_checks as state_checks
 from smartcam.doctor import _trigger_checks as trigger_checks
 from smartcam.doctor._context import DoctorOptions, Examination, Witness
 from smartcam.doctor._findings import Exit, Finding
-from smartcam.doctor._found import FoundPort
+from smartcam.doctor._found import FoundPort, serves_one
 from smartcam.doctor._search import find
 from smartcam.exceptions import (
     CameraFaultError,
@@ -38,6 +38,7 @@ from smartcam.exceptions import (
     UnsupportedError,
 )
 from smartcam.interpreters import resolve
+from smartcam.protocols._inside import load_protocol
 from smartcam.settings import is_fleet, parse_address
 
 if TYPE_CHECKING:
@@ -65,6 +66,11 @@ SHARED = Finding(
     check="notice",
     severity="ok",
     text="the camera is an agent's, which shares it: this examination takes it from nobody",
+)
+SEVERAL = Finding(
+    check="notice",
+    severity="ok",
+    text="the camera serves several clients: this examination takes it from nobody",
 )
 
 
@@ -164,8 +170,8 @@ async def examine(
 ) -> AsyncGenerator[Finding]:
     """Examine a camera and yield what is found, as it is found.
 
-    Connecting takes the camera from another client: the first finding says so. Nothing
-    is started, stopped, switched or set, and nothing is triggered, unless ``trigger`` says so.
+    Connecting may take the camera from another client: the first finding says so. Nothing is
+    started, stopped, switched or set, and nothing is triggered, unless ``trigger`` says so.
 
     Args:
         url: the camera's address; ``gige://HOST`` is a source of frames, of which the way, the
@@ -225,7 +231,8 @@ async def examine(
     way, address = _way_to(url) if fleet else (_AT_THE_WIRE, parse_address(url))
     exam = Examination(options, address, trace, Witness(), wants_trigger=trigger)
     exam.make_camera()  # which sees to it that the options can work
-    yield SHARED if fleet else NOTICE
+    alone = not fleet and serves_one(load_protocol(address.protocol))
+    yield SHARED if fleet else NOTICE if alone else SEVERAL
     async with exam.stack, exam.borrowed:
         for check in (*way, *_CHECKS):
             goes_on = await _run(check, exam)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from smartcam.doctor import examine
 from smartcam.emulator import LineCamera
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from tests.cli.commandline import run
+from tests.processes import Process
 
 MAKES: dict[str, tuple[Callable[[], LineCamera], str]] = {
     "pcic": (EmulatedIfm, "v3"),
@@ -40,6 +42,17 @@ async def test_doctor_finds_nothing_wrong(name: str) -> None:
         found = [one async for one in examine(emulator.url, trigger=True, count=3, seconds=0.1)]
     assert not [one for one in found if one.severity in {"error", "warning"}], found
     assert any("trigger" in one.check for one in found)
+    assert "serves several clients" in found[0].text
+
+
+@pytest.mark.parametrize("name", MAKES)
+@pytest.mark.real_time
+def test_emulated_camera_has_a_page_without_a_word_more(name: str) -> None:
+    with Process("smartcam-emulator", "--protocol", name, "--web") as emulator:
+        assert emulator.read_until(b"\n").startswith(f"{name}://127.0.0.1:")
+        emulator.send_signal(signal.SIGTERM)
+        code, _, said = emulator.wait()
+    assert (code, said.partition("//")[0]) == (0, "page: http:")
 
 
 @pytest.mark.parametrize(("version", "dialect"), [(1, "v1"), (2, "v2"), (3, "v3"), (4, "v4")])
