@@ -139,7 +139,7 @@ class _Plan(NamedTuple):
 
 
 def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:
-    """Return what finds the picture of each result; None where the camera tells it.
+    """Return the observer that finds the picture of each result; None where the camera tells it.
 
     Raises UnsupportedError: nobody knows the pictures of the camera's results.
     """
