@@ -120,7 +120,7 @@ async def record(
         if pictures == JUDGED:
             judged = _judged_pictures(url, recorders[0])
             observers += [] if judged is None else [judged]
-        elif pictures not in {None, NO_PICTURES}:
+        elif pictures is not None and pictures != NO_PICTURES:
             with from_part("frames", "pictures need"):
                 from smartcam._cli.frame_sources import opened
 

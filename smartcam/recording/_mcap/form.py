@@ -77,7 +77,7 @@ MAX_NAME = 1000
 
 EPOCH = datetime.fromtimestamp(0, UTC)
 
-MAX_UTC_TIME = 18_446_744_073.0
+MAX_CAPTURE_TIME = 18_446_744_073.0
 """Seconds since 1970 of the latest capture, in 2554: times are in nanoseconds, of 64 bits."""
 
 
@@ -131,7 +131,7 @@ Item: TypeAlias = TraceEntry | Result | CameraEvent | RecordedError | RecordedPi
 
 def captured_at(frame: Frame) -> datetime:
     """Return when a picture was captured, as near as a recording can say it."""
-    return datetime.fromtimestamp(min(max(0.0, frame.utc), MAX_UTC_TIME), UTC)
+    return datetime.fromtimestamp(min(max(0.0, frame.utc), MAX_CAPTURE_TIME), UTC)
 
 
 class Kind(NamedTuple):

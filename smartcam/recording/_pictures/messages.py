@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from smartcam.exceptions import FrameFormatError
 from smartcam.frames import Frame, Moment, find_format
-from smartcam.recording._mcap.form import MAX_NAME, MAX_UTC_TIME, RecordedPicture
+from smartcam.recording._mcap.form import MAX_CAPTURE_TIME, MAX_NAME, RecordedPicture
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -140,8 +140,8 @@ def check_readable(frame: Frame) -> None:
         said = f"{frame.width}x{frame.height}, expected 1 to {MAX_SIDE_PX} pixels along each side"
     elif not (math.isfinite(frame.captured) and math.isfinite(frame.device_time or 0.0)):
         said = f"captured {frame.captured}, {frame.device_time} of the device, expected seconds"
-    elif not 0 <= frame.utc <= MAX_UTC_TIME:
-        said = f"captured {frame.utc} s after 1970, expected 0 to {MAX_UTC_TIME:.0f}"
+    elif not 0 <= frame.utc <= MAX_CAPTURE_TIME:
+        said = f"captured {frame.utc} s after 1970, expected 0 to {MAX_CAPTURE_TIME:.0f}"
     elif not frame.duration >= 0:
         said = f"duration {frame.duration}, expected 0 or more seconds"
     elif not 0 <= frame.stride < 1 << 32:
