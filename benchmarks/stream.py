@@ -2,8 +2,9 @@
 
 smartcam makes a numpy table of each and hands it to ``async for``, one by one or in batches; the
 yardsticks cut frames and do nothing else. An observer that looks at other things than results is to
-cost nothing. With a status before and one after each result, as of a camera that a sensor triggers,
-no two results follow each other. CPU time for each result.
+cost nothing, and one that takes them together hardly anything. With a status before and one after
+each result, as of a camera that a sensor triggers, no two results follow each other. CPU time for
+each result.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from benchmarks.yardsticks import bare_client
 from smartcam.observers import Observer
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterable
+    from collections.abc import AsyncIterator, Iterable, Sequence
 
     from benchmarks.measure import How, Series
     from benchmarks.sides import Work
@@ -41,6 +42,7 @@ LAYOUT = (
     "x: real32, y: real32, theta: real32)*"
 )
 ITEMS, BATCHES, OBSERVED = "smartcam", "smartcam, batch=True", "smartcam, observed"
+EACH, TOGETHER = "smartcam, on_result", "smartcam, on_results"
 BARE, READER = "bare protocol", "StreamReader.readexactly"
 
 CASES: tuple[tuple[str, str, str, How, Goal | None], ...] = (
@@ -49,6 +51,8 @@ CASES: tuple[tuple[str, str, str, How, Goal | None], ...] = (
     (BATCHES, "async for, batch=True", READER, "speed", Goal("at least", 1.0)),
     (BATCHES, "async for, batch=True", BARE, "speed", None),
     (OBSERVED, "async for, an observer without on_result", ITEMS, "ratio", Goal("at most", 1.1)),
+    (TOGETHER, "async for, an observer with on_results", ITEMS, "ratio", Goal("at most", 1.2)),
+    (EACH, "async for, an observer with on_result", ITEMS, "ratio", None),
 )
 """Side, what it is, its yardstick, how they are compared, the goal."""
 
@@ -65,7 +69,7 @@ def run(plan: Plan) -> Iterable[Comparison]:
 
 def _results(plan: Plan) -> Iterable[Comparison]:
     with peer("stream") as port:
-        ports = dict.fromkeys((ITEMS, BATCHES, OBSERVED, BARE, READER), port)
+        ports = dict.fromkeys((ITEMS, BATCHES, OBSERVED, TOGETHER, EACH, BARE, READER), port)
         counts = count_sides(plan, "stream", ports, COUNTED)
         series = asyncio.run(_measure(plan, ports, plan.operations(RESULTS)))
     for name, case, yardstick, how, goal in CASES:
@@ -187,10 +191,26 @@ class _Elsewhere(Observer):
         self.last = event
 
 
+class _Each(Observer):
+    """Looks at each result."""
+
+    def on_result(self, result: smartcam.Result) -> None:
+        self.last = result
+
+
+class _Together(Observer):
+    """Looks at results as they come."""
+
+    def on_results(self, results: Sequence[smartcam.Result]) -> None:
+        self.last = results[-1]
+
+
 SIDES: dict[str, Side] = {
     ITEMS: _items,
     BATCHES: _batches,
     OBSERVED: lambda port: _items(port, _Elsewhere()),
+    TOGETHER: lambda port: _items(port, _Together()),
+    EACH: lambda port: _items(port, _Each()),
     BARE: _bare,
     READER: _reader,
 }

@@ -9,7 +9,7 @@ from smartcam._arguments import check_all, wrong_argument
 from smartcam._user_code import ENDS_PROGRAM
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from datetime import datetime
 
     from smartcam.exceptions import SmartCamError
@@ -68,11 +68,23 @@ class Observer:
     def on_result(self, result: Result) -> None:
         """See a result that was interpreted: for a trigger, a stream or ``next_result()``.
 
-        Results are handed over one by one for this only where an observer overrides it.
+        Results are handed over one by one for this only where an observer overrides it, and not
+        ``on_results``.
 
         The result of a trigger has ``triggered_at`` and ``latency``. A container that nobody waits
         for is counted and not interpreted.
         """
+
+    def on_results(self, results: Sequence[Result]) -> None:
+        """See results that came together, in order: one or more; do not change the sequence.
+
+        An observer that overrides it gets every result here, and ``on_result`` is not called.
+        Where no observer wants them one by one, those of a camera that runs free stay together:
+        each costs a fraction. They are counted and interpreted before it is called, and statuses
+        between them may be told behind them.
+        """
+        for result in results:
+            self.on_result(result)
 
     def on_picture(self, result: Result, frame: Frame) -> None:
         """See the picture that a result was made of, right before the result.
@@ -100,6 +112,7 @@ class Observers:
     Attributes:
         see_states: whether any looks at events.
         see_results: whether any looks at results.
+        see_each: whether any looks at each result by itself.
     """
 
     def __init__(self, observers: Iterable[Observer] = ()) -> None:
@@ -108,10 +121,11 @@ class Observers:
             if not all(callable(getattr(one, hook, None)) for hook in _HOOKS):
                 raise wrong_argument("observers", "objects of classes of Observer", one)
         self._on_state = self._overriding("on_state")
-        self._on_result = self._overriding("on_result")
+        self._on_result = tuple(self._looking_at_results())
         self._on_picture = self._overriding("on_picture")
         self.see_states: bool = bool(self._on_state)
         self.see_results: bool = bool(self._on_result)
+        self.see_each: bool = not all(together for _, together in self._on_result)
 
     def __bool__(self) -> bool:
         return bool(self._all)
@@ -136,8 +150,17 @@ class Observers:
 
     def result(self, result: Result) -> None:
         """Tell all of a result."""
-        for hook in self._on_result:
-            self._call(hook, result)
+        for hook, together in self._on_result:
+            self._call(hook, (result,) if together else result)
+
+    def results(self, results: Sequence[Result]) -> None:
+        """Tell all of results that came together; one by one where any sees each."""
+        if self.see_each:
+            for result in results:
+                self.result(result)
+            return
+        for hook, _ in self._on_result:
+            self._call(hook, results)
 
     def picture(self, result: Result, frame: Frame) -> None:
         """Tell all of the picture that a result was made of."""
@@ -153,9 +176,16 @@ class Observers:
 
     def _overriding(self, name: str) -> tuple[Callable[..., None], ...]:
         """Return a hook of those observers that have one of their own, in order."""
-        hooks = [getattr(one, name) for one in self._all]
-        own = getattr(Observer, name)
-        return tuple(hook for hook in hooks if getattr(hook, "__func__", None) is not own)
+        hooks = [_own_hook(one, name) for one in self._all]
+        return tuple(hook for hook in hooks if hook is not None)
+
+    def _looking_at_results(self) -> Iterator[tuple[Callable[..., None], bool]]:
+        """Yield the hook of each observer that looks at results, and whether it takes several."""
+        for one in self._all:
+            together, each = _own_hook(one, "on_results"), _own_hook(one, "on_result")
+            hook = together or each
+            if hook is not None:
+                yield hook, together is not None
 
     def _call(self, hook: Callable[..., None], *arguments: Any) -> None:
         try:
@@ -164,3 +194,9 @@ class Observers:
             raise
         except BaseException:  # it is not to end the receive task
             logger.exception("! an observer failed: %r", hook)
+
+
+def _own_hook(observer: Observer, name: str) -> Callable[..., None] | None:
+    """Return a hook of an observer that is its own; None where it does nothing."""
+    hook: Callable[..., None] | None = getattr(observer, name, None)
+    return None if getattr(hook, "__func__", None) is getattr(Observer, name) else hook

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
@@ -167,6 +167,58 @@ def test_observer_with_a_hook_of_its_own_object_is_called() -> None:
     setattr(blind, "on_result", seen.append)  # noqa: B010 - a type checker would refuse it
     Observers([blind]).result(RESULT)
     assert seen == [RESULT]
+
+
+OTHERS = [RESULT._replace(number=number) for number in (2, 3)]
+
+
+class Together(Everything):
+    """Takes results together, and would note it if it were given one alone."""
+
+    def on_results(self, results: Sequence[Result]) -> None:
+        self.calls.append((self.name, "results", *results))
+
+
+def test_results_come_together_where_nobody_wants_them_one_by_one() -> None:
+    calls: list[tuple[Any, ...]] = []
+    observers = Observers([Together("one", calls), Blind(), Together("two", calls)])
+    assert (observers.see_results, observers.see_each) == (True, False)
+    observers.results(OTHERS)
+    observers.result(RESULT)
+    assert calls == [
+        *((name, "results", *OTHERS) for name in ("one", "two")),
+        *((name, "results", RESULT) for name in ("one", "two")),
+    ]
+
+
+def test_results_come_one_by_one_to_all_where_one_wants_that() -> None:
+    calls: list[tuple[Any, ...]] = []
+    observers = Observers([Together("one", calls), Everything("two", calls)])
+    assert observers.see_each
+    observers.results(OTHERS)
+    assert calls == [
+        (name, what, one)
+        for one in OTHERS
+        for name, what in (("one", "results"), ("two", "result"))
+    ]
+
+
+def test_results_that_are_not_overridden_go_to_the_other_hook() -> None:
+    calls: list[tuple[Any, ...]] = []
+    Everything("one", calls).on_results(OTHERS)
+    assert calls == [("one", "result", one) for one in OTHERS]
+
+
+def test_object_without_the_hook_for_several_results_is_an_observer() -> None:
+    seen: list[Result] = []
+
+    class Plain:
+        on_frame = on_state = on_picture = on_error = print
+        on_result = staticmethod(seen.append)
+
+    given: Any = [Plain()]
+    Observers(given).results(OTHERS)
+    assert seen == OTHERS
 
 
 def test_observers_given_as_a_generator_are_kept() -> None:

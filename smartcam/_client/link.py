@@ -20,7 +20,7 @@ from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.doorbell import make_doorbell
-from smartcam._datagrams import read_no_more_than_needed
+from smartcam._datagrams import LARGEST_DATAGRAM, read_no_more_than_needed, second_socket
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
@@ -50,6 +50,10 @@ chunk is left: a camera that sends results faster than they can be delivered has
 
 MAX_DATAGRAMS = 256
 """Datagrams that may wait for the receive task; further ones are dropped and counted."""
+
+MAX_DATAGRAMS_AT_ONCE = 8
+"""Datagrams that are taken in one turn of the loop where they have come already: twice a trigger's
+answers."""
 
 TURN_TIME = 0.0002
 """Seconds of processor time that the receive task aims to take in one turn of the event loop.
@@ -134,6 +138,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self.heard_at: float = self.loop.time()
         self._transport: Any = None
         self._datagrams = machine.transport is Transport.UDP
+        self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
         self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
         self._chunks: collections.deque[Chunk] = collections.deque()
@@ -294,6 +299,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         links[self.loop] = links.get(self.loop, 0) + 1
         if self._datagrams:
             read_no_more_than_needed(transport)
+            self._aside = second_socket(transport)
         sock = transport.get_extra_info("socket")
         if sock is not None and not self._datagrams:
             # the camera sets it and advises it (SC manual p. 40: published)
@@ -316,11 +322,15 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
     def datagram_received(self, data: bytes, addr: Any) -> None:
         """asyncio: a datagram of a UDP link."""
         self.heard_at = self.loop.time()
-        if len(self._chunks) >= MAX_DATAGRAMS:
+        chunks = self._chunks  # only the first may have come by several datagrams
+        if chunks and len(chunks) - 1 + chunks[0].frames >= MAX_DATAGRAMS:
             self.machine.counters.ignored_frames += 1
             return
         self.machine.receive_data(data)
+        error = None if self._aside is None or chunks else self._read_aside(self._aside)
         self._hand_on()
+        if error is not None:
+            self.error_received(error)
 
     def eof_received(self) -> None:
         """asyncio: the camera will send no more."""
@@ -338,6 +348,9 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """asyncio: the link is over."""
         self._lose(exc or ConnectionResetError("the camera closed the connection"))
         links[self.loop] -= 1
+        if self._aside is not None:
+            self._aside.close()
+            self._aside = None
         if not self._closed.done():
             self._closed.set_result(None)
 
@@ -360,6 +373,22 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
                 self._transport.sendto(frame)
         else:
             self._transport.write(b"".join(frames))
+
+    def _read_aside(self, sock: socket.socket) -> OSError | None:
+        """Take the datagrams that have come already, without a turn of the loop for each.
+
+        Returns:
+            What the system says of one that this side has sent; None for nothing.
+        """
+        for _ in range(min(MAX_DATAGRAMS_AT_ONCE, MAX_DATAGRAMS) - 1):
+            try:
+                data = sock.recv(LARGEST_DATAGRAM)
+            except (BlockingIOError, InterruptedError):
+                break
+            except OSError as exc:
+                return exc
+            self.machine.receive_data(data)
+        return None
 
     def _say_goodbye(self) -> None:
         if self.machine.state in {State.CONNECTED, State.CONNECTING}:

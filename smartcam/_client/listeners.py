@@ -39,6 +39,7 @@ class Listeners:
         self.statuses: Subscribers[Status] = Subscribers()
         self.events: Subscribers[CameraEvent] = Subscribers()
         self.observed: bool = observers.see_results
+        self._see_each = observers.see_each
         self._name = name
         self._observers = observers
         # weak: a waiter that was made and never awaited must not count as a listener
@@ -58,8 +59,8 @@ class Listeners:
 
     @property
     def streams_results(self) -> bool:
-        """True if a result would be handed to streams, and to nobody else."""
-        return self._streams_hear and not (self.observed or self._awaits_next)
+        """True if a result would be handed to streams, and to nobody else who wants it alone."""
+        return self._streams_hear and not (self._see_each or self._awaits_next)
 
     @property
     def hears_results(self) -> bool:
@@ -108,7 +109,9 @@ class Listeners:
             self.statuses.offer(status, now)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
-        """Hand results that are only streamed to their subscribers; ``size`` bytes in all."""
+        """Hand on results that are only streamed and observed; ``size`` bytes in all."""
+        if self.observed:
+            self._observers.results(results)
         for stream in self.results:
             stream.offer_all(results, now, size)
 

@@ -287,7 +287,7 @@ class Results:
 
     @property
     def only_streams(self) -> bool:
-        """True if results go to streams, and to nobody else, whatever statuses come between.
+        """True if results go to streams, and need not be told of one by one.
 
         No result can then belong to a trigger, pay a debt, or count as an extra result.
         """
@@ -299,7 +299,7 @@ class Results:
         """Return the results of a burst that is only streamed; None where one may be anything else.
 
         Otherwise a trigger or a single waiter may want one of them, one may pay a debt, an observer
-        may look at each, and one that cannot be interpreted is an item of its own.
+        may look at each by itself, and one that cannot be interpreted is an item of its own.
         """
         application = burst.application
         if self._pending or self._numbering or self.correlation.owed:

@@ -385,6 +385,41 @@ async def test_observer_sees_each_of_a_burst_in_order(*, together: bool) -> None
         assert len(witness.seen) == 10
 
 
+class Gatherer(Witness):
+    def __init__(self) -> None:
+        super().__init__()
+        self.sizes: list[int] = []
+
+    def on_results(self, results: Sequence[Result]) -> None:
+        self.sizes.append(len(results))
+        self.seen += results
+
+
+@each_way
+async def test_observer_of_several_results_is_given_a_burst_whole(*, together: bool) -> None:
+    gatherer = Gatherer()
+    async with by_hand(interpret_as="n: int32", observers=[gatherer]) as (box, camera):
+        batch = camera.results(batch=True)
+        frames = numbered(box, 3)
+        await say(camera, box, *frames, together=together)
+        await say(camera, box, *frames, box.result_frame(b"?"), *frames, together=together)
+        assert gatherer.sizes == ([3, *[1] * 6] if together else [1] * 9)
+        assert gatherer.seen == await queued(batch)
+        assert fates(camera) == {"streamed": 9, "uninterpretable": 1}
+
+
+@each_way
+async def test_observer_of_several_results_beside_one_of_each_is_given_each(
+    *, together: bool
+) -> None:
+    gatherer, witness = Gatherer(), Witness()
+    async with by_hand(interpret_as="n: int32", observers=[gatherer, witness]) as (box, camera):
+        batch = camera.results(batch=True)
+        await say(camera, box, *numbered(box, 3), together=together)
+        assert gatherer.sizes == [1, 1, 1]
+        assert gatherer.seen == witness.seen == await queued(batch)
+
+
 class Quiet(Observer):
     """Looks at errors only."""
 

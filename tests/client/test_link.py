@@ -591,6 +591,41 @@ async def test_udp_refused_port_is_lost() -> None:
         await link.close(LIMIT)
 
 
+async def test_udp_datagrams_that_have_come_are_taken_together_in_order() -> None:
+    async with datagrams(connects) as camera:
+        link = await udp_session(camera.port)
+        camera.send(STATUS, b"noise", RESULT, BUSY)
+        chunk = await asyncio.wait_for(link.receive(), LIMIT)
+        assert (chunk.events, chunk.frames) == ([RUNNING, HELLO, BUSY_REPORT], 3)
+        assert link.machine.counters.ignored_frames == 1
+        camera.send(*[STATUS] * 20)
+        chunk = await asyncio.wait_for(link.receive(), LIMIT)
+        assert chunk.events == connection.MAX_DATAGRAMS_AT_ONCE * [RUNNING]
+        assert await take(link, 12) == 12 * [RUNNING]
+        link.abort()
+        await until(link._closed.done)
+        assert link._aside is None
+
+
+async def test_udp_refusal_among_datagrams_is_told_behind_those_before_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with datagrams(connects) as camera:
+        link = await udp_session(camera.port)
+        camera.send(STATUS, RESULT)
+    hear = link.machine.receive_data
+
+    def hear_and_ask(data: bytes) -> None:
+        hear(data)
+        link.send(m.Query())  # which the system refuses at once: nothing listens there any more
+
+    monkeypatch.setattr(link.machine, "receive_data", hear_and_ask)
+    assert await take(link, 1) == [RUNNING]
+    error = await lost(link)
+    assert isinstance(error.__cause__, ConnectionRefusedError)
+    await until(link._closed.done)
+
+
 async def test_udp_queue_full_drops_and_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "MAX_DATAGRAMS", 3)
     async with datagrams(connects) as camera:

@@ -131,9 +131,6 @@ class TappedListeners(Listeners):
             self.tap.status(status)
 
     def offer_burst(self, results: Sequence[Result], now: float, size: int) -> None:
-        if self.observed:
-            for result in results:
-                self._observers.result(result)
         super().offer_burst(results, now, size)
         if self.tap is not None:
             self.tap.results(results, True, False)

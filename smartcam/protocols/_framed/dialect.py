@@ -238,6 +238,15 @@ class Codec:
                 self._known[body] = message
         return message
 
+    def spell(self, body: bytes) -> dict[str, Any]:
+        """Return the fields of a body with data, which is long enough, as JSON has them.
+
+        Its other fields are plain numbers: results are many, and need no message for that.
+        """
+        fields: dict[str, Any] = dict(zip(self.names, self._body.unpack_from(body), strict=False))
+        fields[self.names[-1]] = body[self.size :].hex()
+        return fields
+
     def like(self, message: Message) -> Callable[[bytes], Message]:
         """Return a function that makes copies of a message with other data."""
         new, kind, data_name = object.__new__, self.type, self._data or ""
@@ -471,11 +480,15 @@ class FramedDialect(Dialect):
     def spell(self, sender: Sender, frame: Frame) -> Spelled:
         """Return a frame in words, for a trace; it never raises."""
         fields: dict[str, Any] | None = None
-        with contextlib.suppress(RemoteProtocolError):  # its error follows in the trace
-            message = self.decode(sender, frame)
-            names = self.fields(type(message))
-            fields = {name: jsonable(getattr(message, name)) for name in names}
-        name = self.message_type(sender, frame.message_id).__name__
+        codec = self.decoders(sender).get(frame.message_id)
+        if codec is not None and codec.has_data and len(frame.payload) >= codec.size:
+            fields = codec.spell(frame.payload)
+        else:
+            with contextlib.suppress(RemoteProtocolError):  # its error follows in the trace
+                message = self.decode(sender, frame)
+                names = self.fields(type(message))
+                fields = {name: jsonable(getattr(message, name)) for name in names}
+        name = UnknownMessage.__name__ if codec is None else codec.type.__name__
         return Spelled(frame.message_id, name, fields, self.encode_frame(frame))
 
     def raw_request(self, message_id: int | str, payload: bytes) -> RawRequest:

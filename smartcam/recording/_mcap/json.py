@@ -7,15 +7,16 @@ What is not of the types that a client makes goes that way itself.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from smartcam._json import NULL, hex_text, text_of
 from smartcam.models import Result
-from smartcam.observers import TraceEntry
+
+if TYPE_CHECKING:
+    from smartcam.observers import TraceEntry
 
 VALUE_IS_RAW = '"raw"'
 
-_FRAME = tuple(f'"{name}":' for name in (*TraceEntry._fields, "data_from"))
 _RESULT = tuple(f'"{name}":' for name in (*Result._fields, "raw_from", "value_from"))
 
 
@@ -32,13 +33,14 @@ def frame_text(entry: TraceEntry) -> str:
         if type(end) is str and end and data.endswith(end) and len(data) % 2 == len(end) % 2 == 0:
             data_from = (len(data) - len(end)) // 2
             fields = {name: value for name, value in fields.items() if name != "data"}
-    texts = (
-        *map(text_of, (at, camera, direction, message_id, message)),
-        text_of(fields),
-        hex_text(data) if type(data) is str else text_of(data),
-        text_of(data_from),
+    number = "" if message_id is None else f'"message_id":{text_of(message_id)},'
+    body = "" if fields is None else f'"fields":{text_of(fields)},'
+    said = hex_text(data) if type(data) is str else text_of(data)
+    begins = "" if data_from is None else f',"data_from":{data_from}'
+    return (
+        f'{{"at":{text_of(at)},"camera":{text_of(camera)},"direction":{text_of(direction)},'
+        f'{number}"message":{text_of(message)},{body}"hex":{said}{begins}}}'
     )
-    return _object_of(_FRAME, texts)
 
 
 def with_data(fields: dict[str, Any] | None, data: str, data_from: int) -> dict[str, Any]:
