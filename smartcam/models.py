@@ -41,6 +41,7 @@ __all__ = [
     "Localization",
     "NoticeReceived",
     "Pose",
+    "PoseSigma",
     "Position",
     "Quaternion",
     "Reconnected",
@@ -190,12 +191,74 @@ class Header(NamedTuple):
     frame_id: str
 
 
+class PoseSigma(NamedTuple):
+    """The errors that a pose may have: what a robot may expect of it, as standard deviations.
+
+    Attributes:
+        x: along the frame's x axis, metres; pixels where the position is in pixels.
+        y: along the frame's y axis, the same.
+        theta: error of the rotation about the pose's z axis, radians.
+        correlation_xy: correlation of the errors of x and y, -1 to 1.
+        correlation_xt: correlation of those of x and theta.
+        correlation_yt: correlation of those of y and theta.
+        z: along the frame's z axis, metres; None: it is not known, as a camera sees no height.
+    """
+
+    x: float
+    y: float
+    theta: float
+    correlation_xy: float = 0.0
+    correlation_xt: float = 0.0
+    correlation_yt: float = 0.0
+    z: float | None = None
+
+    @property
+    def place(self) -> float:
+        """The standard deviation in the frame's x and y along the worst direction; as ``x``."""
+        mean, half = (self.x**2 + self.y**2) / 2, (self.x**2 - self.y**2) / 2
+        return math.sqrt(mean + math.hypot(half, self.correlation_xy * self.x * self.y))
+
+    @property
+    def millimetres(self) -> float:
+        """:attr:`place` in millimetres, of a pose whose position is in metres."""
+        return 1e3 * self.place
+
+    @property
+    def degrees(self) -> float:
+        """The standard deviation of the rotation in degrees."""
+        return math.degrees(self.theta)
+
+
 class Pose(NamedTuple):
     """Position and orientation in a frame."""
 
     header: Header
     position: Position
     orientation: Quaternion
+
+    @property
+    def sigma(self) -> PoseSigma | None:
+        """The errors that it may have; None: nobody said. Comparisons leave it out."""
+        return None
+
+    def with_sigma(self, sigma: PoseSigma) -> Pose:
+        """Return the pose with the errors that it may have."""
+        pose = tuple.__new__(_EstimatedPose, self)
+        pose.__dict__["sigma"] = sigma
+        return pose
+
+
+class _EstimatedPose(Pose):
+    """A pose whose errors are known; what is made of it by ``_replace`` has none."""
+
+    @property
+    def sigma(self) -> PoseSigma | None:
+        known: PoseSigma | None = self.__dict__.get("sigma")
+        return known
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={one!r}" for name, one in self._asdict().items())
+        return f"Pose({values}, sigma={self.sigma!r})"
 
 
 class Localization(NamedTuple):
@@ -205,7 +268,8 @@ class Localization(NamedTuple):
         feature_id: name of the taught feature.
         quality: 0 to 1.
         photo_index: index of the photo it was found in.
-        pose: place of the part: x right, y up, theta counter-clockwise.
+        pose: place of the part: x right, y up, theta counter-clockwise. Of cameras that tell it,
+            ``pose.sigma`` says how far off the pose may be.
     """
 
     feature_id: str

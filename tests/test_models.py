@@ -32,6 +32,7 @@ from smartcam.models import (
     Localization,
     NoticeReceived,
     Pose,
+    PoseSigma,
     Position,
     Quaternion,
     Reconnected,
@@ -384,7 +385,7 @@ def test_models_public_values_are_all_exported() -> None:
     defined = {
         name
         for name, one in vars(models).items()
-        if isinstance(one, type) and one.__module__ == models.__name__
+        if isinstance(one, type) and one.__module__ == models.__name__ and name[0] != "_"
     }
     assert defined <= set(models.__all__)
 
@@ -399,3 +400,31 @@ def test_status_words_with_unknown_bits_are_kept_as_they_are_but_not_in_memory()
     assert repr(words[0]) == "<Status: 2147483776>"
     assert words[0] & Status.RUNNING == Status.RUNNING
     assert pickle.loads(pickle.dumps(words[0])) == words[0]  # noqa: S301
+
+
+# ---------------------------------------------------------------------- errors of poses
+
+
+@given(st.floats(1e-6, 10), st.floats(1e-6, 10), st.floats(-1, 1))
+def test_sigma_of_a_place_is_that_of_the_worst_direction(x: float, y: float, xy: float) -> None:
+    sigma = PoseSigma(x, y, 0.01, correlation_xy=xy)
+    covariance = [[x * x, xy * x * y], [xy * x * y, y * y]]
+    worst = math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
+    assert sigma.place == pytest.approx(worst)
+    assert sigma.millimetres == pytest.approx(1000 * worst)
+    assert sigma.degrees == pytest.approx(math.degrees(0.01))
+
+
+def test_pose_with_sigma_is_the_same_pose() -> None:
+    sigma = PoseSigma(1e-4, 2e-4, 1e-3)
+    pose = POSE.with_sigma(sigma)
+    assert (POSE.sigma, pose.sigma) == (None, sigma)
+    assert pose == POSE
+    assert hash(pose) == hash(POSE)
+    assert isinstance(pose, Pose)
+    assert jsonable(pose) == POSE_JSON
+    assert pickle.loads(pickle.dumps(pose)).sigma == sigma  # noqa: S301 - our own
+    assert "sigma=PoseSigma(x=0.0001, y=0.0002, theta=0.001" in repr(pose)
+    moved = pose._replace(position=Position(0.3, 0.2))
+    assert moved.sigma is None
+    assert sigma.z is None

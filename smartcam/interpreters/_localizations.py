@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
 from smartcam.exceptions import ConfigurationError
 from smartcam.interpreters._base import PlainInterpreter
 from smartcam.layout._inside import UNITS, misfit
-from smartcam.models import Header, Localization, Pose, Position, Quaternion
+from smartcam.models import Header, Localization, Pose, PoseSigma, Position, Quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -38,10 +38,19 @@ _QUANTITIES = {
     "y": ("length", "pixels"),
     "z": ("length", "pixels"),
     "theta": ("angle",),
+    "sigma_x": ("length", "pixels"),
+    "sigma_y": ("length", "pixels"),
+    "sigma_theta": ("angle",),
 }
 """Quantities that a field's unit may measure, by the field's name."""
 
 _POSE = ("x", "y", "z", "theta")
+
+_SIGMAS = ("sigma_x", "sigma_y", "sigma_theta")
+"""Fields that have to be there for the errors of a pose."""
+
+_CORRELATIONS = ("correlation_xy", "correlation_xt", "correlation_yt")
+"""Fields that may be there beside them; without one the errors are independent."""
 
 MAX_QUALITY = 1.0 + 1e-6
 """Largest quality: 1, with room for the rounding of a 32-bit float."""
@@ -59,8 +68,10 @@ class LocalizationsInterpreter(PlainInterpreter):
     Args:
         layout: ``x`` and ``y`` must be in its records. Without ``feature_id`` it is ``""``,
             without ``quality`` 1.0 (the camera reported the part as found), without
-            ``photo_index``, ``z`` or ``theta`` 0. Other fields are ignored. Lengths without a
-            unit are metres, angles radians; ``px`` stays pixels.
+            ``photo_index``, ``z`` or ``theta`` 0. ``sigma_x``, ``sigma_y`` and ``sigma_theta``,
+            and ``correlation_xy``, ``correlation_xt`` and ``correlation_yt`` where they are there,
+            become ``pose.sigma``. Other fields are ignored. Lengths without a unit are metres,
+            angles radians; ``px`` stays pixels.
 
     Raises:
         ConfigurationError: ``x`` or ``y`` is missing, or a field has a type or a unit that it
@@ -88,6 +99,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         self._z = use.z
         self._scales = use.scales
         self._checks = use.checks
+        self._sigmas = use.sigmas
         self._empty = bytes(self.layout.size)
         self._names: dict[bytes, str] = {}  # of features, by what is on the wire
 
@@ -144,7 +156,28 @@ class LocalizationsInterpreter(PlainInterpreter):
             self.layout.parse_records(data, context.byte_order)
         if skipped:
             context.empty_slots += skipped
-        return found
+        return found if self._sigmas is None else self._with_sigmas(found, data, context)
+
+    def _with_sigmas(
+        self, found: list[Localization], data: bytes, context: Context
+    ) -> list[Localization]:
+        """Return localizations with the errors of their poses, where these are numbers."""
+        use = cast("_SigmaUse", self._sigmas)
+        rows = self.layout.wire_records(data, context.byte_order)
+        taken = [row for number, row in enumerate(rows) if not self._is_empty(data, number)]
+        result: list[Localization] = []
+        for part, row in zip(found, taken, strict=True):
+            x, y, theta = (row[place] * scale for place, scale in use.sigmas)
+            xy, xt, yt = (0.0 if place is None else row[place] for place in use.correlations)
+            if context.y_down:
+                xy, xt = -xy, -xt
+            sigma = PoseSigma(x, y, theta, xy, xt, yt)
+            known = min(x, y, theta) >= 0 and math.isfinite(x + y + theta)
+            if known and max(abs(xy), abs(xt), abs(yt)) <= MAX_QUALITY:
+                result.append(part._replace(pose=part.pose.with_sigma(sigma)))
+            else:
+                result.append(part)
+        return result
 
     def _heights(self, data: bytes, context: Context) -> Iterator[float]:
         """Return the values of ``z`` as they are on the wire."""
@@ -188,6 +221,7 @@ class _Use(NamedTuple):
         z: place of ``z``, which is rare; None without it.
         scales: factors that turn the values into SI; None where they are SI.
         checks: True if unused texts and bools have to be checked, too.
+        sigmas: places of the errors of poses; None without them.
     """
 
     missing: tuple[Any, ...]
@@ -195,6 +229,14 @@ class _Use(NamedTuple):
     z: int | None
     scales: _Scales | None
     checks: bool
+    sigmas: _SigmaUse | None
+
+
+class _SigmaUse(NamedTuple):
+    """The fields of a record that say the errors of its pose."""
+
+    sigmas: tuple[tuple[int, float], ...]  # places of those in _SIGMAS, and their factors for SI
+    correlations: tuple[int | None, ...]  # places of those in _CORRELATIONS; None: it is not there
 
 
 @functools.lru_cache(maxsize=64)
@@ -216,6 +258,19 @@ def _use_of(layout: tuple[Field, ...]) -> _Use:
         [*fields].index("z") if "z" in fields else None,
         _scales(fields),
         any(one.type in {"string", "bool"} and one.name != "feature_id" for one in layout),
+        _sigma_use(fields),
+    )
+
+
+def _sigma_use(fields: dict[str, Field]) -> _SigmaUse | None:
+    names = [*fields]
+    if not set(_SIGMAS) <= set(names):
+        return None
+    units = [UNITS[unit] if (unit := fields[name].unit) else None for name in _SIGMAS]
+    scales = [one.multiply / one.divide if one else 1.0 for one in units]
+    return _SigmaUse(
+        tuple((names.index(name), scale) for name, scale in zip(_SIGMAS, scales, strict=True)),
+        tuple(names.index(name) if name in fields else None for name in _CORRELATIONS),
     )
 
 
@@ -250,6 +305,8 @@ def _check(field: Field) -> None:
         fits = fits and (field.unit is None or UNITS[field.unit].quantity in quantities)
         units = [name for name, unit in UNITS.items() if unit.quantity in quantities]
         expected = f"a number without a unit or in {', '.join(units)}"
+    elif field.name in _CORRELATIONS:
+        fits, expected = wire.is_number and field.unit is None, "a number without a unit"
     elif field.name == "photo_index":
         fits, expected = wire.is_integer and field.unit is None, "an integer without a unit"
     elif field.name == "feature_id":

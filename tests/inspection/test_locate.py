@@ -366,6 +366,11 @@ def test_results_are_localizations(tmp_path: Path) -> None:
     assert 0 < record.sigma_x < 0.02
     assert 0 < record.sigma_theta < 0.001
     assert abs(record.correlation_xy) < 1
+    sigma = one.pose.sigma
+    assert sigma is not None
+    assert sigma[:3] == pytest.approx((record.sigma_x, record.sigma_y, record.sigma_theta))
+    assert sigma.correlation_xy == pytest.approx(-record.correlation_xy)
+    assert sigma.correlation_yt == pytest.approx(record.correlation_yt)
     nothing = program.inspect(drawn())
     assert not nothing.ok
     assert nothing.reason == "0 found, expected 1 or more; nothing is like it"

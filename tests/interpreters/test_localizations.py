@@ -225,3 +225,46 @@ def test_any_bytes_give_finite_poses_or_an_interpretation_error(data: bytes, y_d
     assert len(value) + context.empty_slots == len(data) // 70
     for part in value:
         assert all(map(math.isfinite, (*part.pose.position, *part.pose.orientation)))
+
+
+# ---------------------------------------------------------------------- errors
+
+SIGMAS = "sigma_theta: real32 deg, sigma_y: real32 mm, sigma_x: real32 mm"
+FULL = f"(x: real32 mm, y: real32 mm, {SIGMAS}, correlation_xt: real32, correlation_xy: real32)*"
+
+
+def test_errors_of_poses_are_read_in_si() -> None:
+    part = struct.Struct("<7f")
+    data = part.pack(12, 34, 0.5, 0.2, 0.1, -0.25, 0.5) + bytes(part.size)
+    data += part.pack(1, 2, 1, 0.1, 0.4, 0, 0)
+    first, second = interpret(data, FULL)
+    sigma = first.pose.sigma
+    assert sigma is not None
+    assert sigma[:3] == pytest.approx((1e-4, 2e-4, math.radians(0.5)))
+    assert sigma[3:6] == pytest.approx((0.5, -0.25, 0.0))
+    assert first.pose.position.x == pytest.approx(0.012)
+    assert second.pose.sigma is not None
+    assert second.pose.sigma.millimetres == pytest.approx(0.4)
+    (down, _) = interpret(data, FULL, y_down=True)
+    assert down.pose.sigma is not None
+    assert down.pose.sigma[3:6] == pytest.approx((-0.5, 0.25, 0.0))
+    assert down.pose.position.y == pytest.approx(-0.034)
+
+
+@pytest.mark.parametrize("sigma", [math.nan, math.inf, -0.1])
+def test_error_that_is_none_is_not_known(sigma: float) -> None:
+    data = struct.pack("<7f", 12, 34, 0.5, 0.2, sigma, 0, 0)
+    (part,) = interpret(data, FULL)
+    assert part.pose.sigma is None
+    (part,) = interpret(struct.pack("<7f", 12, 34, 0.5, 0.2, 0.1, 0, 1.5), FULL)
+    assert part.pose.sigma is None
+
+
+def test_errors_need_all_three_fields_in_units_that_fit() -> None:
+    (part,) = interpret(
+        struct.pack("<4f", 1, 2, 3, 4), "x: real32, y: real32, sigma_x: real32, b: real32"
+    )
+    assert part.pose.sigma is None
+    for wrong in ("sigma_x: real32 deg", "sigma_theta: real32 mm", "correlation_xy: real32 mm"):
+        with pytest.raises(ConfigurationError, match=wrong.split(":")[0]):
+            interpret(b"", f"x: real32, y: real32, {wrong}")

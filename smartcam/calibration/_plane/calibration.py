@@ -37,6 +37,7 @@ from smartcam.calibration._plane.diagnostics import (
 from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
 from smartcam.calibration._plane.mapping import PlaneMap
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, Candidates, rms, squares
+from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._plane.robust import agreeing
 from smartcam.calibration._plane.validation import (
     check_lever,
@@ -300,7 +301,8 @@ class PlaneCalibration(storage.SavedCalibration):
         """Return localizations with their poses in the robot's space.
 
         Their z axis is the plane's normal, their x axis the part's. The header is in the robot's
-        frame; number and time stay.
+        frame; number and time stay. Where a pose has a ``sigma``, and the touches' sigma is known,
+        the robot's has one, too, with the calibration's own error in it.
 
         Args:
             localizations: localizations of the camera, one or many.
@@ -318,7 +320,23 @@ class PlaneCalibration(storage.SavedCalibration):
         return self._poses(localizations, tool_flip)
 
     def _poses(self, localizations: Iterable[Localization], flip: bool) -> list[Localization]:
-        return self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
+        if not isinstance(localizations, list):
+            localizations = [*localizations]
+        found = self._map.poses(localizations, self.robot_frame, self.camera_frame, flip=flip)
+        told = [n for n, one in enumerate(localizations) if one.pose.sigma is not None]
+        if told and self.touch_sigma is not None:
+            sigmas = robot_sigmas(
+                [localizations[n] for n in told],
+                self.transform,
+                self.normal,
+                self._rows,
+                self._variance * self.unit_covariance,
+                self.place.camera_size,
+                flip=flip,
+            )
+            for n, sigma in zip(told, sigmas, strict=True):
+                found[n] = found[n]._replace(pose=found[n].pose.with_sigma(sigma))
+        return found
 
     def covariance_at(self, points: ArrayLike) -> Array:
         """Return the covariance of mapped points that the touches' noise causes.
