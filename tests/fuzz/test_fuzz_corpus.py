@@ -6,6 +6,8 @@ Needs no atheris. Inputs that are named, not numbered, were findings once.
 from __future__ import annotations
 
 import random
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from itertools import islice
@@ -25,6 +27,7 @@ from smartcam.layout._text import parse_text
 from smartcam.protocols import FramedDialect, LineMachine, Machine
 from smartcam.protocols._inside import Framer
 from smartcam.settings import Address
+from tests import ROOT
 from tests.fuzz import fuzz_cells
 from tests.fuzz.fuzz_seeds import seeds
 from tests.fuzz.fuzz_targets import CORPUS, FINDINGS, KNOWN, TARGETS, Target, describe, known
@@ -173,3 +176,9 @@ def test_corpora_are_small_and_belong_to_a_target() -> None:
     rows = tomllib.loads(FINDINGS.read_text(encoding="utf-8"))["finding"]
     assert {name for row in rows for name in row["targets"]} <= set(TARGETS)
     assert sum(path.stat().st_size for path in paths) < LARGEST_CORPUS
+
+
+def test_runner_leaves_smartcam_to_be_instrumented() -> None:
+    """Code that is imported before atheris looks at it tells nothing of what inputs reach."""
+    script = "import sys, tests.fuzz.__main__; sys.exit('smartcam' in sys.modules)"
+    subprocess.run([sys.executable, "-c", script], cwd=ROOT, check=True, timeout=60)  # noqa: S603
