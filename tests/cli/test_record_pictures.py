@@ -108,3 +108,11 @@ def test_image_of_a_software_camera_is_that_of_a_trigger(tmp_path: Path) -> None
     file = tmp_path / "seen.png"
     run("image", f"software:{cell_of(tmp_path)}#{NAME}", "-o", str(file)).done()
     assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_video_is_refused_since_it_has_no_results(tmp_path: Path) -> None:
+    file = tmp_path / "run.mkv"
+    refused = run("record", "bvs://127.0.0.1:1", "-o", str(file))
+    assert refused.code == 2
+    assert "a video has no results: expected FILE.mcap" in refused.err
+    assert not file.exists()
