@@ -122,7 +122,7 @@ def _error_or_overrun(content: str) -> tuple[m.Message, ...]:
 
 
 def _notice(kind: Literal["error", "notification"], content: str) -> m.Notice:
-    """Return what a device says of itself: nine digits, a colon and a text."""
+    """Return the notice of a content: nine digits, a colon and a text."""
     digits, colon, text = content.partition(":")
     if colon and digits.isascii() and digits.isdecimal() and len(digits) <= 9:
         return m.Notice(kind, int(digits), text)
