@@ -417,7 +417,7 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _made_of(self, message: Message) -> _Made:
-        """Return the frame of a message with a body; a camera says the same objects again and again.
+        """Return the frame of a message with a body; a camera often says the same object again.
 
         Of those with data, such as results, only the last one's frame is kept.
         """
