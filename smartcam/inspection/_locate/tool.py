@@ -83,7 +83,7 @@ class Locate(Tool[LocateSettings]):
                 )
             )
         for model in self.models:  # worked out now, for the same reason
-            _ = model.bands, model.coarse
+            _ = model.bands, model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
         self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS
@@ -236,12 +236,15 @@ def _near(nearest: LocatedPart | None, named: bool) -> str:
 
 
 def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
-    """Return the drawings of a part: its hull, its axes, its edges, and those not seen."""
+    """Return the drawings of a part: its outline, its axes, its edges, and those not seen."""
     pose = part.pose
     reach = 0.25 * float(np.linalg.norm(part.hull - (pose.x, pose.y), axis=1).max()) / pose.scale
     axes = pose.to_picture([(2 * reach, 0), (0, 0), (0, reach)])
     text = f"{part.name} {100 * part.score:.0f} %"
-    marks = [Drawing("polygon", _points(part.hull), role, text)]
+    marks = [
+        Drawing("polygon", _points(one), role, "" if number else text)
+        for number, one in enumerate(part.contours or (part.hull,))
+    ]
     marks.append(Drawing("line", _points(axes), role))
     shown: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
     for places, which in shown:
