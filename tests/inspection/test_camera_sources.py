@@ -149,12 +149,13 @@ async def test_outlines_of_located_parts_are_in_a_fleets_frames_and_recordings(
         await server.wait_tried()
         url = server.urls["cam"]
         async with smartcam.connect(url) as camera, camera.frames() as frames:
+            shown = []
             for _ in range(3):
                 found = await camera.trigger(timeout=PATIENCE)
                 assert found.value.count == 1
                 async with asyncio.timeout(PATIENCE):
-                    frame = await anext(frames)
-        assert outlined(frame.array())
+                    shown.append(await anext(frames))
+        assert all(outlined(one.array()) for one in shown)
     judged = [*load_recording(tmp_path / "rec").judged("cam")]
     pictures = [one.picture for one in judged if one.picture is not None]
     assert len(judged) == 3

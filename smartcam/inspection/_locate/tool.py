@@ -118,6 +118,28 @@ class Locate(Tool[LocateSettings]):
             "correlation_xy: real32, correlation_xt: real32, correlation_yt: real32"
         )
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Symmetry and edges of each model, and the error that its poses will have."""
+        return tuple(self._remark(model) for model in self.models)
+
+    def _remark(self, model: PartModel) -> str:
+        place, angle = model.predicted_sigma()
+        text = (
+            f"{model.name}: {model.symmetry.text()}; {len(model.segments.halves)} pieces of edges; "
+            f"a pose is good to {place:.2g} px"
+        )
+        try:
+            slopes = self._plane.slopes(np.array([model.reference]))[0]
+        except NotMeasuredError:
+            pass  # an outline's reference need not be in the picture
+        else:
+            longest = float(np.linalg.norm(slopes, 2))
+            text += f", {longest * place:.2g} mm" if self._plane.unit == "mm" else ""
+        if not math.isnan(angle):
+            text += f" and {math.degrees(angle):.2g} degrees"
+        return f"{text} in a picture like the taught one"
+
     def inspect(self, view: View) -> Finding:
         """Return the parts, the best first."""
         region = view.region
