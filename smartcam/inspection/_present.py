@@ -118,15 +118,17 @@ class Present(Tool[PresentSettings]):
 
     def inspect(self, view: View) -> Finding:
         """Return the spots, the largest first."""
-        spots = self._spots(view)
+        blind = self.settings.colour is not None and not view.picture.has_colours
+        spots = [] if blind else self._spots(view)
         count = len(spots)
-        ok = self._least <= count <= self._most
+        ok = not blind and self._least <= count <= self._most
         wanted = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
+        reason = "the picture has no colours" if blind else f"{count} spots, expected {wanted}"
         kept = spots[: self.settings.most]
         alone = dict(kept[0].values()) if kept and self.settings.most == 1 else {}
         return Finding(
             ok=ok,
-            reason="" if ok else f"{count} spots, expected {wanted}",
+            reason="" if ok else reason,
             values={"count": min(count, 0xFFFF), **alone},
             records=[] if self.settings.most == 1 else [spot.values() for spot in kept],
             drawings=[

@@ -76,6 +76,14 @@ def test_colour_is_found_where_grey_is_the_same(tmp_path: Path) -> None:
     assert not inspected(tmp_path, f"{{{red}}}", picture[:, :, ::-1].copy()).ok
 
 
+def test_grey_picture_is_never_good_for_its_colours(tmp_path: Path) -> None:
+    colour = "colour: {hue: [170, 10], saturation: [100, 255]}"
+    for count in ("0", "[0, 5]", "1"):
+        found = inspected(tmp_path, f"{{present: {{{colour}, count: {count}}}}}", TWO)
+        assert (found.ok, found.value.count) == (False, 0)
+        assert "the picture has no colours" in found.reason
+
+
 def test_region_of_corners_counts_what_is_inside(tmp_path: Path) -> None:
     picture = np.full((100, 200), 250, np.uint8)
     triangle = "[[20, 10], [60, 10], [20, 50]]"
