@@ -298,6 +298,7 @@ TABLE: dict[str, dict[str, str]] = {
         "columns": "function",
         "command": "function or None",
         "cameras": "function",
+        "names": "function",
         "tell": "function",
     },
     "Outlets.stored": {"question": "object"},

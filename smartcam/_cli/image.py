@@ -12,7 +12,8 @@ from smartcam.exceptions import ConfigurationError
 
 @click.command(
     help="Write a camera's last picture to a file, as the camera sends it (In-Sight: a bitmap), "
-    f"where it can be asked for one. {CONNECTS}"
+    "where it can be asked for one. A software camera begins with the command, so it is triggered "
+    f"first, and its picture is a PNG. {CONNECTS}"
 )
 @click.argument("url")
 @option("--output", required=True)
@@ -20,10 +21,15 @@ from smartcam.exceptions import ConfigurationError
 @runs(*CAMERA)
 async def image(url: str, output: str, force: bool, options: Options) -> None:
     """Write a camera's last picture to a file."""
+    from smartcam.camera import DEFAULT_TRIGGER_TIMEOUT
+    from smartcam.settings import is_software
+
     _check_free(output, force)
     url = await options.located(url)
     with options.camera(url) as unopened:
         async with unopened as camera:
+            if is_software(url):
+                await camera.trigger(timeout=options.step(DEFAULT_TRIGGER_TIMEOUT))
             data = await camera.read_image(timeout=options.step(10.0))
             name = camera.name
     _write(output, data)

@@ -107,6 +107,11 @@ async def record(
     """Record a camera."""
     if (pictures not in {None, NO_PICTURES} or read_images) and output is None:
         raise click.UsageError("pictures go into a recording (-o), not into a bag")
+    if output is not None and Path(output).suffix.lower() == ".mkv":
+        raise click.UsageError(
+            f"-o {output}: a video has no results: expected FILE.mcap; `smartcam frames record` "
+            "writes videos"
+        )
     if read_images and every is None:
         raise click.UsageError(
             "--read-images needs --every: only of a trigger that is sent from "

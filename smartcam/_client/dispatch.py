@@ -148,6 +148,7 @@ class Dispatch:
         self.fail(error)
         self._waits.finish(error)
         self._results.finish()
+        self._requests.finish()
         self._listeners.end(None if isinstance(error, ConnectionClosedError) else error)
 
     # ------------------------------------------------------------------ by the kind of event

@@ -17,6 +17,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
+from smartcam._client.deadline import DeadlineTimer
 from smartcam._client.handshake import code_text
 from smartcam.exceptions import (
     CommandRejectedError,
@@ -54,6 +55,12 @@ class Requests:
         self.name: str = self._connection.name
         self._locks: dict[object, asyncio.Lock] = collections.defaultdict(asyncio.Lock)
         self._due: dict[object, float] = {}  # until when the last request of a kind was to wait
+        self._late: asyncio.Future[None] | None = None  # of the wait that has the timer
+        self._timer = DeadlineTimer(self._wake_late)
+
+    def finish(self) -> None:
+        """End for good: leave nothing in the event loop."""
+        self._timer.cancel()
 
     def begin_session(self) -> None:
         """Owe nothing: the session is new."""
@@ -267,13 +274,41 @@ class Requests:
 
     async def _take_answer(self, answer: OwedAnswer, deadline: float) -> m.Message:
         if not answer.done():
-            await _done_or_late(answer, deadline)
+            await self._done_or_late(answer, deadline)
             if not answer.done():
                 raise TimeoutError
         got = answer.result()
         if isinstance(got, SmartCamError):
             raise got.with_traceback(None)
         return got
+
+    async def _done_or_late(self, answer: OwedAnswer, deadline: float) -> None:
+        """Wait until an answer is there or the deadline is over.
+
+        The answer is left alone when the task that waits is cancelled: it stays owed.
+        """
+        loop = asyncio.get_running_loop()
+        waiter: asyncio.Future[None] = loop.create_future()
+        answer.waiters.append(waiter)
+        timer = None  # a wait beside another one has a timer of its own
+        if self._late is None:
+            self._late = waiter
+            self._timer.set(deadline)
+        else:
+            timer = loop.call_at(deadline, _wake, waiter)
+        try:
+            await waiter
+        finally:
+            if timer is None:
+                self._late = None
+                self._timer.clear()
+            else:
+                timer.cancel()
+            answer.waiters.remove(waiter)
+
+    def _wake_late(self) -> None:
+        if self._late is not None:
+            _wake(self._late)
 
     def _unsent(self, message: m.Message) -> ResponseTimeoutError:
         return self._timeout(message, "could not send", "in time: an earlier answer is owed")
@@ -284,22 +319,6 @@ class Requests:
             f"{self.name}: {what} {dialect.called(message)} {why}; status: {self._state.status}",
             message_id=dialect.message_id(message),
         )
-
-
-async def _done_or_late(answer: OwedAnswer, deadline: float) -> None:
-    """Wait until an answer is there or the deadline is over.
-
-    The answer is left alone when the task that waits is cancelled: it stays owed.
-    """
-    loop = asyncio.get_running_loop()
-    waiter: asyncio.Future[None] = loop.create_future()
-    answer.waiters.append(waiter)
-    timer = loop.call_at(deadline, _wake, waiter)
-    try:
-        await waiter
-    finally:
-        timer.cancel()
-        answer.waiters.remove(waiter)
 
 
 def _wake(waiter: asyncio.Future[None]) -> None:

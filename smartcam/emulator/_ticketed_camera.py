@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from smartcam.emulator._line_camera import LineCamera, LineClient
 from smartcam.emulator._line_codec import LineCodec, LineFramer, LineServer
@@ -13,6 +13,7 @@ from smartcam.protocols import Frame, TicketedDialect
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Self
 
     from smartcam.emulator._client_link import ClientLink
     from smartcam.emulator._line_codec import HeardLine
@@ -32,7 +33,6 @@ class TicketedClient(LineClient):
         dialect: how the client is spoken to.
         ticket: ticket of the request under way, "" where it has none.
         number: number of its session, from 1.
-        session: the client itself; of one that :meth:`keep` has returned, the client it is of.
     """
 
     def __init__(self, camera: LineCamera, link: ClientLink, server: LineServer) -> None:
@@ -41,7 +41,12 @@ class TicketedClient(LineClient):
         self.speak(next(iter(camera.protocol.dialects)))
         self.ticket: str = ""
         self.number: int = 0
-        self.session: TicketedClient = self
+        self._session: TicketedClient = self
+
+    @property
+    def session(self) -> Self:
+        """The client itself; of one that :meth:`keep` has returned, the client it is of."""
+        return cast("Self", self._session)
 
     def speak(self, name: str) -> None:
         """Go on in one of the protocol's dialects."""

@@ -141,6 +141,11 @@ class Tool(ABC, Generic[S]):
         """Layout text of one thing found, for tools that find several; "" where there is none."""
         return ""
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences for those who teach it: what it was taught, and how good that is."""
+        return ()
+
     @abstractmethod
     def inspect(self, view: View) -> Finding:
         """Return the finding in a picture.

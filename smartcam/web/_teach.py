@@ -50,11 +50,13 @@ class NamedPicture:
     Args:
         name: name of the picture for people.
         picture: pixels of the picture.
+        file: path of its file as the cell file can name it; "": it is in none.
     """
 
-    def __init__(self, name: str, picture: Picture) -> None:
+    def __init__(self, name: str, picture: Picture, file: str = "") -> None:
         self.name = name
         self.picture = picture
+        self.file = file
 
 
 class TeachSite(ThreadedSite):
@@ -94,7 +96,8 @@ class TeachSite(ThreadedSite):
         paths = [Path(one) for one in files]
         if len(paths) > MAX_PICTURES:
             raise ConfigurationError(f"teach: expected {MAX_PICTURES} pictures at most")
-        made = [NamedPicture(path.name, Picture.read(path)) for path in paths]
+        folder = teaching.path.parent
+        made = [NamedPicture(one.name, Picture.read(one), _beside(one, folder)) for one in paths]
         self.pictures: dict[int, NamedPicture] = dict(enumerate(made, start=1))
         self._number = len(made)
         self._tried: dict[int, Inspection] = {}  # by picture, by the tools that were tried last
@@ -142,8 +145,10 @@ class TeachSite(ThreadedSite):
             raise RefusedError(404, f"picture {number:.20}", "one of those that are listed")
         return found
 
-    def try_tools(self, given: dict[str, dict[str, str]]) -> list[dict[str, Any]]:
+    def try_tools(self, given: dict[str, dict[str, str]]) -> dict[str, Any]:
         """Return the verdicts and values of every picture; it belongs into a thread.
+
+        Besides, what the tools were taught.
 
         Raises:
             ConfigurationError: a tool or setting is wrong.
@@ -168,7 +173,8 @@ class TeachSite(ThreadedSite):
                 }
             )
         self._tried = tried
-        return found
+        remarks = [text for step in program.steps for text in step.tool.remarks]
+        return {"found": found, "remarks": remarks}
 
     def learn(self, given: dict[str, dict[str, str]], good: list[int]) -> dict[str, Any]:
         """Return the tools' settings, as texts, by which the good pictures are good; and why.
@@ -199,10 +205,16 @@ class TeachSite(ThreadedSite):
             "kinds": tool_settings(),
             "live": self.source is not None,
             "pictures": [
-                {"number": number, "name": one.name, "size": one.picture.size}
+                {"number": number, "name": one.name, "size": one.picture.size, "file": one.file}
                 for number, one in self.pictures.items()
             ],
         }
+
+
+def _beside(path: Path, folder: Path) -> str:
+    """Return the path of a picture as a file in a folder names it."""
+    path, folder = path.resolve(), folder.resolve()
+    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else str(path)
 
 
 def texts_of(tools: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
@@ -279,8 +291,8 @@ async def _shoot(site: TeachSite, _call: CallRequest) -> object:
 
 @CALLS.add("POST", f"{API}/try", body=ToolsBody, sample=_SAMPLE)
 async def _try(site: TeachSite, call: CallRequest) -> object:
-    """Verdicts and values of the tools for every picture."""
-    return {"found": await site.work(site.try_tools, call.body.tools)}
+    """Verdicts and values of the tools for every picture, and what the tools were taught."""
+    return await site.work(site.try_tools, call.body.tools)
 
 
 @CALLS.add(

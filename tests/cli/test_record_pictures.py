@@ -102,3 +102,17 @@ def test_a_camera_without_pictures_is_told_what_there_is_instead(tmp_path: Path)
     refused = run("record", "bvs://127.0.0.1:1", "-o", str(file), "--pictures", "judged")
     refused.failed(5, "sends no pictures with its results", "--pictures SOURCE", "--read-images")
     assert not file.exists()
+
+
+def test_image_of_a_software_camera_is_that_of_a_trigger(tmp_path: Path) -> None:
+    file = tmp_path / "seen.png"
+    run("image", f"software:{cell_of(tmp_path)}#{NAME}", "-o", str(file)).done()
+    assert file.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_video_is_refused_since_it_has_no_results(tmp_path: Path) -> None:
+    file = tmp_path / "run.mkv"
+    refused = run("record", "bvs://127.0.0.1:1", "-o", str(file))
+    assert refused.code == 2
+    assert "a video has no results: expected FILE.mcap" in refused.err
+    assert not file.exists()

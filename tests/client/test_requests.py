@@ -125,6 +125,29 @@ async def test_requests_that_are_awaited_for_too_short_a_time_keep_the_link(seco
         assert (camera.connected, camera.statistics().sessions) == (True, 1)
 
 
+@pytest.mark.parametrize("first", [0, 1, 2])
+async def test_requests_side_by_side_each_end_at_their_own_deadline(first: int) -> None:
+    async with by_hand() as (box, camera):
+        calls: dict[str, Callable[..., Coroutine[Any, Any, Any]]] = {
+            "query": camera.query_application,
+            "clock": camera.get_clock,
+            "unknown": functools.partial(camera.request, UNKNOWN),
+        }
+        box.script |= dict.fromkeys((QUERY, GET_CLOCK, UNKNOWN), quiet)
+        ended: list[str] = []
+
+        async def ask(name: str, seconds: float) -> None:
+            with pytest.raises(ResponseTimeoutError):
+                await calls[name](timeout=seconds)
+            ended.append(name)
+
+        names = [*calls][first:] + [*calls][:first]
+        seconds = {name: SHORT * (1 + 3 * place) for place, name in enumerate(calls)}
+        await asyncio.gather(*(ask(name, seconds[name]) for name in names))
+        assert ended == [*calls]
+        await camera.wait_connected(timeout=SHORT)
+
+
 async def test_request_timeout_of_the_settings_bounds_requests() -> None:
     async with by_hand(request_timeout=SHORT) as (box, camera):
         box.script[QUERY] = quiet

@@ -361,7 +361,7 @@ async def test_camera_is_read_and_its_query_left_to_it() -> None:
     ("then", "said"),
     [
         ("dies", "the server ended the stream|cannot be read: "),
-        ("stalls", "expected an answer, got none within 2 s"),
+        ("stalls", "expected a picture, got no bytes for 2 s"),
     ],
 )
 async def test_server_that_dies_or_stalls_ends_readers_and_the_next_connects_anew(

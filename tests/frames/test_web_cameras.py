@@ -171,3 +171,44 @@ async def test_chunks_that_are_none_are_told(line: bytes) -> None:
     async with served(serve) as port:
         with pytest.raises(FrameFormatError, match="a chunk: expected its size"):
             await frames.open(f"http://127.0.0.1:{port}/").__aenter__()
+
+
+PARTED = HEAD % (b"multipart/x-mixed-replace; boundary=b", b"")
+JPEG_PART = b"--b\r\nContent-Type: image/jpeg\r\n"
+BAD = {
+    "no parts": (PARTED, "expected a picture, got no bytes for 0.5 s"),
+    "parts of text": (
+        PARTED + b"--b\r\nContent-Type: text/plain\r\nContent-Length: 2\r\n\r\nhi\r\n" * 9,
+        "expected a picture, got no bytes for 0.5 s",
+    ),
+    "JPEGs of nothing": (
+        PARTED + (JPEG_PART + b"Content-Length: 4\r\n\r\n\xff\xd8\xff\xd9\r\n") * 9,
+        "expected a picture, got no bytes for 0.5 s",
+    ),
+    "a part without an end": (
+        PARTED + JPEG_PART + b"Content-Length: 2000000000\r\n\r\n\xff\xd8",
+        "expected a picture, got no bytes for 0.5 s",
+    ),
+    "a part of less than nothing": (
+        PARTED + JPEG_PART + b"Content-Length: -5\r\n\r\n\xff\xd8",
+        "expected a picture, got no bytes for 0.5 s",
+    ),
+    "bytes of nothing": (PARTED + b"x" * 3_000_000, "bytes came that belong to no picture"),
+    "not found": (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", "404 Not Found"),
+    "no HTTP": (b"\xde\xad" * 100_000, "it gives no answer that can be understood"),
+    "silence": (b"", "expected an answer, got none within 0.5 s"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+async def test_bad_web_camera_is_told_in_time(name: str) -> None:
+    data, said = BAD[name]
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.readuntil(b"\r\n\r\n")
+        writer.write(data)
+        await reader.read()
+
+    async with asyncio.timeout(20), served(serve) as port:
+        with pytest.raises(FrameSourceError, match=said):
+            await frames.open(f"http://127.0.0.1:{port}/#timeout=0.5").__aenter__()

@@ -135,6 +135,14 @@ async def test_applications_are_switched_by_number_and_by_name(cell: Path, desk:
         assert (await camera.trigger(timeout=PATIENCE)).application == 7
         with pytest.raises(ConfigurationError, match=r"no application 'dark'.*7 \(bright\)"):
             await camera.switch_application("dark")
+        counted = await camera.trigger(application="counted", timeout=PATIENCE)
+        assert (counted.application, camera.active_application) == (40, 7)
+        with pytest.raises(ConfigurationError, match="'dark' is none of bright, gated"):
+            await camera.trigger(application="dark")
+    async with opened(cell, application="counted") as camera:
+        assert (await camera.trigger(timeout=PATIENCE)).application == 40
+    with pytest.raises(ConfigurationError, match="'dark' is none of bright, gated"):
+        smartcam.connect(f"software:{cell}#line1/cam1", application="dark")
 
 
 async def test_a_slow_program_is_busy_and_a_trigger_meanwhile_overtriggered(

@@ -13,11 +13,16 @@ import pytest
 import smartcam
 import smartcam.fleet
 from smartcam.exceptions import ConfigurationError
+from smartcam.recording import FleetRecorder, load_recording
 from tests.handmade import PATIENCE
 from tests.inspection.seeing import Desk, cell_of
 
+cv2: Any = pytest.importorskip("cv2")
+
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 pytestmark = pytest.mark.real_time
 
@@ -109,6 +114,53 @@ async def test_a_fleet_shares_it_with_typed_results_and_the_judged_pictures(
             lambda status: bool(status & smartcam.Status.SYSTEM_ERROR), timeout=PATIENCE
         )
     assert desk.sink is None
+
+
+def write_located(folder: Path) -> Path:
+    """Write a fleet file with a camera that locates a part, whose agent records."""
+    picture = np.full((160, 200), 60, np.uint8)
+    cv2.fillPoly(picture, [np.array([(60, 40), (140, 40), (140, 70), (90, 110), (60, 110)])], 190)
+    (folder / "shots").mkdir()
+    cv2.imwrite(str(folder / "shots" / "1.png"), cv2.GaussianBlur(picture, (0, 0), 0.8))
+    cell = FOLDER.format(frames="shots").replace(
+        "{name: bright, level: {most: 25}}", "{locate: {taught: shots/1.png}}"
+    )
+    path = folder / "fleet.yaml"
+    path.write_text(f"{cell}listen: tcp/127.0.0.1:0\nrecord: {{folder: rec, pictures: judged}}\n")
+    return path
+
+
+def outlined(pixels: NDArray[Any]) -> bool:
+    """Return whether the part's edges are drawn over in green, halfway along three of them."""
+    whole = pixels.astype(int)
+    green = whole[:, :, 1] - whole[:, :, 0] > 40
+    return all(
+        green[y - 2 : y + 3, x - 2 : x + 3].any() for x, y in ((100, 40), (60, 75), (75, 110))
+    )
+
+
+async def test_outlines_of_located_parts_are_in_a_fleets_frames_and_recordings(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("zenoh")
+    server = smartcam.fleet.serve(write_located(tmp_path))
+    assert server.file.record is not None
+    async with FleetRecorder(server, server.file.record), server:
+        await server.wait_tried()
+        url = server.urls["cam"]
+        async with smartcam.connect(url) as camera, camera.frames() as frames:
+            shown = []
+            for _ in range(3):
+                found = await camera.trigger(timeout=PATIENCE)
+                assert found.value.count == 1
+                async with asyncio.timeout(PATIENCE):
+                    shown.append(await anext(frames))
+        assert all(outlined(one.array()) for one in shown)
+    judged = [*load_recording(tmp_path / "rec").judged("cam")]
+    pictures = [one.picture for one in judged if one.picture is not None]
+    assert len(judged) == 3
+    assert pictures
+    assert all(outlined(one.array()) for one in pictures)
 
 
 @pytest.mark.parametrize(

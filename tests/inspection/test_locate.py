@@ -435,6 +435,24 @@ def test_other_tools_follow_the_part(tmp_path: Path) -> None:
     assert abs(found.value.measure_diameter - 24) < 0.1
 
 
+def test_outline_is_drawn_along_the_edges(tmp_path: Path) -> None:
+    program = programs(tmp_path, f"7: {{locate: {{{written(tmp_path, 'tee')}}}}}")[7]
+    part = PlacedPart(PARTS["tee"], 98.37, 101.81, 0.6)
+    found = program.inspect(drawn(part))
+    lines = [one for one in found.findings["locate"].drawings if one.kind == "polygon"]
+    outer, hole = (np.array(one.points) for one in lines if one.role == "found")
+    cos, sin = math.cos(part.angle), math.sin(part.angle)
+    for line, shape in zip((outer, hole), part.shapes, strict=True):
+        x, y = (line - (part.x, part.y)).T
+        off = shape.inside(cos * x + sin * y, cos * y - sin * x)
+        assert np.abs(off).max() < 1.6
+        assert 8 <= len(line) <= 150
+    picture = found.drawn().astype(int)
+    green = picture[:, :, 1] - picture[:, :, 0] > 40
+    x, y = np.rint(outer).astype(int).T
+    assert green[y, x].all()
+
+
 @pytest.mark.long
 def test_calibration_leads_to_the_robots_millimetres(tmp_path: Path) -> None:
     pixels = np.array([(0, 0), (200, 0), (200, 200), (0, 200), (100, 50)], float)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import pytest_asyncio
 
 from smartcam import frames
+from smartcam.calibration import fit_plane
 from smartcam.inspection import Teaching, load_cell
 from smartcam.web import TeachSite
 from tests.web.browser import BROWSER_MARKS, new_page, nothing_wrong, see
@@ -159,3 +161,63 @@ async def test_pictures_are_taken_with_the_camera(page: Page, path: Path) -> Non
             await page.click("#shoot")
             await see(page, "#rows tr[data-picture='2']", "ms")
             assert len(site.pictures) == 2
+
+
+def located_cell(folder: Path) -> tuple[Path, list[Path]]:
+    """Write a cell with a calibration in which a part is taught, and pictures of it."""
+    pixels = np.array([(0, 0), (320, 0), (320, -240), (0, -240)], float)
+    robot = np.column_stack([0.0005 * pixels, np.zeros(4)])
+    fit_plane(pixels, robot, touch_sigma=1e-5, y_down=True).save(folder / "plane.json")
+    path = folder / "cell.yaml"
+    path.write_text(
+        "cameras:\n  cam: {software: {frames: shots, calibration: plane.json, applications: {\n"
+        "    7: {locate: {model: old.model}}}}} # brackets\n"
+    )
+    (folder / "shots").mkdir()
+    files = []
+    for number, degrees in enumerate((0, 130, 45), start=1):
+        corners = np.array([(-50, -40), (50, -40), (50, -5), (0, 5), (0, 45), (-50, 45)], float)
+        turn = cv2.getRotationMatrix2D((0, 0), -degrees, 1.0)[:, :2]
+        picture = np.full((240, 320), 60, np.uint8)
+        if number < 3:
+            places = np.rint((corners @ turn.T + (160, 120)) * 256).astype(np.int32)
+            cv2.fillPoly(picture, [places], 190, cv2.LINE_AA, 8)
+        noise = np.random.default_rng(number).normal(0, 2, picture.shape)
+        blurred = cv2.GaussianBlur(picture, (0, 0), 0.8) + noise
+        files.append(folder / "shots" / f"bracket{number}.png")
+        cv2.imwrite(str(files[-1]), np.clip(blurred, 0, 255).astype(np.uint8))
+    return path, files
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
+async def test_a_part_is_taught_from_a_picture(
+    page: Page, tmp_path: Path, width: int, height: int
+) -> None:
+    path, files = located_cell(tmp_path)
+    await page.set_viewport_size({"width": width, "height": height})
+    async with opened(page, TeachSite(Teaching(path, "cam", 7), files)):
+        await see(page, "#problem", "old.model")
+        await page.click("#teach")
+        await see(page, "#how", "Drag around the part")
+        assert await page.input_value("#set-model") == ""
+        assert await page.input_value("#set-taught") == "shots/bracket1.png"
+        await page.locator("#canvas").scroll_into_view_if_needed()
+        await drag(page, (0.28, 0.2), (0.72, 0.8))
+        await see(page, "#remarks li", "bracket1: has one angle")
+        remark = await page.inner_text("#remarks li")
+        assert re.search(r"good to 0\.00\d+ px, 0\.00\d+ mm and 0\.0\d+ degrees", remark)
+        await see(page, "#rows tr[data-picture='2']", "count 1, best_score 0.9")
+        await see(page, "#rows tr[data-picture='2']", " ms")
+        await see(page, "#rows tr[data-picture='3'] .bad", "0 found, expected 1 or more")
+        await see(page, "#marks polygon.found")
+        await page.locator("#rows tr[data-picture='2']").click()
+        await see(page, "#shown-name", "bracket2.png")
+        assert await page.is_visible("#teach")
+        await page.click("#save")
+        await see(page, "#saved", "Saved in")
+        wide = await page.evaluate("document.documentElement.scrollWidth")
+        assert wide <= width
+    await page.set_viewport_size({"width": 1280, "height": 900})
+    settings = load_cell(path)["cam"].programs[7].steps[0].tool.settings
+    assert (settings.model, settings.taught) == (None, "shots/bracket1.png")
+    assert settings.part[0][0] == pytest.approx(0.28 * 320, abs=2)

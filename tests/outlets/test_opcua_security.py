@@ -190,15 +190,24 @@ async def test_passwords_are_not_tried_without_end(
 
 
 @pytest.mark.parametrize(
-    ("content", "why"), [(None, "No such file"), (b"no certificate", "user_certificates.plc")]
+    ("content", "more", "why"),
+    [
+        (None, {}, "No such file"),
+        (b"no certificate", {}, "user_certificates.plc"),
+        (b"", {"other": "user.pem"}, "two users have the same certificate"),
+    ],
 )
-async def test_a_users_certificate_that_cannot_be_read_is_told(
-    tmp_path: Path, content: bytes | None, why: str
+async def test_a_users_certificate_that_is_of_no_use_is_told(
+    tmp_path: Path, content: bytes | None, more: dict[str, str], why: str
 ) -> None:
     if content is not None:
         (tmp_path / "plc.der").write_bytes(content)
+    if more:
+        made = user_files(tmp_path / "made", "plc")
+        (made / "user.der").rename(tmp_path / "plc.der")
+        (made / "user.pem").rename(tmp_path / "user.pem")
     listen = f"opc.tcp://127.0.0.1:{free_port()}"
-    settings = {"listen": listen, "user_certificates": {"plc": "plc.der"}}
+    settings = {"listen": listen, "user_certificates": {"plc": "plc.der", **more}}
     async with Outlets({"opcua": settings}, tmp_path) as outlets:
         await until(lambda: bool(outlets.states["opcua"].trouble))
         assert why in outlets.states["opcua"].trouble

@@ -20,6 +20,7 @@ pytest.importorskip("asyncua")
 from asyncua import ua
 
 import smartcam.outlets
+from tests import ROOT
 from tests.outlets.opcuakit import Heard, Plc, cell, plc
 from tests.outlets.outletkit import until
 
@@ -78,6 +79,15 @@ def arrows() -> dict[int, Arrow]:
             owner = str(nodes[ends[0]].get("ParentNodeId"))
             found[int(str(key).split("=")[-1])] = Arrow(source, target, owner, "".join(causes))
     return found
+
+
+def test_arrows_of_the_drawing_are_transitions_of_the_nodeset() -> None:
+    drawing = ET.fromstring((ROOT / "docs" / "opcua.svg").read_text())  # noqa: S314 - our own
+    drawn = [one.get("data-transition") for one in drawing.iter() if one.get("data-transition")]
+    root = ET.fromstring(gzip.decompress(XML.read_bytes()))  # noqa: S314 - of this project
+    known = {one.get("BrowseName", "").partition(":")[2] for one in root}
+    assert len(drawn) == len(set(drawn)) == 15
+    assert known.issuperset(drawn)
 
 
 class Books:

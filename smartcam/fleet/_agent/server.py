@@ -407,6 +407,7 @@ class FleetServer(Server):
             device.last_sent,
             lambda: self._hosts[planned.name].camera.statistics().received,
             lambda result, judged: observers.picture(result, judged.frame),
+            kept=0,
         )
         device.eyes.viewers.add(teller.take)
         return device, FramesOf(make, masked(camera.frames), teller)

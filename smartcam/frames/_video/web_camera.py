@@ -190,7 +190,7 @@ class _PartsStream:
             text = f"expected a picture, got bytes that make no picture for {seconds}"
             self._decoding.over(FrameFormatError(f"{self._name}: {text}"))
         else:
-            text = f"expected an answer, got none within {seconds}"
+            text = f"expected a picture, got no bytes for {seconds}"
             self._decoding.over(FrameSourceError(f"{self._name}: {text}"))
 
 

@@ -49,7 +49,11 @@ class SoftwareCamera(SmartCamera[ValueT]):
     ) -> None:
         camera = find_camera(url)
         self._device = SoftwareDevice(camera)
-        usual = {"name": camera.name, "interpret_as": self._device.interpret_as}
+        usual = {
+            "name": camera.name,
+            "interpret_as": self._device.interpret_as,
+            "application_names": {one.name: number for number, one in camera.programs.items()},
+        }
         given = {
             **usual,
             **{name: one for name, one in options.items() if one or name not in usual},

@@ -42,6 +42,7 @@ class JudgedResults(Observer):
         received: returns how many containers the client has got so far.
         found: function that is called with each result whose picture is known, before others see
             the result.
+        kept: number of last results whose pictures are kept for :meth:`judged_of`.
     """
 
     def __init__(
@@ -49,8 +50,11 @@ class JudgedResults(Observer):
         session: Callable[[], tuple[int, LastReport | None]],
         received: Callable[[], int],
         found: Callable[[Result, Judged], None],
+        *,
+        kept: int = MAX_KEPT,
     ) -> None:
         self._session, self._received, self._found = session, received, found
+        self._max_kept = kept
         self._number = 0  # of the session
         self._sent = 0  # containers in it
         self._report: LastReport | None = None
@@ -88,7 +92,7 @@ class JudgedResults(Observer):
         if sent is None or (sent.data, sent.judged.application) != (result.raw, result.application):
             return
         self._kept[result.number, result.received_at] = sent.judged
-        if len(self._kept) > MAX_KEPT:
+        if len(self._kept) > self._max_kept:
             self._kept.popitem(last=False)
         self._found(result, sent.judged)
 

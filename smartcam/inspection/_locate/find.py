@@ -90,6 +90,8 @@ class LocatedPart:
         refusal: why the part counts as not found; "" for one that was found.
         doubt: why it may be turned otherwise; mostly "".
         hull: convex hull of the part, (K, 2), pixels of the picture.
+        contours: polygons (K, 2) along its edges, pixels of the picture, for people; none of a part
+            that was refused.
     """
 
     name: str
@@ -104,6 +106,7 @@ class LocatedPart:
     refusal: str = ""
     doubt: str = ""
     hull: Array = field(default_factory=lambda: np.zeros((0, 2)), repr=False)
+    contours: tuple[Array, ...] = field(default=(), repr=False)
 
     @property
     def sigmas(self) -> tuple[float, float, float, float]:
@@ -304,6 +307,7 @@ def _part(model: PartModel, fine: FinePose) -> LocatedPart:
         blur=fine.blur,
         chi_square=fine.chi_square,
         hull=fine.pose.to_picture(model.hull),
+        contours=tuple(fine.pose.to_picture(one) for one in model.contours),
     )
 
 

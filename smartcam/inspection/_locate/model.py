@@ -85,6 +85,9 @@ LEVEL_RESPONSE: Final = 0.8
 NOISES: Final = 6.0
 """Standard deviations of the noise that a taught edge's contrast has at least."""
 
+MAX_CONTOURS, MAX_CONTOUR_CORNERS, MIN_CONTOUR_PX = 12, 150, 8
+"""Contours of a part that are shown at most, their corners at most, and their pixels at least."""
+
 MAX_LEVEL: Final = 255.0
 """Contrast or noise that may be given at most, grey levels of 255."""
 
@@ -276,6 +279,31 @@ class PartModel:
         cv2 = load("cv2", "inspection needs")
         found: Array = cv2.convexHull(self.outline.astype(np.float32))[:, 0].astype(np.float64)
         return found
+
+    @cached_property
+    def contours(self) -> tuple[Array, ...]:
+        """Polygons (K, 2) along the edges, the longest first, for people; a pixel off at most."""
+        cv2 = load("cv2", "inspection needs")
+        low = np.floor(self.outline.min(axis=0)).astype(int) - 3
+        at = np.rint(self.outline - low).astype(int)
+        mask = np.zeros(at.max(axis=0)[::-1] + 4, np.uint8)
+        mask[at[:, 1], at[:, 0]] = 1
+        mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        found, (tree,) = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        outer = [one for one, (_, _, _, parent) in zip(found, tree, strict=True) if parent < 0]
+        outer.sort(key=len, reverse=True)
+        polygons = [_simpler(one) for one in outer[:MAX_CONTOURS] if len(one) >= MIN_CONTOUR_PX]
+        return tuple(one.astype(np.float64) + low for one in polygons)
+
+
+def _simpler(contour: NDArray[Any]) -> NDArray[Any]:
+    """Return a polygon (K, 2) of few corners along a contour (N, 1, 2)."""
+    cv2 = load("cv2", "inspection needs")
+    off = 0.7
+    while len(polygon := cv2.approxPolyDP(contour, off, True)) > MAX_CONTOUR_CORNERS:
+        off *= 1.5
+    found: NDArray[Any] = polygon[:, 0]
+    return found
 
 
 # ---------------------------------------------------------------------- teaching

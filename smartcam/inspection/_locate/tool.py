@@ -83,7 +83,7 @@ class Locate(Tool[LocateSettings]):
                 )
             )
         for model in self.models:  # worked out now, for the same reason
-            _ = model.bands, model.coarse
+            _ = model.bands, model.coarse, model.contours
         kind = getattr(setup.calibration, "kind", None)
         calibrated = kind in {"plane", "sheet"}
         self._plane = robot_plane_of(setup.calibration) if calibrated else PIXELS
@@ -117,6 +117,28 @@ class Locate(Tool[LocateSettings]):
             f"theta: real32 deg, scale: real32, {lengths}, sigma_theta: real32 deg, "
             "correlation_xy: real32, correlation_xt: real32, correlation_yt: real32"
         )
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Symmetry and edges of each model, and the error that its poses will have."""
+        return tuple(self._remark(model) for model in self.models)
+
+    def _remark(self, model: PartModel) -> str:
+        place, angle = model.predicted_sigma()
+        text = (
+            f"{model.name}: {model.symmetry.text()}; {len(model.segments.halves)} pieces of edges; "
+            f"a pose is good to {place:.2g} px"
+        )
+        try:
+            slopes = self._plane.slopes(np.array([model.reference]))[0]
+        except NotMeasuredError:
+            pass  # an outline's reference need not be in the picture
+        else:
+            longest = float(np.linalg.norm(slopes, 2))
+            text += f", {longest * place:.2g} mm" if self._plane.unit == "mm" else ""
+        if not math.isnan(angle):
+            text += f" and {math.degrees(angle):.2g} degrees"
+        return f"{text} in a picture like the taught one"
 
     def inspect(self, view: View) -> Finding:
         """Return the parts, the best first."""
@@ -236,12 +258,15 @@ def _near(nearest: LocatedPart | None, named: bool) -> str:
 
 
 def _marks(part: LocatedPart, role: Role) -> list[Drawing]:
-    """Return the drawings of a part: its hull, its axes, its edges, and those not seen."""
+    """Return the drawings of a part: its outline, its axes, its edges, and those not seen."""
     pose = part.pose
     reach = 0.25 * float(np.linalg.norm(part.hull - (pose.x, pose.y), axis=1).max()) / pose.scale
     axes = pose.to_picture([(2 * reach, 0), (0, 0), (0, reach)])
     text = f"{part.name} {100 * part.score:.0f} %"
-    marks = [Drawing("polygon", _points(part.hull), role, text)]
+    marks = [
+        Drawing("polygon", _points(one), role, "" if number else text)
+        for number, one in enumerate(part.contours or (part.hull,))
+    ]
     marks.append(Drawing("line", _points(axes), role))
     shown: list[tuple[Array, Role]] = [(part.edges, role), (part.missing, "hint")]
     for places, which in shown:

@@ -85,7 +85,6 @@ class IfmClient(TicketedClient):
 
     outputs: int = 1
     layout: Mapping[str, Any]
-    session: IfmClient
 
 
 class EmulatedIfm(EvaluatingCamera, TicketedCamera):

@@ -92,6 +92,8 @@ class Users:
             _certificate(folder / path, name): name
             for name, path in settings.user_certificates.items()
         }
+        if len(self._certificates) < len(settings.user_certificates):
+            raise ConfigurationError("user_certificates: two users have the same certificate")
 
     def get_user(
         self,

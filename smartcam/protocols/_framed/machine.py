@@ -417,9 +417,9 @@ class Machine:
     # ------------------------------------------------------------------ inside
 
     def _made_of(self, message: Message) -> _Made:
-        """Return the objects of a message with a body; a camera says the same ones again and again.
+        """Return the frame of a message with a body; a camera often says the same object again.
 
-        Of those with data, such as results, only the last one is known.
+        Of those with data, such as results, only the last one's frame is kept.
         """
         known = self._said.get(id(message))
         if known is not None:

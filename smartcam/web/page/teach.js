@@ -43,6 +43,7 @@ async function show(number) {
   setText("shown-name", one.name);
   setText("shown-size", `${width} x ${height}`);
   mark();
+  hint();
 }
 
 function mark() {
@@ -92,7 +93,7 @@ $("canvas").addEventListener("pointerup", (event) => {
   hideOutline();
   if (measured()) {
     if (Math.hypot(end[0] - begin[0], end[1] - begin[1]) >= 2) setWay(begin, end);
-  } else if (wanted[2] >= 2 && wanted[3] >= 2) set("region", `[${wanted.join(", ")}]`);
+  } else if (wanted[2] >= 2 && wanted[3] >= 2) set(taughtHere() ? "part" : "region", `[${wanted.join(", ")}]`);
 });
 $("canvas").addEventListener("pointercancel", hideOutline);
 
@@ -124,6 +125,26 @@ const VALUE = String.raw`(\[\s*\[[^\]]*\]\s*,\s*\[[^\]]*\]\s*\]|\[[^\]]*\]|[-+.\
 
 const measured = () => kindOf(current) === "measure";
 
+// A part is taught from a picture: in that one a drag goes around the part.
+const located = () => kindOf(current) === "locate";
+const fileOf = (number) => state.pictures.find((picture) => picture.number === number)?.file ?? "";
+const taughtHere = () => located() && fileOf(shown) !== "" && tools[current].taught === fileOf(shown);
+
+function hint() {
+  let text = "Drag in the picture to draw the region in which the tool looks.";
+  if (measured()) text = "Drag in the picture across the two edges of a width or over one edge, along a line, or from a circle's centre to its rim: whichever has a setting; without one, a width.";
+  else if (taughtHere()) text = "Drag around the part, some pixels away from it: this is the picture that it is taught from.";
+  setText("how", text);
+  $("teach").hidden = !located() || !fileOf(shown) || taughtHere();
+}
+
+$("teach").addEventListener("click", () => {
+  for (const name of ["model", "outline", "pixels_per_mm", "unit", "part"]) delete tools[current][name];
+  tools[current].taught = fileOf(shown);
+  listTools();
+  changed();
+});
+
 function setWay(begin, end) {
   const given = Object.keys(tools[current]).filter((name) => tools[current][name].trim());
   if (given.includes("distance") || given.includes("angle")) return setText("problem", "A distance or an angle has two things: write them by hand.");
@@ -147,7 +168,7 @@ function listTools() {
   $("tool").value = current;
   $("remove").disabled = !current;
   $("whole").disabled = !current || measured();
-  setText("how", measured() ? "Drag in the picture across the two edges of a width or over one edge, along a line, or from a circle's centre to its rim: whichever has a setting; without one, a width." : "Drag in the picture to draw the region in which the tool looks.");
+  hint();
   const fields = state.kinds[kindOf(current)] ?? {};
   $("settings").replaceChildren(...Object.entries(fields).map(([name, about]) => {
     const input = make("input", { id: `set-${name}`, name, value: tools[current][name] ?? "", spellcheck: false });
@@ -192,6 +213,7 @@ let again = false;
 
 function changed() {
   setText("saved", "Not saved yet.");
+  hint();
   clearTimeout(timer);
   timer = setTimeout(attempt, TRY_MS);
 }
@@ -207,6 +229,7 @@ async function attempt() {
     if (Object.keys(tools).length && state.pictures.length) {
       const answer = await (await call("/api/try", { tools })).json();
       found = new Map(answer.found.map((one) => [one.picture, one]));
+      $("remarks").replaceChildren(...answer.remarks.map((text) => make("li", { textContent: text })));
     } else {
       found = new Map();
     }
@@ -214,6 +237,7 @@ async function attempt() {
     alarm(null);
   } catch (error) {
     found = new Map();
+    $("remarks").replaceChildren();
     if (error instanceof Refused && error.status === 422) setText("problem", error.message);
     else alarm(error);
   }
