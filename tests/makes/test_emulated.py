@@ -11,7 +11,7 @@ import pytest
 
 import smartcam
 from smartcam import Camera, Status
-from smartcam.emulator import LineCamera, load_scenario
+from smartcam.emulator import LineCamera, ManualClock, load_scenario
 from smartcam.exceptions import ConfigurationError, ConnectionLostError, TriggerTimeoutError
 from smartcam.makes import EmulatedIfm, EmulatedIv3, EmulatedSr
 from smartcam.recording import Recorder, load_recording, replay
@@ -149,12 +149,14 @@ async def test_recorded_state_is_played_at_its_trigger_however_often_a_client_as
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "run.mcap"
-    async with MAKES["sr"](reading_time=0.3) as emulator:
+    clock = ManualClock()
+    async with MAKES["sr"](reading_time=0.3, clock=clock) as emulator:
         with Recorder(path) as made:
             async with smartcam.connect(emulator.url, name="left", observers=[made]) as camera:
                 triggered = asyncio.create_task(camera.trigger())
                 while Status.BUSY not in (last := await camera.query_status()):
                     assert not triggered.done()
+                clock.advance(0.3)
                 recorded = (await triggered).raw
     assert Status.BUSY in last  # which nothing but the code follows
     async with (

@@ -19,6 +19,7 @@ from smartcam.fleet._inside import FleetOutlets, exposition, read_numbers
 from smartcam.registry import OUTLETS
 from tests.outlets.broker import broker, listener, needs_mosquitto
 from tests.outlets.outletkit import FarEnd, ListOutlet, until
+from tests.processes import free_port
 
 pytestmark = pytest.mark.real_time
 
@@ -100,7 +101,7 @@ async def test_a_trigger_over_mqtt_reaches_a_camera_of_the_fleet(tmp_path: Path)
     async with broker(tmp_path) as there:
         mqtt = f"mqtt: {{broker: '{there.url}', commands: true}}"
         text = FLEET.replace("store: {kind: sqlite, file: results.sqlite}", mqtt)
-        path = fleet(tmp_path, f"listen: tcp/127.0.0.1:{there.port + 1}\n{text}")
+        path = fleet(tmp_path, f"listen: tcp/127.0.0.1:{free_port()}\n{text}")
         server = FleetServer(path)
         async with FleetOutlets(server), server:
             await until(lambda: server.hosts["line1/cam1"].connected)
