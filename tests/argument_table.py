@@ -126,6 +126,7 @@ KINDS: dict[str, frozenset[str]] = {
     "object or None": _NONE,
     "pixels": frozenset({"numpy array"}),
     "list": frozenset({"list", "dict"}),
+    "names": frozenset({"list"}),
     "mapping": frozenset({"dict"}),
     "mapping or None": frozenset({"dict"}) | _NONE,
     "message id": _INTEGER | _TEXT,
@@ -431,6 +432,14 @@ TABLE: dict[str, dict[str, str]] = {
     "Recorder.__init__": {"path": "text", "overwrite": "flag", "pictures": "flag"},
     "CellCamera.program": {"application": "application or name"},
     "Inspection.payload": {"byte_order": "choice", "sequence": "seed or None"},
+    "PartModel.from_outline": {
+        "path": "text",
+        "pixels_per_mm": "number",
+        "name": "text",
+        "bright": "flag",
+        "unit": "choice or None",
+        "layers": "names",
+    },
     "PartModel.predicted_sigma": {"noise": "number or None"},
     "PartModel.read": {"path": "text"},
     "PartModel.teach": {
@@ -621,7 +630,14 @@ NOT_HERE: dict[str, tuple[str, ...]] = {
         *("SyncFrameReaderBase", "SyncFrameReader"),
         *("CameraLog.__init__", "ThreadedCamera.in_thread", "Backoff.delays"),
         *("WireCamera.__init__", "Device.__init__", "CellCamera.__init__", "Drawing", "View"),
-        *("Inspection.__init__", "PixelPose", "PlacedRegion", "Program.__init__", "ToolSetup"),
+        *(
+            "Inspection.__init__",
+            "PixelPose",
+            "Pose.with_sigma",
+            "PlacedRegion",
+            "Program.__init__",
+            "ToolSetup",
+        ),
         *("SoftwareCamera.__init__", "LocatedPart.__init__", "PartModel.__init__", "Symmetry"),
     ),
     "what a driver, an observer, a client or another make of camera does or is told": (

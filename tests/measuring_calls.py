@@ -123,6 +123,10 @@ def measuring_calls() -> dict[str, Call]:
             {"static": static, "calibrated_at": still, "field": corners}
             | {"tolerance": 0.0002, "max_lag": 0.001},
         ),
+        "PlacePattern": (
+            calibration.PlacePattern,
+            {"frame": still, "rows": 2, "columns": 2, "layers": 1, "pitch": (0.1, 0.1, 0.0)},
+        ),
         "PlaneProjection": (calibration.PlaneProjection, {"matrix": np.eye(3)}),
         "PoseHistory": (calibration.PoseHistory, {"size": 10, "max_gap": 0.1}),
         "ToolOffset": (

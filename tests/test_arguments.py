@@ -257,6 +257,10 @@ def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], 
     square = np.full((80, 80), 60, np.uint8)
     square[20:60, 20:60] = 180
     part = PartModel.teach(square)
+    outline = path.parent / "square.svg"
+    outline.write_text(
+        '<svg width="20mm" height="20mm" viewBox="0 0 20 20"><path d="M1 1h9v7h-9z"/></svg>'
+    )
     software = {"software": Software.model_validate(CELL_OF_ONE)}
 
     def mistakes(name: Any = "cam", folder: Any = folder, **more: Any) -> Any:
@@ -265,6 +269,10 @@ def inspecting(folder: Path, frame: Any) -> dict[str, tuple[Callable[..., Any], 
     return {
         "CellCamera.program": (cell.program, {}),
         "Inspection.payload": (program.inspect(frame).payload, {}),
+        "PartModel.from_outline": (
+            PartModel.from_outline,
+            {"path": outline, "pixels_per_mm": 4.0},
+        ),
         "PartModel.predicted_sigma": (part.predicted_sigma, {}),
         "PartModel.read": (PartModel.read, {}),
         "PartModel.teach": (PartModel.teach, {"picture": square}),

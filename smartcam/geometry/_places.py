@@ -63,7 +63,7 @@ class PlacePattern(Sequence[Transform]):
         for name in ("rows", "columns", "layers"):
             count = check_integer(getattr(self, name), name, 1, MAX_PLACES, who)
             object.__setattr__(self, name, count)
-        if not isinstance(self.pitch, Sequence) or len(self.pitch) != 3:
+        if not isinstance(self.pitch, tuple | list) or len(self.pitch) != 3:
             raise wrong_argument("pitch", "distances of columns, rows and layers", self.pitch, who)
         counts = (self.columns, self.rows, self.layers)
         pitch = [

@@ -87,6 +87,7 @@ PARSERS_OF: dict[str, str] = {
     "ros2._types.codec": "ROS: messages",
     "ros2._types.definitions": "ROS: definitions of messages",
     "web._routes": "pages: bodies of calls",
+    "_client.link": "frames of a camera, handbook",
     "_cli.byte_text": "hex dumps of frames",
 }
 """By module (without ``smartcam.``): the row of the table in which it is measured."""

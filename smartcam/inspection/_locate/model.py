@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
@@ -34,7 +35,6 @@ from smartcam.inspection._picture import Picture
 from smartcam.inspection._places import PixelPose, Region, place
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -191,6 +191,8 @@ class PartModel:
         bright = check_flag(bright, "bright", who)
         if unit is not None:
             check_choice(unit, "unit", tuple(MM), who)
+        if isinstance(layers, str | bytes) or not isinstance(layers, Sequence):
+            raise wrong_argument("layers", "a sequence of names", layers, who)
         layers = [check_text(one, "layers", who, least=1) for one in layers]
         picture, (x, y) = drawn_outline(read_outline(path, scale, unit, layers), bright=bright)
         model = _taught(Picture.of(picture), None, name, None)

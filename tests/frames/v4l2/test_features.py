@@ -10,7 +10,7 @@ from smartcam.exceptions import FrameSourceError
 from smartcam.frames import DeviceFeatures, Feature
 from tests.frames.v4l2 import scenarios
 from tests.frames.v4l2.scenarios import DeviceControl, V4L2Driver, abi
-from tests.frames.v4l2.test_driver import Player, play  # noqa: F401 - a fixture
+from tests.frames.v4l2.test_driver import Player, begin, play  # noqa: F401 - a fixture
 
 WEBCAM = [
     DeviceControl("brightness", 0x00980900, "integer", -64, 64, 1, 0, 3),
