@@ -435,7 +435,10 @@ def test_wrong_use_is_told_in_words(arguments: tuple[str, ...], text: str) -> No
     assert text in " ".join(outcome.err.split())
 
 
-def test_name_of_a_host_is_no_mistyped_command() -> None:
+def test_name_of_a_host_is_no_mistyped_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # where a wizard keeps its journal
     outcome = run("calibrate", "vision1.invalid", "--application", "7", "--timeout", "0.5")
     assert "No such command" not in outcome.err
 

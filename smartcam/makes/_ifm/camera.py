@@ -103,7 +103,7 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
     """
 
     protocol = PCIC
-    client_class: ClassVar[type[IfmClient]] = IfmClient
+    client_class: ClassVar[type[TicketedClient]] = IfmClient
     also_hears: ClassVar[tuple[LineRow, ...]] = (ASYNCHRONOUS,)
 
     def __init__(
