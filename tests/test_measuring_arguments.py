@@ -43,7 +43,7 @@ DEAR = frozenset(
         *("fit_corners", "fit_plane", "fit_touches", "suggest_views"),
     }
 )
-"""Those that calculate for long where an odd value is one of theirs."""
+"""Functions that calculate for long where an odd value is one of those that they take."""
 
 
 def widths() -> Iterator[Any]:

@@ -170,7 +170,7 @@ IN_TIME_OF_THEIR_OWN = frozenset(
         "test_trigger_cancelled_at_any_step_leaves_the_next_trigger_its_own_result",
     }
 )
-"""Those that count the loop's steps, measure, name exact times, or take long in real time.
+"""Tests that count the loop's steps, measure, name exact times, or take long in real time.
 
 They run neither over Zenoh nor in uvloop, whose time is the real one.
 """

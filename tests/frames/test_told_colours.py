@@ -38,7 +38,7 @@ LIMIT = 30.0
 """Seconds that only a failure reaches."""
 
 WEIGHTS = {"601": (0.299, 0.114), "709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
-"""Of red and blue in Y, from the recommendations of ITU-R."""
+"""Shares of red and blue in Y, from the recommendations of ITU-R."""
 
 X264_NAMES = {"601": "smpte170m", "709": "bt709", "2020": "bt2020nc"}
 FORMATS = {

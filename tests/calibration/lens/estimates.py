@@ -70,7 +70,7 @@ class Bench:
 
     @functools.cached_property
     def covariance(self) -> Array:
-        """That of the lens."""
+        """The calibration of the lens."""
         found: Array = (self.sigma**2 * self.back @ self.back.T)[: self.values, : self.values]
         return found
 

@@ -359,7 +359,7 @@ COLOURS_AT = FORMAT_FIELDS.size + 6 * 4
 quantization follow."""
 
 WEIGHTS = {"601": (0.299, 0.114), "709": (0.2126, 0.0722), "2020": (0.2627, 0.0593)}
-"""Of red and blue in Y, from the recommendations of ITU-R."""
+"""Shares of red and blue in Y, from the recommendations of ITU-R."""
 
 
 class ColouredDevice(Replay):
