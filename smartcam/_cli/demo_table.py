@@ -18,7 +18,8 @@ from smartcam._extras import load
 from smartcam.emulator import TablePose, TableScene
 from smartcam.emulator._inside import TABLE_SIZE
 from smartcam.exceptions import ConfigurationError
-from smartcam.frames import Frame, FrameDriver, Moment, StreamFormat, find_format
+from smartcam.frames import Frame, Moment, StreamFormat, find_format
+from smartcam.frames._inside import TaskDriver
 from smartcam.geometry import Transform
 from smartcam.registry import FRAMES
 
@@ -218,7 +219,7 @@ class DrawnTable:
         return place.real, place.imag
 
 
-class TableDriver(FrameDriver):
+class TableDriver(TaskDriver):
     """The pictures of a :class:`DrawnTable`, by its address."""
 
     times_frames = True
@@ -229,29 +230,14 @@ class TableDriver(FrameDriver):
         if address.url not in self.tables:
             raise ConfigurationError(f"frame source {address.url!r}: there is no such table")
         self._table = self.tables[address.url]
-        self._task: asyncio.Task[None] | None = None
         self._number = 0
 
     async def open(self) -> StreamFormat:
         """Return the format, size and rate of the pictures."""
         return StreamFormat(find_format("Mono8"), *SIZE_PX, (FRAMES_PER_SECOND,))
 
-    async def start(self, sink: FrameSink) -> None:
-        """Begin to draw."""
-        self._task = asyncio.create_task(self._draw(sink), name=f"frames of {self.name}")
-
-    async def stop(self) -> None:
-        """Draw no longer."""
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
-
-    async def close(self) -> None:
-        """Have nothing left."""
-        await self.stop()
-
-    async def _draw(self, sink: FrameSink) -> None:
+    async def deliver(self, sink: FrameSink) -> None:
+        """Draw pictures of the table."""
         while True:
             captured, utc = time.monotonic(), time.time()
             picture = await asyncio.to_thread(self._table.picture)

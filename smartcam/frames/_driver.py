@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
@@ -220,3 +221,28 @@ class FrameDriver(ABC):
     @abstractmethod
     async def close(self) -> None:
         """Give the device back. Idempotent, and right after any failure."""
+
+
+class TaskDriver(FrameDriver):
+    """A driver whose frames come from a task: a subclass says by :meth:`deliver` how."""
+
+    _task: asyncio.Task[None] | None = None
+
+    @abstractmethod
+    async def deliver(self, sink: FrameSink) -> None:
+        """Hand frames to the sink until the task is cancelled."""
+
+    async def start(self, sink: FrameSink) -> None:
+        """Begin to deliver."""
+        self._task = asyncio.create_task(self.deliver(sink), name=f"frames of {self.name}")
+
+    async def stop(self) -> None:
+        """End the task."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+            await asyncio.wait([task])
+
+    async def close(self) -> None:
+        """End the task, where it still delivers."""
+        await self.stop()

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from smartcam.frames._codecs.h264 import entry_point
     from smartcam.frames._codecs.jpeg import jpeg_header
     from smartcam.frames._codecs.pictures import converted, decoded, to_jpeg, with_pixels
+    from smartcam.frames._driver import TaskDriver
     from smartcam.frames._features import FEATURE_TIMEOUT
     from smartcam.frames._frame import changed
     from smartcam.frames._gige import discovery, places
@@ -40,6 +41,7 @@ __all__ = [
     "PacketCounts",
     "Planes",
     "Register",
+    "TaskDriver",
     "YuvPairs",
     "changed",
     "checked_mac",
@@ -68,6 +70,7 @@ if not TYPE_CHECKING:
             "_codecs.h264": "entry_point",
             "_codecs.jpeg": "jpeg_header",
             "_codecs.pictures": "converted decoded to_jpeg with_pixels",
+            "_driver": "TaskDriver",
             "_features": "FEATURE_TIMEOUT",
             "_frame": "changed",
             "_gige.force_address": "checked_mac force_address",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.frames._driver import FrameDriver, StreamFormat
+from smartcam.frames._driver import StreamFormat, TaskDriver
 from smartcam.frames._frame import Frame, Moment
 from smartcam.frames._pixels.formats import find_format
 
@@ -33,7 +33,7 @@ MIN_SIZE_PX: Final = (STAMP_BITS * BIT_SIDE_PX, 4 * BIT_SIDE_PX)
 """Width and height, in pixels, of the smallest picture that has room for a stamp."""
 
 
-class SyntheticDriver(FrameDriver):
+class SyntheticDriver(TaskDriver):
     """Moving stripes with a stamp: ``synthetic://?size=640x480&fps=30&format=YUYV``.
 
     Formats are Mono8, YUYV, RGB8, Z16 (distances in millimetres) and MJPEG.
@@ -56,7 +56,6 @@ class SyntheticDriver(FrameDriver):
         self._format = _format(address, said.get("format", "Mono8"))
         self._rate = address.number("fps", said.get("fps", "30"), 0.01, 10_000)
         self._name = said.get("name", "synthetic")
-        self._task: asyncio.Task[None] | None = None
         self._number = 0
 
     @property
@@ -73,22 +72,8 @@ class SyntheticDriver(FrameDriver):
         _FORMATS[self._format.name](stripes(*self._size))
         return StreamFormat(self._format, *self._size, (self._rate,))
 
-    async def start(self, sink: FrameSink) -> None:
-        """Begin to draw."""
-        self._task = asyncio.create_task(self._draw(sink), name=f"frames drawn for {self.name}")
-
-    async def stop(self) -> None:
-        """Draw no longer."""
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
-
-    async def close(self) -> None:
-        """Have nothing left."""
-        await self.stop()
-
-    async def _draw(self, sink: FrameSink) -> None:
+    async def deliver(self, sink: FrameSink) -> None:
+        """Draw pictures."""
         width, height = self._size
         picture = stripes(width, height)
         coded = _FORMATS[self._format.name]

@@ -16,7 +16,8 @@ from smartcam.exceptions import (
     FrameSourceError,
     RecordingError,
 )
-from smartcam.frames import Frame, FrameDriver, StreamFormat
+from smartcam.frames import Frame, StreamFormat
+from smartcam.frames._inside import TaskDriver
 from smartcam.recording._mcap.form import GAP, RecordedError, RecordedPicture
 from smartcam.recording._reader import each_item, frame_of
 
@@ -41,7 +42,7 @@ MAX_SPEED: Final = 1000.0
 _KNOWN: Final = ("camera", "name", "pace", "speed")
 
 
-class RecordedDriver(FrameDriver):
+class RecordedDriver(TaskDriver):
     """The pictures in a recording: ``run.mcap``, or a folder of recordings that follow each other.
 
     Parameters stand behind ``#``: ``run.mcap#camera=left&pace=none``.
@@ -77,7 +78,6 @@ class RecordedDriver(FrameDriver):
             raise address.wrong("pace", "real or none", pace)
         self._paced = pace == "real"
         self._speed = address.number("speed", said.get("speed", "1"), 1 / MAX_SPEED, MAX_SPEED)
-        self._task: asyncio.Task[None] | None = None
         self._reading: asyncio.Future[RecordedPicture | None] | None = None
 
     @property
@@ -130,23 +130,12 @@ class RecordedDriver(FrameDriver):
             available=tuple(cameras),
         )
 
-    async def start(self, sink: FrameSink) -> None:
-        """Play the recording from its beginning."""
-        self._task = asyncio.create_task(self._play(sink), name=f"frames of {self.name}")
-
     async def stop(self) -> None:
         """Play no longer."""
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-            await asyncio.wait([task])
+        await super().stop()
         reading, self._reading = self._reading, None
         if reading is not None:
             await asyncio.wait([reading], timeout=STOP_TIMEOUT)
-
-    async def close(self) -> None:
-        """Have nothing left. Idempotent."""
-        await self.stop()
 
     # ------------------------------------------------------------------ playing
 
@@ -169,7 +158,8 @@ class RecordedDriver(FrameDriver):
         reading.add_done_callback(_looked_at)
         return await asyncio.shield(reading)
 
-    async def _play(self, sink: FrameSink) -> None:
+    async def deliver(self, sink: FrameSink) -> None:
+        """Play the recording from its beginning."""
         pictures = self._pictures()
         loop = asyncio.get_running_loop()
         last: Frame | None = None
