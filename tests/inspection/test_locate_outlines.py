@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import random
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -197,3 +199,20 @@ def test_arguments_and_settings_that_cannot_work_are_told(tmp_path: Path) -> Non
     ):
         with pytest.raises(ConfigurationError, match=text):
             programs(tmp_path, f"7: {{locate: {{{said}}}}}")
+
+
+@pytest.mark.parametrize("make", [tee_svg, tee_dxf])
+def test_damaged_file_is_told_or_taught(make: Any, tmp_path: Path) -> None:
+    path = make(tmp_path)
+    whole = path.read_bytes()
+    chance = random.Random(path.suffix)  # noqa: S311 - of a test
+    for _ in range(40):
+        cut = bytearray(whole[: chance.randrange(len(whole))] if chance.random() < 0.3 else whole)
+        for _ in range(chance.randrange(4) if cut else 0):
+            at = chance.randrange(len(cut))
+            cut[at : at + chance.randrange(1, 40)] = chance.randbytes(chance.randrange(8))
+            if not cut:
+                break
+        path.write_bytes(cut)
+        with contextlib.suppress(TeachingError):
+            PartModel.from_outline(path, 4.0)

@@ -186,8 +186,8 @@ def _dxf_lines(
                 yield corners[:, :2] * (scale, -scale)
     except TeachingError:
         raise
-    except (ezdxf.DXFError, OSError, ValueError, ArithmeticError, LookupError) as exc:
-        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: {exc!s:.200}") from exc
+    except Exception as exc:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: no DXF: {exc!r:.200}") from exc
 
 
 # ---------------------------------------------------------------------- SVG
@@ -207,8 +207,8 @@ def _svg_lines(
         yield from reader.read(root, np.diag([scale, scale, 1.0]), not layers, 0)
     except TeachingError:
         raise
-    except (ElementTree.ParseError, ValueError, TypeError, ArithmeticError, LookupError) as exc:
-        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: {exc!s:.200}") from exc
+    except Exception as exc:
+        raise TeachingError(TeachingTrouble.UNREADABLE, f"{path}: no SVG: {exc!r:.200}") from exc
 
 
 def _tag(element: ElementTree.Element) -> str:
