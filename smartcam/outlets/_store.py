@@ -15,6 +15,7 @@ from pydantic import Field
 
 from smartcam._file_values import Age, Size  # noqa: TC001 - pydantic does
 from smartcam.exceptions import ConfigurationError
+from smartcam.outlets._database import open_database
 from smartcam.outlets._outlet import Outlet
 from smartcam.outlets._records import picture_of, records_of
 from smartcam.outlets._settings import OutletSettings
@@ -127,9 +128,7 @@ class ResultStore(Outlet[StoreSettings]):
 
     def _open(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._database = database = sqlite3.connect(
-            self.path, timeout=10.0, isolation_level=None, check_same_thread=False
-        )
+        self._database = database = open_database(self.path, timeout=10.0)
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version > VERSION:
             raise ConfigurationError(

@@ -13,8 +13,8 @@ import pytest
 
 from smartcam._client._inside import Interpretation
 from smartcam.exceptions import ConfigurationError
-from smartcam.outlets import OutletDesk, OutletEntry
-from smartcam.outlets._inside import columns_of
+from smartcam.outlets import OutletDesk, OutletEntry, StoreQuestion
+from smartcam.outlets._inside import columns_of, read_store
 from smartcam.registry import OUTLETS
 
 pytestmark = pytest.mark.real_time
@@ -132,6 +132,18 @@ async def test_a_picture_is_referred_to_where_it_is_there(tmp_path: Path) -> Non
     await written(made, entry(1, {"n": 1}), entry(2, {"n": 2}))
     found = rows(tmp_path, "SELECT picture FROM results ORDER BY number")
     assert found == [("pictures/line1/cam1-1.png",), (None,)]
+
+
+async def test_a_store_whose_tables_have_no_readable_names_is_told(tmp_path: Path) -> None:
+    await written(store(tmp_path), entry(1, {"n": 1}))
+    path = tmp_path / "results.sqlite"
+    damaged = path.read_bytes().replace(b"tableresultsresults", b"tablere\xd4\xd4ltsresults")
+    assert damaged != path.read_bytes()
+    path.write_bytes(damaged)
+    with pytest.raises(ConfigurationError, match="malformed database schema"):
+        read_store(path, StoreQuestion(None, False, "**", 10))
+    with pytest.raises(sqlite3.DatabaseError, match="malformed database schema"):
+        await store(tmp_path).open()
 
 
 async def test_a_store_of_a_newer_version_is_refused(tmp_path: Path) -> None:
