@@ -140,6 +140,7 @@ class Spool:
         try:
             database.execute("PRAGMA journal_mode = WAL")
             database.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'NORMAL'}")
+            _check_versions(self.path)
             database.execute("BEGIN IMMEDIATE")
             database.execute("COMMIT")
             ((found,),) = database.execute("PRAGMA quick_check(1)").fetchall()
@@ -420,6 +421,18 @@ def _connected(path: Path) -> sqlite3.Connection:
     database = open_database(path, timeout=0.5)
     database.text_factory = _text  # a damaged text is found by its checksum
     return database
+
+
+def _check_versions(path: Path) -> None:
+    """Check the versions in the file's header: SQLite takes a damaged one for a file to read only.
+
+    Raises:
+        sqlite3.DatabaseError: they are damaged.
+    """
+    with path.open("rb") as file:
+        versions = file.read(20)[18:]
+    if any(one not in {1, 2} for one in versions):
+        raise sqlite3.DatabaseError(f"expected the versions 1 or 2, got {versions.hex(' ')}")
 
 
 def _text(data: bytes) -> str:
