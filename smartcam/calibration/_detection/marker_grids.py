@@ -1,4 +1,4 @@
-"""Grids of markers in images: Kalibr's AprilGrid and OpenCV's GridBoard."""
+"""Find grids of markers in images: Kalibr's AprilGrid and OpenCV's GridBoard."""
 
 from __future__ import annotations
 
@@ -36,16 +36,17 @@ FITTED_SHARE = 0.9
 """Part of the black border, or of the white gap beside a corner, that is fitted."""
 
 MAX_MOVED_PX = 1.0
-"""Pixels by which a corner that could not be fitted has moved from where it was read, at most."""
+"""A corner that could not be fitted is kept if refinement moved it by less than this many
+pixels."""
 
 MAX_DOUBLED_PX = 2600
-"""Longest side, pixels, of an image that is looked at in double size, too, for small markers."""
+"""An image whose longest side is at most this many pixels is also searched at twice its size."""
 
 
 def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> TargetView:
-    """Find the corners of the markers that are seen.
+    """Find the corners of the visible markers.
 
-    Raises TARGET_NOT_FOUND, WRONG_TARGET, or SHAPE: no such dictionary.
+    Raises TARGET_NOT_FOUND, WRONG_TARGET, or SHAPE if the dictionary is unknown.
     """
     what = f"grid of {target.columns} x {target.rows} markers"
     board = target.points[target.corners, :2]
@@ -90,7 +91,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
 
 
 def _read(bytes_: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Markers:
-    """Return the markers of an image that is ``scale`` times as large, numbered from the first."""
+    """Return the markers read at ``scale`` times the size, numbered from the target's first."""
     cv2: Any = load("cv2")
     count = target.columns * target.rows
     dictionary = marker_dictionary(target.dictionary, target.first_id + count, target.kind)
@@ -104,7 +105,7 @@ def _read(bytes_: NDArray[np.uint8], target: MarkerGrid, scale: float) -> Marker
 
 
 def _refined(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points: Array) -> Corners:
-    """Return corners of markers; four squares meet at one, or it is the marker's alone."""
+    """Return the refined corners of markers; at each, either four squares meet or a marker ends."""
     flat = target.points[ids, :2]
     matrix = fit_homography(flat, points)
     if matrix is None:
@@ -116,7 +117,7 @@ def _refined(image: GreyImage, target: MarkerGrid, ids: NDArray[np.intp], points
     ways = local_steps(partial(apply_homography, matrix), flat, clear)
     if target.kalibr:
         return refine_corners(image, points, ways)
-    # towards the inside of the marker, in the order that the fit of a single square wants
+    # from the corner into the marker, in the order that the fit of a single square needs
     row, column = np.divmod(ids, 2 * target.columns)
     ways *= np.stack([1 - 2 * (column % 2), 1 - 2 * (row % 2)], axis=1)[:, :, None]
     ways[np.linalg.det(ways) < 0] = ways[np.linalg.det(ways) < 0][:, ::-1]
