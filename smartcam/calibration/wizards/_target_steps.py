@@ -1,4 +1,4 @@
-"""Steps that ask which target is on a sheet, and how long its rulers came out."""
+"""Ask which target is on a sheet, and how long its printed rulers are."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _INPUTS: Final[Mapping[str, tuple[Input, ...]]] = {
         _length("origin_diameter", "Diameter of the dot at the origin, if larger", optional=True),
     ),
 }
-"""Inputs for each kind of target; names are its attributes', lengths in mm."""
+"""Inputs for each kind of target; names are those of its attributes, lengths are in mm."""
 
 
 def ruler(name: str, along: str = "") -> Number:
@@ -70,11 +70,11 @@ def ruler(name: str, along: str = "") -> Number:
 async def ask_target(
     suggested: Target | None = None, *, known: object = None, square: float | None = None
 ) -> Target:
-    """Ask what is on the sheet, and how large it was printed: lengths are those on paper.
+    """Ask for the target on the sheet and its printed size: lengths are those on paper.
 
-    ``suggested``: the default of what is asked. ``known``: a description of the target, which is
-    not asked then; None: there is none. ``square``: the default of a square's side, mm.
-    Refused as a step shows it: what is no description of a target, or rulers that
+    ``suggested``: default of the target. ``known``: a description of the target, which is then not
+    asked for; None: there is none. ``square``: default of a square's side, mm. A wrong description
+    of a target is refused as the step shows it, and so are rulers that
     :func:`~smartcam.calibration.scaled` refuses.
     """
     if known is None:
