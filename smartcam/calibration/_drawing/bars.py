@@ -1,4 +1,4 @@
-"""A bar or two for each view, with the numbers that they are to be compared with."""
+"""Draw a bar or two for each view, with lines at the values to compare them with."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 WIDTH, HEIGHT = 900.0, 260.0
-"""A chart is drawn this wide and this high, pixels."""
+"""Width and height of a chart, pixels."""
 
 LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
 """Pixels beside a chart, above it, below it, and on the right."""
@@ -21,10 +21,11 @@ ADVANCE: Final = 7.5
 """Approximate width of a letter, pixels."""
 
 CUT: Final = 3.0
-"""Multiple of the highest bar of a used view beyond which a bar is cut, with its number."""
+"""Bars longer than this many times the longest bar of a used view are cut, and their value is
+written."""
 
 MAX_LINES: Final = 5
-"""Horizontal lines of a chart at most."""
+"""A chart has at most this many horizontal lines."""
 
 DIGITS: Final = "0123456789"
 
@@ -36,17 +37,17 @@ class Series(NamedTuple):
     """One bar of each view."""
 
     name: str
-    values: Sequence[float]  # NaN: none
-    level: float = math.nan  # of all views together; NaN: none
+    values: Sequence[float]  # NaN for a view without a value
+    level: float = math.nan  # value of all views together; NaN if there is none
 
 
 class Chart(NamedTuple):
     """Bars of each view, in one unit."""
 
     unit: str
-    series: Sequence[Series]  # one or two
-    names: Sequence[str]  # of the views
-    off: Sequence[bool]  # whether each was left out
+    series: Sequence[Series]  # one series or two
+    names: Sequence[str]  # names of the views
+    off: Sequence[bool]  # whether each view was left out
 
 
 def draw_bars(charts: Sequence[Chart], title: str) -> str:
@@ -60,7 +61,7 @@ def draw_bars(charts: Sequence[Chart], title: str) -> str:
 
 
 def short_names(names: Sequence[str]) -> list[str]:
-    """Return names without what all of them begin and end with, digits apart."""
+    """Return the names without their common beginning and end; digits are kept."""
     if len(set(names)) < 2:
         return list(names)
     begin = _common(names).rstrip(DIGITS)
@@ -97,7 +98,7 @@ def _chart(chart: Chart, top: float) -> Iterator[str]:
 
 
 def _largest(chart: Chart) -> float:
-    """Return the upper end of a chart: views that were left out do not make the others small."""
+    """Return the upper end of a chart, which views that were left out do not raise."""
     used = [
         value
         for one in chart.series

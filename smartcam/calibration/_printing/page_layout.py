@@ -1,7 +1,7 @@
 """Place a target, its rays, rulers and texts on a page; all lengths are millimetres.
 
-The target stands at the lower left, so the rays A and B are as long as the page allows. Rulers
-stand left of it and below it, texts above it, right of the ray B.
+The target is at the lower left, so that the rays A and B are as long as the page allows. Rulers are
+left of it and below it, texts above it, right of the ray B.
 """
 
 from __future__ import annotations
@@ -19,67 +19,71 @@ if TYPE_CHECKING:
     from smartcam.calibration._printing.shapes import Box
 
 RULER: Final = 100.0
-"""Length of each of the two rulers."""
+"""Length of each of the two rulers, mm."""
 
 BORDER: Final = 5.0
-"""Border of the page: many printers leave it white."""
+"""Border of the page, mm, which many printers leave white."""
 
 MAX_MOVE_MM: Final = 5.0
-"""Distance of a target from the border where there is space; the rest is left to the rays."""
+"""Largest distance of a target from the border, mm; the rest of the space is for the rays."""
 
 MARGIN_OF_PITCH: Final = 0.2
-"""White around a target, of a square's side or of the distance of two dots."""
+"""Width of the white margin around a target, as a part of a square's side or of the distance
+between dots."""
 MIN_MARGIN_SQUARES, MAX_MARGIN_SQUARES = 2.0, 6.0
-"""Bounds of the white around a target."""
+"""Bounds of the width of the white margin around a target, mm."""
 
 MIN_RAY_MM: Final = 8.0
 RAY_WIDTH: Final = 0.4
 HEAD: Final = (4.0, 1.5)
-"""Length of a ray's head and half its width."""
+"""Length of a ray's head and half its width, mm."""
 NOTCH: Final = 0.65
-"""Depth of the notch in a head's back, of its length: a search takes a solid head for a dot."""
+"""Depth of the notch in the back of a ray's head, as a part of its length: a solid head would be
+taken for a dot."""
 LETTER_MM: Final = 4.0
-"""Size of the letters of the rays."""
+"""Height of the rays' letters, mm."""
 
 TICK: Final = (0.3, 3.0)
-"""Width and height of a ruler's ticks."""
+"""Width and height of a ruler's ticks, mm."""
 RULER_SPAN: Final = RULER + 12.0
-"""Length of a ruler with its label."""
+"""Length of a ruler with its label, mm."""
 
 TEXT, LINE = 2.6, 3.4
-"""Size of a text and distance of its lines."""
+"""Height of a text and distance between its lines, mm."""
 RULE_MM: Final = 0.2
-"""Thickness of the line under a text: joined to a line, letters are not taken for dots."""
+"""Thickness of the line under a text, mm: letters that are joined to a line are not taken for
+dots."""
 TEXT_LEFT: Final = HEAD[1] + LETTER_MM + 2
-"""Distance from the ray B to the texts right of its letter."""
+"""Distance from the ray B to the texts right of its letter, mm."""
 MIN_LETTERS: Final = 20
-"""Letters of a line at least, on however small a page."""
+"""A line has room for at least this many letters, even on a small page."""
 GLYPH_WIDTH: Final = 0.6
-"""Width of a letter, of its size: more than a line of Helvetica or Arial has on the average."""
+"""Assumed width of a letter, as a part of its height: more than the average of Helvetica or
+Arial."""
 
 AREA_REACH: Final = AREA_DISTANCE + AREA_DIAMETER / 2
-"""Reach of the areas outside of a checkerboard's outer corners, sides of a square."""
+"""Distance that the areas outside of a checkerboard's outer corners reach, in sides of a square."""
 
 AREA_GAP: Final = 1.0
-"""Distance between a white area outside of a checkerboard and what stands beyond it."""
+"""Distance between a white area outside of a checkerboard and the things beyond it, mm."""
 
 
 class PageLayout:
     """The places of all things on a page.
 
     Args:
-        box: rectangle that the target's pattern takes.
+        box: rectangle around the target's pattern.
         pitch: a square's side, or the distance of two dots.
-        areas: how far areas that are to stay white reach outside of the pattern's corners, an
-            origin mark among them.
+        areas: distance that white areas outside of the pattern's corners reach, an origin mark
+            included.
         texts: lines of text to print.
         width: width of the page.
         height: height of the page.
 
     Attributes:
         origin: the target's origin from the page's lower left corner.
-        needed_width: width of a page on which all of the layout fits.
-        needed_height: height of a page on which all of the layout fits.
+        needed_width: width of a page on which the whole layout fits.
+        needed_height: height of a page on which the whole layout fits.
     """
 
     def __init__(
@@ -115,15 +119,15 @@ class PageLayout:
         return max(self._clear(RULER_SPAN, edge) + TICK[1], self._areas)
 
     def _clear(self, end: float, edge: float) -> float:
-        """Return the distance from the target of something that reaches from its origin to ``end``.
+        """Return the distance from the target of a thing that reaches from the origin to ``end``.
 
-        It stands between the areas at the corners, or beyond them where it does not fit.
+        The thing is placed between the areas at the corners, or beyond them if it does not fit.
         """
         return self._quiet if end <= edge else max(self._quiet, self._areas + AREA_GAP)
 
     @property
     def excess(self) -> float:
-        """Length by which the layout is too large for the page; zero where it fits."""
+        """Length by which the layout is too large for the page; zero if it fits."""
         return max(self.needed_width - self.width, 0.0) + max(self.needed_height - self.height, 0.0)
 
     def furniture(self) -> Iterator[Shape]:
@@ -149,8 +153,8 @@ def _along(
 ) -> tuple[float, float]:
     """Return the origin's place along a side of the page, and the length which that side needs.
 
-    ``pattern``: begin and end of the pattern, from its origin. ``bands``: space that is needed
-    before and behind it.
+    ``pattern``: begin and end of the pattern, from its origin. ``bands``: space needed before and
+    behind the pattern.
     """
     low, high = pattern
     needed = 2 * BORDER + bands[0] + max(high - low + bands[1], RULER_SPAN - low)
@@ -181,7 +185,7 @@ def _ruler(start: float, low: float) -> Iterator[Polygon | Label]:
 
 
 def _upright(shape: Polygon | Label) -> Shape:
-    """Return a shape along x as one along y: mirrored, but for its letters.
+    """Turn a shape along x into one along y: mirrored, except for its letters.
 
     A single letter stays upright, a longer text runs upwards.
     """

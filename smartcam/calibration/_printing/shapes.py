@@ -1,4 +1,4 @@
-"""Black shapes of a target, in millimetres from its origin, x right and y up."""
+"""Draw the black shapes of a target, in millimetres from its origin, x right and y up."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
 
 MM = 1e3
-"""Millimetres of a metre."""
+"""Millimetres per metre."""
 
 
 class Box(NamedTuple):
-    """Bounds of a target's own pattern, its origin mark aside, mm from its origin."""
+    """Bounds of a target's pattern without its origin mark, mm from its origin."""
 
     left: float
     low: float
@@ -35,10 +35,10 @@ class Box(NamedTuple):
 
 
 def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    """Return the shapes of a target and what they take; those of an origin mark are the last.
+    """Return the shapes of a target, those of an origin mark last, and their bounds.
 
-    Raises SHAPE: its dictionary is none of OpenCV's, or has too few markers; MissingExtraError:
-    a marker's pattern needs OpenCV.
+    Raises SHAPE if OpenCV has no such dictionary or it has too few markers; MissingExtraError: a
+    marker's pattern needs OpenCV.
     """
     match target:
         case Checkerboard():
@@ -97,7 +97,7 @@ def _marker_box(target: MarkerGrid) -> Box:
 
 
 def _markers(target: MarkerGrid) -> Iterator[Polygon]:
-    """Yield markers, and of Kalibr's the squares between their corners."""
+    """Yield markers, and for Kalibr's grids the squares between their corners."""
     side, gap = MM * target.marker, MM * target.gap
     patterns = marker_patterns(target)
     module = side / len(patterns[0])
@@ -113,7 +113,7 @@ def _markers(target: MarkerGrid) -> Iterator[Polygon]:
 
 
 def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
-    """Yield each marker's black modules, its border with them, by id."""
+    """Yield each marker's black modules, its border included, by id."""
     cv2 = load("cv2")
     dictionary: Any = charuco_board(target).getDictionary()
     modules = dictionary.markerSize + 2
@@ -122,7 +122,7 @@ def _patterns(target: Charuco) -> Iterator[NDArray[np.bool_]]:
 
 
 def outlines(cells: NDArray[np.bool_]) -> list[list[tuple[int, int]]]:
-    """Return the outlines of what is black among cells (rows, columns), the upper row first.
+    """Return the outlines of the black areas among cells (rows, columns), the upper row first.
 
     Corners are x to the right and y up, counted in cells from the lower left one's; outer outlines
     counter-clockwise, those of holes clockwise.
@@ -174,9 +174,9 @@ def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
 
 
 def quartered(radius: float) -> tuple[tuple[Polygon | Disc, ...], Box]:
-    """Return a disc about the origin with two black quarters, the first one with a white dot.
+    """Return a disc around the origin with two black quarters, the first with a white dot.
 
-    The quarters meet in the point to touch; the dot tells the sheet from one that is turned.
+    The quarters meet in the point to touch; the dot distinguishes the sheet from a turned one.
     """
     hole = 0.18 * radius
     at = 0.6 * radius * math.sqrt(0.5)

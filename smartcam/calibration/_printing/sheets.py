@@ -1,14 +1,12 @@
-"""Sheets to print: a target, the thesis' rays A and B from its origin, and rulers.
+"""Make sheets to print: a target, the thesis' rays A and B from its origin, and rulers.
 
 ::
 
     sheet = make_sheet(Checkerboard(columns=9, rows=6, square=0.025), page="A4")
-    Path("sheet.svg").write_text(sheet.svg())
-    Path("sheet.pdf").write_bytes(sheet.pdf())
-    ...
-    target = scaled(sheet.target, (99.2, 99.3))  # how long the printed rulers are, mm
+    Path("sheet.svg").write_text(sheet.svg()) Path("sheet.pdf").write_bytes(sheet.pdf()) ... target
+    = scaled(sheet.target, (99.2, 99.3))  # measured lengths of the rulers, mm
 
-A sheet says on itself what it is; both files carry the target's description, as
+A description is printed on each sheet; both files carry the target's description, as
 :func:`~smartcam.calibration.target_from_data` reads it.
 """
 
@@ -62,16 +60,17 @@ PAGES: Final[Mapping[str, tuple[float, float]]] = {
     "Legal": (215.9, 355.6),
     "Tabloid": (279.4, 431.8),
 }
-"""Width and height of pages, mm; a sheet takes them upright or lying, as it fits."""
+"""Width and height of pages, mm; a sheet uses them in portrait or landscape format, as it fits."""
 
 MAX_PAGE: Final = 3000.0
 """Longest side of a page, mm."""
 
 MAX_SCALE_CHANGE: Final = 0.05
-"""Largest deviation of a printer's scale."""
+"""Largest deviation of a printer's scale, as a part of it."""
 
 MAX_UNEQUAL_SCALES: Final = 0.005
-"""Largest difference of the scales along x and y: about that of a ruler that is read twice."""
+"""Largest difference between the scales along x and y, as a part: about that of reading a ruler
+twice."""
 
 DIGITS: Final = 9
 """Digits of a length in metres: nanometres."""
@@ -79,11 +78,11 @@ DIGITS: Final = 9
 
 @dataclass(frozen=True, kw_only=True)
 class Rays:
-    """Rays and an origin mark alone: for a camera that localizes the mark by itself.
+    """A sheet of only rays and an origin mark, for a camera that localizes the mark by itself.
 
     Attributes:
         diameter: diameter of the origin mark, metres; the mark has two black quarters, which meet
-            in the origin, and a white dot in the one between the rays.
+            in the origin, and a white dot in the quarter between the rays.
     """
 
     kind: ClassVar[str] = "rays"
@@ -108,12 +107,12 @@ class Sheet:
     """A target on a page.
 
     Attributes:
-        target: what is on it.
+        target: target, or rays, on the sheet.
         width: width of the page, mm.
         height: height of the page, mm.
         origin: the target's origin from the page's lower left corner, mm; x and y are those of the
             page.
-        shapes: what is printed.
+        shapes: printed shapes.
     """
 
     target: Target | Rays
@@ -124,7 +123,7 @@ class Sheet:
 
     @property
     def data(self) -> dict[str, Any]:
-        """The target's description, JSON-able."""
+        """Description of the target, as JSON takes it."""
         return _data(self.target)
 
     @property
@@ -134,7 +133,7 @@ class Sheet:
 
     @property
     def title(self) -> str:
-        """Id, kind, counts and lengths in a line, as it is printed."""
+        """One line with id, kind, counts and lengths, as it is printed."""
         return _title(self.target)
 
     def svg(self) -> str:
@@ -156,13 +155,13 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     """Lay out a sheet.
 
     Args:
-        target: what is on it; lengths are printed as they are.
-        page: one of ``PAGES``, upright or lying as the target fits, or width and height in mm,
-            such as ``300x200``, which is not turned.
+        target: target, or rays, on the sheet; lengths are printed as they are.
+        page: one of ``PAGES``, in portrait or landscape format as the target fits, or width and
+            height in mm, such as ``300x200``, which is not turned.
 
     Raises:
-        CalibrationError: PAGE_TOO_SMALL; SHAPE: no such page, no such dictionary of markers, or one
-            with too few.
+        CalibrationError: PAGE_TOO_SMALL; SHAPE: the page is unknown, or the dictionary of markers
+            is, or it has too few.
         MissingExtraError: a ChArUco target needs OpenCV.
     """
     pattern, box = _pattern(target)
@@ -214,14 +213,14 @@ def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> Calibrat
 
 
 def on_paper(data: Mapping[str, Any]) -> Target | Rays:
-    """Return the target, or the rays, that a sheet's ``data`` describes (SHAPE: it does not)."""
+    """Return the target, or the rays, that a sheet's ``data`` describes; raise SHAPE otherwise."""
     if data.get("kind") != Rays.kind or set(data) != {"kind", "diameter"}:
         return target_from_data(data)
     return Rays(diameter=data["diameter"])
 
 
 def page_size(page: str) -> tuple[float, float]:
-    """Return a page's width and height, mm; SHAPE where it has none."""
+    """Return a page's width and height, mm; raise SHAPE if it has none."""
     if page in PAGES:
         return PAGES[page]
     sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
@@ -238,13 +237,13 @@ def page_size(page: str) -> tuple[float, float]:
 
 @takes(measured_ruler=each(a_number, 2))
 def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
-    """Return a target with the lengths that it has on paper.
+    """Return a target with its lengths as they are on paper.
 
     Args:
         target: the target as it was to be printed.
-        measured_ruler: how long the printed rulers along x and along y are, mm. A target has one
-            scale, the mean of both. Rulers that differ by more than half a percent show no
-            scale, but a printer that pulls the paper unevenly.
+        measured_ruler: measured lengths of the printed rulers along x and along y, mm. A target has
+            one scale, the mean of both. If the rulers differ by more than half a percent, that is
+            not a scale but a printer that pulls the paper unevenly.
 
     Raises:
         CalibrationError: SCALE_MISMATCH: a ruler is more than 5 % off 100 mm, or the rulers differ
@@ -270,7 +269,7 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
     return resized(target, sum(factors) / 2, DIGITS)
 
 
-# ---------------------------------------------------------------------- what is said
+# ---------------------------------------------------------------------- texts
 
 
 def _data(target: Target | Rays) -> dict[str, Any]:
@@ -332,7 +331,7 @@ def _mm(metres: float) -> str:
     return f"{MM * metres:.6g} mm"
 
 
-# ---------------------------------------------------------------------- what is drawn
+# ---------------------------------------------------------------------- shapes
 
 
 def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
@@ -343,7 +342,7 @@ def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
 
 
 def _pitch(target: Target | Rays) -> float:
-    """Return the distance of two neighbouring points, mm."""
+    """Return the distance between two neighbouring points, mm."""
     match target:
         case Checkerboard() | Charuco():
             return MM * target.square
