@@ -33,11 +33,11 @@ MAX_LENGTH_M = 1.0
 """Largest side of a square or marker, and largest distance of dots, metres: those of a printed
 sheet are some millimetres to a few hundred, so a larger number was meant in millimetres."""
 
-AREA_DISTANCE = 0.3
+AREA_DISTANCE_SQUARES = 0.3
 """Distance along x and along y from an outer corner of a checkerboard to the centre of the round
 area outside of it, in sides of a square."""
 
-AREA_DIAMETER = 0.3
+AREA_DIAMETER_SQUARES = 0.3
 """Diameter of the round area outside of an outer corner of a checkerboard, in sides of a square."""
 
 
@@ -80,15 +80,15 @@ class Checkerboard:
         The first is at the origin, the others follow counter-clockwise on the sheet as it is read:
         at the end of the ray A, opposite, at the end of the ray B.
         """
-        low = -self.square * (1 + AREA_DISTANCE)
-        right = self.square * (self.columns + AREA_DISTANCE)
-        top = self.square * (self.rows + AREA_DISTANCE)
+        low = -self.square * (1 + AREA_DISTANCE_SQUARES)
+        right = self.square * (self.columns + AREA_DISTANCE_SQUARES)
+        top = self.square * (self.rows + AREA_DISTANCE_SQUARES)
         return np.array([[low, low], [right, low], [right, top], [low, top]])
 
     @property
     def corner_area_diameter(self) -> float:
         """Diameter of each of the ``corner_areas``, and of the origin's dot, metres."""
-        return AREA_DIAMETER * self.square
+        return AREA_DIAMETER_SQUARES * self.square
 
     @property
     def turned_alike(self) -> bool:

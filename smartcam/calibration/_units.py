@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 LengthUnit: TypeAlias = Literal["m", "cm", "mm", "inch"]
 """Names of units of length."""
 
-METRES: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+METRES_PER_UNIT: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 """Metres per unit."""
 
 MAX_UNASKED_M: Final = 20.0
@@ -34,13 +34,13 @@ MAX_ANGLE: Final = 2 * math.pi + 1e-3
 
 def metres_of(unit: object, what: str) -> float:
     """Return the metres per unit, or raise UNIT_UNKNOWN; ``what`` names the lengths."""
-    if not isinstance(unit, str) or unit not in METRES:
+    if not isinstance(unit, str) or unit not in METRES_PER_UNIT:
         raise Code.UNIT_UNKNOWN.refusal(
-            f"{what}: expected a unit of length of {', '.join(METRES)}, got {unit!r}",
-            list(METRES),
+            f"{what}: expected a unit of length of {', '.join(METRES_PER_UNIT)}, got {unit!r}",
+            list(METRES_PER_UNIT),
             unit,
         )
-    return METRES[unit]
+    return METRES_PER_UNIT[unit]
 
 
 def no_unit(what: str) -> CalibrationError:
@@ -48,7 +48,7 @@ def no_unit(what: str) -> CalibrationError:
     return Code.UNIT_UNKNOWN.refusal(
         f"{what}: expected to know the unit of its lengths, which neither the file nor its format "
         'says; give it as unit="m" or unit="mm", or as --unit on the command line',
-        list(METRES),
+        list(METRES_PER_UNIT),
     )
 
 

@@ -1,8 +1,8 @@
 """Judge a calibration: whether it is good, for how many millimetres, and what to do next.
 
 A calibration is "good" if no warning has a cure, if the error at left-out points is known, and if
-twice that error is within what the user allows; the default is :data:`MAX_ERROR_PART` of the field.
-Loading a calibration that is not good logs a warning.
+twice that error is within what the user allows; the default is :data:`MAX_ERROR_SHARE` of the
+field. Loading a calibration that is not good logs a warning.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-MAX_ERROR_PART: Final = 0.01
+MAX_ERROR_SHARE: Final = 0.01
 """Largest allowed error, as a part of the field, if the user does not say another."""
 
-_WITHIN: Final = 2.0
+_RMS_OF_95_PERCENT: Final = 2.0
 """Twice an RMS error includes 95 of 100 errors or more, in one direction as well as in three."""
 
 
@@ -49,14 +49,14 @@ class Allowed(NamedTuple):
     @classmethod
     def of(cls, error: float | None, field: float) -> Allowed:
         """Return the allowed error: the user's, or a part of the ``field``, both in metres."""
-        return cls(1e3 * (MAX_ERROR_PART * field if error is None else error), error is not None)
+        return cls(1e3 * (MAX_ERROR_SHARE * field if error is None else error), error is not None)
 
     @property
     def text(self) -> str:
         """The error that is allowed, and who said so, in words."""
         if self.said:
             return f"{self.error:.3g} mm are allowed"
-        share = f"{100 * MAX_ERROR_PART:g} % of the field"
+        share = f"{100 * MAX_ERROR_SHARE:g} % of the field"
         return f"{self.error:.3g} mm are allowed, {share}, as nobody said"
 
 
@@ -137,7 +137,7 @@ def judge(
         return Judgement(
             CalibrationVerdict("unknown", f"Not known how good: {more}"), option="more"
         )
-    good_for = _rounded_up(_WITHIN * max(held_out, predicted or 0.0))
+    good_for = _rounded_up(_RMS_OF_95_PERCENT * max(held_out, predicted or 0.0))
     promise = f"95 of 100 new points lie within {good_for:g} mm{where}"
     if good_for > max(allowed.error, _rounded_up(0.0)):
         text = f"Not good enough: {promise}, but {allowed.text}: {more}"

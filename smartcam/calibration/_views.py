@@ -23,7 +23,7 @@ IDS = storage.Form(
     write=lambda ids: ids.tolist(),
 )
 
-ROUNDED: Final = 1e-9
+MAX_ROUNDING_RATIO: Final = 1e-9
 """Elements of a covariance may be off by this part of it."""
 
 
@@ -165,9 +165,13 @@ def as_covariances(values: Any, count: int, what: str) -> Array:
     found = as_points(given.reshape(-1, 4), 4, what).reshape(-1, 2, 2)
     # a symmetric matrix is a covariance if neither its trace nor its determinant is negative
     trace = np.trace(found, axis1=1, axis2=2)
-    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > ROUNDED * np.abs(found).max(axis=(1, 2))
+    uneven = np.abs(found[:, 0, 1] - found[:, 1, 0]) > MAX_ROUNDING_RATIO * np.abs(found).max(
+        axis=(1, 2)
+    )
     product = found[:, 0, 0] * found[:, 1, 1]
-    negative = (found[:, 0, 0] < 0) | (product - found[:, 0, 1] ** 2 < -ROUNDED * trace**2)
+    negative = (found[:, 0, 0] < 0) | (
+        product - found[:, 0, 1] ** 2 < -MAX_ROUNDING_RATIO * trace**2
+    )
     wrong = np.flatnonzero(uneven | negative | (trace < 0))
     if len(wrong):
         got = found[wrong[0]].tolist()

@@ -25,7 +25,7 @@ MIN_CONTRAST = 7
 MIN_SPOT_PIXELS = 9
 """A spot has at least this many pixels."""
 
-MIN_SPECK, LARGEST_SPECK = 3, 24
+MIN_SPECK_PIXELS, MAX_SPECK_PIXELS = 3, 24
 """Areas in pixels: a dot below the first is noise; one up to the second is called small."""
 
 MAX_PART_OF_IMAGE = 1 / 16
@@ -78,7 +78,7 @@ class Pieces(NamedTuple):
     def specks(self) -> Spots:
         """Return the pieces that may be dots that cover only a few pixels."""
         _, _, wide, high, areas = self.boxes.T
-        chosen = (areas >= MIN_SPECK) & (areas <= LARGEST_SPECK)
+        chosen = (areas >= MIN_SPECK_PIXELS) & (areas <= MAX_SPECK_PIXELS)
         chosen &= (wide <= MAX_ASPECT_RATIO / 2 * high) & (high <= MAX_ASPECT_RATIO / 2 * wide)
         chosen[0] = False
         return self._some(np.flatnonzero(chosen))

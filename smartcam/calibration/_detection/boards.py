@@ -48,20 +48,20 @@ MIN_FITTED_SHARE = 0.6
 MIN_FILLED_SHARE = 0.5
 """An outermost row or column is left out where fewer than this part of its corners are seen."""
 
-ASIDE = 0.25
+MAX_OFFSET_STEPS = 0.25
 """A fitted corner may lie this part of a step, from one corner to the next, off its predicted
 place."""
 
 MIN_SQUARE_PIXELS = 9.0
 """A corner is fitted only where a square has a larger area than this in the image, pixels^2."""
 
-MAX_REACH = 8.0
+MAX_REACH_PX = 8.0
 """At most this many pixels around a corner are fitted: enough to see whether there is a corner."""
 
 MAX_CORNERS_JUDGED = 24
 """At most this many corners of a candidate are checked to decide whether it is a board."""
 
-WITHIN_SQUARES = np.array(
+PLACES_IN_SQUARES = np.array(
     [
         (side * x, up * y)
         for side, up in ((1, 1), (-1, -1), (1, -1), (-1, 1))
@@ -211,11 +211,11 @@ def _fitted(image: GreyImage, board: Board, places: NDArray[np.intp]) -> tuple[A
     inside[inside] = like_corners(image, points[inside], ways[inside])
     if inside.any():
         lengths = np.linalg.norm(ways[inside], axis=2)
-        part = np.minimum(FITTED_SHARE, MAX_REACH / lengths.max(axis=1))[:, None, None]
+        part = np.minimum(FITTED_SHARE, MAX_REACH_PX / lengths.max(axis=1))[:, None, None]
         corners = refine_corners(image, points[inside], part * ways[inside])
         aside = np.linalg.norm(corners.points - points[inside], axis=1)
         step = lengths.min(axis=1)
-        good = corners.fitted & (aside < ASIDE * step)
+        good = corners.fitted & (aside < MAX_OFFSET_STEPS * step)
         points[inside] = corners.points
         signs[inside] = np.sign(corners.gains) * good
     return points, signs
@@ -230,7 +230,7 @@ def like_corners(image: GreyImage, points: Array, ways: Array) -> NDArray[np.boo
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
     cv2 = load("cv2")
-    at = points[:, None] + np.einsum("pk,nki->npi", WITHIN_SQUARES, ways)
+    at = points[:, None] + np.einsum("pk,nki->npi", PLACES_IN_SQUARES, ways)
     levels = cv2.remap(
         image.levels, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

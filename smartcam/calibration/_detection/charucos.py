@@ -11,7 +11,7 @@ import numpy as np
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
 from smartcam.calibration._detection.markers import (
     Markers,
     agreeing,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 MIN_CORNERS = 4
 """At least this many corners determine a pose."""
 
-LARGEST_DOUBLED = 2600
+MAX_DOUBLED_PX = 2600
 """An image whose longest side is at most this many pixels is also searched at twice its size."""
 
 MIN_QUADRANGLES = 5
@@ -174,13 +174,13 @@ def _detect(image: GreyImage, target: Charuco) -> _Sighting:
     may be markers that were too small to be read.
     """
     best = _Sighting(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), 0, 0, 0, 0, (), 0.0)
-    times = math.ceil(max(image.size) / USUAL_SIZE)
+    times = math.ceil(max(image.size) / USUAL_SIDE_PX)
     if times > 1:
         best = _look(reduced(image.bytes, times), 1 / times, target, best)
         if _is_all(best, target, image):
             return best
     best = _look(image.bytes, 1.0, target, best)
-    few = max(image.size) <= LARGEST_DOUBLED and 2 * len(best.ids) <= len(target.points)
+    few = max(image.size) <= MAX_DOUBLED_PX and 2 * len(best.ids) <= len(target.points)
     if few and (
         best.markers or 0 < best.side < MAX_UNREAD_MODULE_PIXELS * _modules(charuco_board(target))
     ):

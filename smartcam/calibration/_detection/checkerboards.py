@@ -16,7 +16,7 @@ from smartcam.calibration._detection.boards import (
     like_corners,
     parity,
 )
-from smartcam.calibration._detection.corners import UNREFINED, Corners, refine_corners
+from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, Corners, refine_corners
 from smartcam.calibration._detection.dots import GridMap
 from smartcam.calibration._detection.ordering import (
     MIN_ORIGIN_CONTRAST,
@@ -27,7 +27,7 @@ from smartcam.calibration._detection.ordering import (
 )
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import apply_homography, fit_homography
-from smartcam.calibration._targets import AREA_DIAMETER, AREA_DISTANCE
+from smartcam.calibration._targets import AREA_DIAMETER_SQUARES, AREA_DISTANCE_SQUARES
 from smartcam.calibration._views import TargetView
 from smartcam.geometry import Code
 
@@ -183,7 +183,7 @@ def _refined(image: GreyImage, found: _BoardCorners, steps: Array) -> Corners:
     some &= inside
     if some.all():
         return refine_corners(image, points, FITTED_SHARE * steps)
-    covariance = np.tile(UNREFINED**2 * np.eye(2), (len(points), 1, 1))
+    covariance = np.tile(UNREFINED_SIGMA_PX**2 * np.eye(2), (len(points), 1, 1))
     corners = Corners(points.copy(), covariance, np.zeros(len(points)), np.zeros_like(some))
     if some.any():
         found_there = refine_corners(image, points[some], FITTED_SHARE * steps[some])
@@ -315,7 +315,7 @@ def _margin_levels(image: GreyImage, grid: Array) -> Iterator[float]:
     Places outside of the image have the level 0.
     """
     rows, columns, _ = grid.shape
-    low = -(1 + AREA_DISTANCE)
+    low = -(1 + AREA_DISTANCE_SQUARES)
     around = DOT_RING_SIDES * np.column_stack([np.cos(RING_ANGLES), np.sin(RING_ANGLES)]) + low
     along = (
         [(at + 0.5, low) for at in range(columns - 1)],
@@ -340,7 +340,9 @@ class _Shades(NamedTuple):
 def _shades(image: GreyImage, target: Checkerboard, corners: Corners, way: Arrangement) -> _Shades:
     grid = corners.points[way.order]
     squares = sorted(mean_level(image, _near(grid, at + FITTED_SHARE * DISC)) for at in SQUARES)
-    area = target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER / 2 * DISC
+    area = (
+        target.corner_areas[0] / target.square + OUTER_AREA_RATIO * AREA_DIAMETER_SQUARES / 2 * DISC
+    )
     seen = _near(grid, area)
     inside = ((seen >= 0) & (seen <= np.array(image.size) - 1)).all()
     level = mean_level(image, seen) if inside else None

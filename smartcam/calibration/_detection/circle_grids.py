@@ -16,7 +16,7 @@ import numpy as np
 from smartcam.calibration._detection.blobs import dark_pieces
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.grid_growing import alike_areas, lattices
-from smartcam.calibration._detection.image import USUAL_SIZE, GreyImage, reduced, scaled
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, GreyImage, reduced, scaled
 from smartcam.calibration._detection.ordering import arrangements, leftmost, marked
 from smartcam.calibration._detection.sampling import mean_level
 from smartcam.calibration._homography import local_steps
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from smartcam.exceptions import CalibrationError
     from smartcam.geometry._inside import Array
 
-WIDE, NARROW = 1.0, 0.3
+WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO = 1.0, 0.3
 """Side of the square whose mean a pixel is compared with, in distances between dots of a grid that
 fills the image: a wide and a narrow square."""
 
@@ -50,7 +50,7 @@ can be separated in the given one."""
 NEIGHBOURS = 8
 """Dots of a few pixels: the next dots of a grid are looked for among this many neighbours."""
 
-MORE_SPOTS = 1000
+EXTRA_SPOTS = 1000
 """Spots examined beyond twice the number of the target's dots; in an image with more, the
 largest."""
 
@@ -60,7 +60,9 @@ MIN_DOTS_REPORTED = 9
 MAX_OFFSET_RATIO = 0.15
 """A dot may lie this part of the distance between dots off the place that the others predict."""
 
-RING = np.column_stack([np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)])
+RING_DIRECTIONS = np.column_stack(
+    [np.cos(np.arange(16) * np.pi / 8), np.sin(np.arange(16) * np.pi / 8)]
+)
 """(16, 2), points of the unit circle."""
 
 
@@ -109,21 +111,21 @@ def _looks(image: NDArray[np.uint8], target: CircleGrid) -> Iterator[tuple[bool,
     may have dots of a few pixels.
     """
     longest = max(image.shape)
-    times, usual = math.ceil(longest / SMALL_SIDE_PX), min(1.0, USUAL_SIZE / longest)
-    most = MORE_SPOTS + 2 * len(target.points)
+    times, usual = math.ceil(longest / SMALL_SIDE_PX), min(1.0, USUAL_SIDE_PX / longest)
+    most = EXTRA_SPOTS + 2 * len(target.points)
     if times > 1:
         small = reduced(image, times)
         for light in (False, True):
-            yield light, 1 / times, _pieces(small, light, WIDE, target).spots(most)
+            yield light, 1 / times, _pieces(small, light, WIDE_WINDOW_RATIO, target).spots(most)
     looked_at = scaled(image, usual)
     fine = []
-    for part, light in itertools.product((WIDE, NARROW), (False, True)):
+    for part, light in itertools.product((WIDE_WINDOW_RATIO, NARROW_WINDOW_RATIO), (False, True)):
         pieces = _pieces(looked_at, light, part, target)
         yield light, usual, pieces.spots(most)
-        if part == NARROW and _may_be_dots(pieces.specks(), target):
+        if part == NARROW_WINDOW_RATIO and _may_be_dots(pieces.specks(), target):
             fine.append(light)
     for light in fine:
-        pieces = _pieces(scaled(image, 2 * usual), light, NARROW, target)
+        pieces = _pieces(scaled(image, 2 * usual), light, NARROW_WINDOW_RATIO, target)
         yield light, 2 * usual, pieces.spots(most)
 
 
@@ -200,7 +202,7 @@ def _contrast(image: GreyImage, target: CircleGrid, mapped: GridMap) -> tuple[fl
     flat = target.points[:, None, :2]
     gap = (_apart(target) + target.diameter) / 4
     inside, outside = (
-        mean_level(image, mapped((flat + radius * RING).reshape(-1, 2)))
+        mean_level(image, mapped((flat + radius * RING_DIRECTIONS).reshape(-1, 2)))
         for radius in (target.diameter / 4, gap)
     )
     return inside, outside
@@ -218,12 +220,12 @@ def _next_to(target: CircleGrid) -> Array:
 
 def _levels(image: GreyImage, mapped: GridMap, flat: Array, radius: float) -> Array:
     """Return grey levels (N, 16) on circles around places; NaN outside of the image."""
-    u, v = mapped((flat[:, None] + radius * RING).reshape(-1, 2)).T
+    u, v = mapped((flat[:, None] + radius * RING_DIRECTIONS).reshape(-1, 2)).T
     width, height = image.size
     inside = (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
     column, row = (np.rint(np.where(inside, one, 0)).astype(np.intp) for one in (u, v))
     levels = np.where(inside, image.levels[row, column], np.nan)
-    return levels.reshape(len(flat), len(RING))
+    return levels.reshape(len(flat), len(RING_DIRECTIONS))
 
 
 def _view(
@@ -272,8 +274,8 @@ def _number(
     if target.origin_diameter is None:
         return leftmost(ways, what), None
     flat = target.points[:, :2]
-    rim = RING * (target.diameter + target.origin_diameter) / 4
-    between = target.spacing * (RING / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
+    rim = RING_DIRECTIONS * (target.diameter + target.origin_diameter) / 4
+    between = target.spacing * (RING_DIRECTIONS / 16 + (0.5, 0.0 if target.asymmetric else 0.5))
     seen = {}
     for way in ways:
         mapped = GridMap(flat, found[way.order.ravel()])

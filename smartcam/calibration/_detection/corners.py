@@ -32,17 +32,17 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.pixels import Windows
     from smartcam.geometry._inside import Array
 
-MAX_REACH = 13
+MAX_REACH_PX = 13
 """At most this many pixels to each side of a corner are fitted: more of the edges adds little and
 takes time."""
 
-WORST_RESIDUAL = 0.35
+MAX_RESIDUAL_RATIO = 0.35
 """Largest RMS of a good fit's residuals, as a part of the gain; where there is no edge it is 1."""
 
 MIN_SINE = 0.17
 """The two edges of a corner must cross at an angle whose sine is larger than this: 10 degrees."""
 
-UNREFINED = 0.25
+UNREFINED_SIGMA_PX = 0.25
 """Standard deviation, pixels, of a corner that could not be refined: that of common detectors."""
 
 ROUNDED_PX = 2.0
@@ -86,12 +86,12 @@ def refine_corners(
     """
     reach = np.linalg.norm(ways, axis=2).min(axis=1)
     start = _start(image, points, reach if clear is None else reach * clear.min(axis=1))
-    windows = cut_windows(image, start, ways, MAX_REACH, round_=False, clear=clear)
+    windows = cut_windows(image, start, ways, MAX_REACH_PX, round_=False, clear=clear)
     if single:
         windows = windows.without(start, ROUNDED_PX)
     guess = _guess(start - windows.middle, ways)
     evaluate = partial(_evaluate, alone=1.0 if single else 0.0)
-    fits, good = refined(evaluate, windows, guess, moving=(0, 2), worst=WORST_RESIDUAL)
+    fits, good = refined(evaluate, windows, guess, moving=(0, 2), worst=MAX_RESIDUAL_RATIO)
     corners, covariance, crossing = _crossings(fits, windows)
     corners += windows.middle
     moved = np.linalg.norm(corners - start, axis=1)
@@ -99,7 +99,7 @@ def refine_corners(
     if single:
         good &= reach > 1.5 * ROUNDED_PX
     start[good] = corners[good]
-    covariance[~good] = UNREFINED**2 * np.eye(2)
+    covariance[~good] = UNREFINED_SIGMA_PX**2 * np.eye(2)
     return Corners(start, covariance, fits.values[:, GAIN], good)
 
 

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.pixels import Windows
     from smartcam.geometry._inside import Array
 
-MAX_REACH = 20
+MAX_REACH_PX = 20
 """A dot's window reaches at most this many pixels to each side; a larger dot is fitted in a reduced
 image."""
 
-WORST_RESIDUAL = 0.5
+MAX_RESIDUAL_RATIO = 0.5
 """Largest RMS of a good fit's residuals, as a part of the gain; where there is no dot it is 1."""
 
-UNREFINED = 0.5
+UNREFINED_SIGMA_PX = 0.5
 """Standard deviation, pixels, of a dot that could not be refined: that of common detectors."""
 
 MIDDLE, SHAPE = slice(0, 2), slice(2, 5)
@@ -120,12 +120,12 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     visible; all in pixels.
     """
     longest = float(np.hypot(reaches[:, 0], reaches[:, 1]).max())
-    if longest > MAX_REACH:
-        return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MAX_REACH))
-    windows = cut_windows(image, points, reaches, MAX_REACH, round_=True)
+    if longest > MAX_REACH_PX:
+        return _refine_smaller(image, points, radii, reaches, math.ceil(longest / MAX_REACH_PX))
+    windows = cut_windows(image, points, reaches, MAX_REACH_PX, round_=True)
     near = points - windows.middle
     guess = _guess(near, radii)
-    fits, good = refined(_evaluate, windows, guess, moving=(0, 1), worst=WORST_RESIDUAL)
+    fits, good = refined(_evaluate, windows, guess, moving=(0, 1), worst=MAX_RESIDUAL_RATIO)
     a, b, d = fits.values[:, SHAPE].T
     inverse_area = a * d - b * b  # the area is pi / det S
     moved = np.linalg.norm(fits.values[:, MIDDLE] - near, axis=1)
@@ -133,7 +133,7 @@ def refine_dots(image: GreyImage, points: Array, radii: Array, reaches: Array) -
     good &= (inverse_area > 0) & (moved < np.maximum(smallest, 1.0)) & (fits.values[:, GAIN] > 0)
     middles = np.where(good[:, None], fits.values[:, MIDDLE] + windows.middle, points)
     covariance = covariances(fits, windows.counts)[:, MIDDLE, MIDDLE].copy()
-    covariance[~good] = UNREFINED**2 * np.eye(2)
+    covariance[~good] = UNREFINED_SIGMA_PX**2 * np.eye(2)
     expected = np.pi * np.abs(np.linalg.det(radii))
     areas = np.where(good, np.pi / np.where(good, inverse_area, 1.0), expected)
     return Dots(middles, covariance, areas, good)

@@ -35,7 +35,7 @@ MIN_SINE = 0.5
 """The steps to a grid's next column and next row must enclose an angle whose sine is larger than
 this: 30 degrees. The two shortest steps of a lattice enclose 60 degrees or more."""
 
-NEAR, NEAR_FIRST = 0.3, 0.2
+MAX_STEP_OFFSET, MAX_FIRST_STEP_OFFSET = 0.3, 0.2
 """A dot is the grid's next one if it lies within the first part of a step from the place that the
 step leads to; within two steps of the first dot, where steps change less, within the second
 part."""
@@ -43,7 +43,7 @@ part."""
 MAX_AREA_RATIO = 1.8
 """A dot has at most this many times the area of its neighbour."""
 
-MAX_MEDIAN_OFF = 0.08
+MAX_MEDIAN_OFFSET = 0.08
 """The dots of a flat grid lie off their places by a median of less than this part of a step: lenses
 bend a grid of fewer than 20 dots by less."""
 
@@ -169,7 +169,7 @@ class _Grown:
             if waves == 2 and len(places) < MIN_DOTS_REACHED:
                 break
             waves += 1
-            around = self._around(reached, NEAR_FIRST if waves < 2 else NEAR)
+            around = self._around(reached, MAX_FIRST_STEP_OFFSET if waves < 2 else MAX_STEP_OFFSET)
             wave, reached = reached, []
             for (here, dot, steps, like), sides in zip(wave, around, strict=True):
                 for side, fits in enumerate(sides):
@@ -203,7 +203,9 @@ class _Grown:
                 if (x + column, y + row) not in places
             }
             at = np.array(list(next_to), dtype=np.float64)
-            longest = NEAR * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(axis=1)
+            longest = MAX_STEP_OFFSET * np.linalg.norm(local_steps(mapped, at, 1.0), axis=2).min(
+                axis=1
+            )
             off, near = self._tree.query(mapped(at))
             fits = (off < longest) & self._follows(near, np.array(list(next_to.values())))
             for place, dot, fit in zip(next_to, near.tolist(), fits.tolist(), strict=True):
@@ -258,4 +260,4 @@ def _is_regular(points: Array, grid: Lattice) -> bool:
     seen = GridMap(places, found)
     off = np.linalg.norm(seen(places) - found, axis=1)
     steps = np.linalg.norm(local_steps(seen, places, 1.0), axis=2).min(axis=1)
-    return bool(np.median(off / steps) < MAX_MEDIAN_OFF)
+    return bool(np.median(off / steps) < MAX_MEDIAN_OFFSET)

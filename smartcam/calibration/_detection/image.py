@@ -12,13 +12,13 @@ from smartcam.geometry import Code
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-MIN_SIDE = 16
+MIN_SIDE_PX = 16
 """An image has at least this width and height, pixels."""
 
-MAX_SIDE = 20_000
+MAX_SIDE_PX = 20_000
 """An image has at most this width and height, pixels."""
 
-USUAL_SIZE = 1600
+USUAL_SIDE_PX = 1600
 """OpenCV looks for a grid first in an image whose longest side has this many pixels: in a larger
 one it takes seconds and finds less.
 """
@@ -65,12 +65,12 @@ def grey_image(image: Any) -> GreyImage:
         isinstance(image, np.ndarray)
         and fits
         and kind in (np.uint8, np.uint16)
-        and all(MIN_SIDE <= side <= MAX_SIDE for side in shape[:2])
+        and all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in shape[:2])
     ):
         what = f"{kind} of shape {shape}" if kind is not None else type(image).__name__
         raise Code.SHAPE.unexpected(
             "image: expected an array of uint8 or uint16, (H, W) or (H, W, 3), "
-            f"{MIN_SIDE} to {MAX_SIDE} pixels wide and high",
+            f"{MIN_SIDE_PX} to {MAX_SIDE_PX} pixels wide and high",
             "uint8 or uint16, (H, W) or (H, W, 3)",
             what,
         )

@@ -41,7 +41,7 @@ MAX_STEPS = 20
 MAX_LAST_MOVE_PX = 1e-3
 """A fit has come to rest when its last step moves the point by at most this many pixels."""
 
-RIDGE = 1e-6
+DIAGONAL_OFFSET = 1e-6
 """Added to the diagonal, so that a value which no pixel determines stays finite."""
 
 
@@ -96,7 +96,7 @@ def refined(
     values[:, BLUR], values[:, GAIN:] = 1.0, 0.0
     # The model is linear in gain and offset, so one solution of their normal equations is the best.
     flat = evaluate(windows, values)
-    linear = flat.hessian[:, GAIN:, GAIN:] + RIDGE * np.eye(2)
+    linear = flat.hessian[:, GAIN:, GAIN:] + DIAGONAL_OFFSET * np.eye(2)
     values[:, GAIN:] = np.linalg.solve(linear, flat.gradient[:, GAIN:, None])[:, :, 0]
     fits, settled = _solve(evaluate, windows, values, moving)
     blur, gain = fits.values[:, BLUR], np.abs(fits.values[:, GAIN])
@@ -121,7 +121,7 @@ def _solve(
         # (J^T J + damping diag(J^T J)) step = J^T r, each point with a damping of its own.
         # Source: Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters
         # (1963).
-        diagonal = np.einsum("nii->ni", hessian) * damping[active, None] + RIDGE
+        diagonal = np.einsum("nii->ni", hessian) * damping[active, None] + DIAGONAL_OFFSET
         damped = hessian + diagonal[:, :, None] * identity
         step = np.linalg.solve(damped, best.gradient[active, :, None])[:, :, 0]
         trial = best.values[active] + step
@@ -146,6 +146,6 @@ def covariances(fits: Fits, counts: Array) -> Array:
     # s^2 (J^T J)^-1 with s^2 = sum r^2 / (pixels - M)
     size = fits.values.shape[1]
     variance = fits.cost / np.maximum(counts - size, 1)
-    inverse = np.linalg.inv(fits.hessian + RIDGE * np.eye(size))
+    inverse = np.linalg.inv(fits.hessian + DIAGONAL_OFFSET * np.eye(size))
     covariance: Array = inverse * variance[:, None, None]
     return covariance

@@ -10,9 +10,9 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.calibration._detection.corners import refine_corners
-from smartcam.calibration._detection.image import USUAL_SIZE, reduced, scaled
+from smartcam.calibration._detection.image import USUAL_SIDE_PX, reduced, scaled
 from smartcam.calibration._detection.markers import (
-    MIN_AGREEING,
+    MIN_AGREEING_MARKERS,
     Markers,
     agreeing,
     check_one_board,
@@ -52,7 +52,7 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
     board = target.points[target.corners, :2]
     best, strays, read = Markers(np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)), (), 0
     against = 0
-    times = math.ceil(max(image.size) / USUAL_SIZE)
+    times = math.ceil(max(image.size) / USUAL_SIDE_PX)
     for scale in dict.fromkeys((1 / times, 1.0, 2.0)):
         few = len(best.ids) < len(board) / 2
         if len(best.ids) == len(board) or (
@@ -67,11 +67,11 @@ def find_marker_grid(image: GreyImage, target: MarkerGrid, name: str = "") -> Ta
             best = found.some(good)
             strays = tuple(sorted((found.ids[~good] + target.first_id).tolist()))
     check_one_board(len(best.ids), against, what)
-    if len(best.ids) < MIN_AGREEING:
+    if len(best.ids) < MIN_AGREEING_MARKERS:
         raise Code.TARGET_NOT_FOUND.refusal(
-            f"{what}: expected at least {MIN_AGREEING} that stand to each other as on the board, "
-            f"found {len(best.ids)} of {read} markers of its dictionary",
-            MIN_AGREEING,
+            f"{what}: expected at least {MIN_AGREEING_MARKERS} that stand to each other as "
+            f"on the board, found {len(best.ids)} of {read} markers of its dictionary",
+            MIN_AGREEING_MARKERS,
             len(best.ids),
         )
     numbers = target.corners[best.ids].ravel()

@@ -27,11 +27,11 @@ MAX_NEIGHBOUR_PITCHES = 2.9
 """Two markers are compared if they are at most this far apart on the board, in distances of next
 neighbours."""
 
-MAX_ASIDE = 0.15
+MAX_VECTOR_DIFFERENCE = 0.15
 """The vector between two markers may differ from the board's by this part of its length. A number
 that is wrong by one moves a marker by a third of the longest such vector or more."""
 
-MAX_TURNED = 0.5
+MAX_SLOPE_DIFFERENCE = 0.5
 """The turns and scales of two neighbouring markers may differ by this part."""
 
 MAX_PITCHES_OFF = 0.35
@@ -40,23 +40,23 @@ the others predict."""
 
 MIN_PITCHES_AGAINST = 0.6
 """A group of markers contradicts the board's description if it lies at least this many distances of
-next neighbours, plus MAX_ASIDE times its distance from the others, off the place that they
-predict."""
+next neighbours, plus MAX_VECTOR_DIFFERENCE times its distance from the others, off the place that
+they predict."""
 
-MIN_CONTRARY = 3
+MIN_CONTRARY_MARKERS = 3
 """A group that contradicts the description of the target has at least this many markers."""
 
-MAX_NAMED = 8
+MAX_NUMBERS_IN_MESSAGE = 8
 """At most this many marker numbers stand in one message."""
 
-MIN_AGREEING = 2
+MIN_AGREEING_MARKERS = 2
 """At least this many markers must agree: one alone rests on a single reading."""
 
 
 WINDOWS_PX = (3, 13, 23)
 """Sides of the windows, pixels, whose mean separates dark from light: OpenCV's."""
 
-MANY_OUTLINES, MAX_OUTLINES = 1500, 4000
+MAX_OUTLINES_OF_ALL_WINDOWS, MAX_OUTLINES = 1500, 4000
 """Dark outlines of an image, as the mean over the windows: with more than the first number a single
 window is used, and of that at most the second number is examined. A board of 1,000 markers, the
 most that a dictionary has, shows some 3,000."""
@@ -112,7 +112,7 @@ def marker_finder(bytes_: NDArray[np.uint8], dictionary: Any, parameters: Any = 
     cv2 = load("cv2")
     given = cv2.aruco.DetectorParameters() if parameters is None else parameters
     lengths = {window: _outlines(bytes_, window, given) for window in WINDOWS_PX}
-    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MANY_OUTLINES:
+    if sum(map(len, lengths.values())) > len(WINDOWS_PX) * MAX_OUTLINES_OF_ALL_WINDOWS:
         window = sorted(WINDOWS_PX, key=lambda one: len(lengths[one]))[len(WINDOWS_PX) // 2]
         given.adaptiveThreshWinSizeMin = given.adaptiveThreshWinSizeMax = window
         longest = np.sort(lengths[window])[::-1]
@@ -140,11 +140,11 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     """Compare markers with a board; count each number once.
 
     ``board`` (M, 4, 2): the corners of the markers by their numbers, in any unit. If fewer than
-    MIN_AGREEING markers agree, the result has none.
+    MIN_AGREEING_MARKERS markers agree, the result has none.
     """
     good = np.zeros(len(markers.ids), dtype=np.bool_)
     known = np.flatnonzero((markers.ids >= 0) & (markers.ids < len(board)))
-    if len(known) < MIN_AGREEING:
+    if len(known) < MIN_AGREEING_MARKERS:
         return MarkerAgreement(good, 0)
     ids, quads = markers.ids[known], markers.quads[known]
     flat = board[ids]
@@ -153,7 +153,7 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     groups = _hanging_together(_agreements(slopes, seen, mapped, MAX_NEIGHBOUR_PITCHES * pitch))
     largest = groups == np.bincount(groups).argmax()
     matrix = fit_homography(flat[largest].reshape(-1, 2), quads[largest].reshape(-1, 2))
-    if largest.sum() < MIN_AGREEING or matrix is None:
+    if largest.sum() < MIN_AGREEING_MARKERS or matrix is None:
         return MarkerAgreement(good, 0)
     off = np.linalg.norm(apply_homography(matrix, mapped) - seen, axis=1)
     off /= pitch * np.sqrt(np.abs(np.linalg.det(slopes)))
@@ -161,7 +161,7 @@ def agreeing(markers: Markers, board: Array) -> MarkerAgreement:
     upright = _alike(slopes, derivatives(matrix, mapped))
     joined = largest | ((off < MAX_PITCHES_OFF) & upright & ~np.isin(ids, ids[largest]))
     good[known[joined]] = True
-    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_ASIDE * away)
+    contrary = ~joined & (off > MIN_PITCHES_AGAINST + MAX_VECTOR_DIFFERENCE * away)
     return MarkerAgreement(good, int(np.bincount(groups[contrary], minlength=1).max()))
 
 
@@ -171,7 +171,7 @@ def check_one_board(agreed: int, contrary: int, what: str) -> None:
     ``agreed`` markers are arranged as on the board; ``contrary`` others agree with each other, but
     not with these. ``what`` names the target.
     """
-    if contrary >= MIN_CONTRARY and 2 * contrary >= agreed:
+    if contrary >= MIN_CONTRARY_MARKERS and 2 * contrary >= agreed:
         raise Code.WRONG_TARGET.refusal(
             f"{what}: expected markers of one such board, got {agreed} that stand to each other as "
             f"on it and {contrary} others that do so elsewhere: columns and rows are others, or "
@@ -202,7 +202,9 @@ def strays_told(numbers: Sequence[int]) -> tuple[Remark, ...]:
     """Return the remark that names the markers left out; nothing if none were."""
     if not numbers:
         return ()
-    shown = ", ".join(map(str, numbers[:MAX_NAMED])) + (", ..." if numbers[MAX_NAMED:] else "")
+    shown = ", ".join(map(str, numbers[:MAX_NUMBERS_IN_MESSAGE])) + (
+        ", ..." if numbers[MAX_NUMBERS_IN_MESSAGE:] else ""
+    )
     text = f"markers left out, which do not stand where the board has them: {shown}"
     return (Code.OUTLIER.remark(text),)
 
@@ -233,7 +235,7 @@ def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDAr
     return np.asarray(
         (apart > 0)
         & (apart <= reach)
-        & (off < MAX_ASIDE * np.linalg.norm(expected, axis=2))
+        & (off < MAX_VECTOR_DIFFERENCE * np.linalg.norm(expected, axis=2))
         & _alike(slopes[:, None], slopes[None])
     )
 
@@ -241,7 +243,9 @@ def _agreements(slopes: Array, seen: Array, mapped: Array, reach: float) -> NDAr
 def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
     """Return True for each pair of slopes (..., 2, 2) with about the same turn and scale."""
     differ = np.linalg.norm(one - other, axis=(-2, -1))
-    return np.asarray(differ < MAX_TURNED * np.linalg.norm((one + other) / 2, axis=(-2, -1)))
+    return np.asarray(
+        differ < MAX_SLOPE_DIFFERENCE * np.linalg.norm((one + other) / 2, axis=(-2, -1))
+    )
 
 
 def _hanging_together(agreed: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -18,7 +18,7 @@ CUBIC: Final = 0.0997927
 """``erf(x)`` is approximated by ``tanh(x * (LINEAR + CUBIC * x^2))``: the error is at most 0.0003,
 far below one grey level, and it takes a tenth of the time. Both values were fitted."""
 
-MIN_REACH = 3
+MIN_REACH_PX = 3
 """A window reaches at least this many pixels to each side."""
 
 
@@ -69,7 +69,7 @@ def cut_windows(
     half widths are these parts of the ways; None counts all of it.
     """
     reach = np.hypot(ways[:, 0], ways[:, 1]) if round_ else np.abs(ways).sum(axis=1)
-    half = int(np.clip(np.ceil(reach.max()), MIN_REACH, most))
+    half = int(np.clip(np.ceil(reach.max()), MIN_REACH_PX, most))
     span = np.arange(-half, half + 1)
     y, x = (side.ravel() for side in np.meshgrid(span, span, indexing="ij"))
     middle = np.rint(points).astype(np.intp)
@@ -82,7 +82,7 @@ def cut_windows(
     within = (parts**2).sum(axis=1) <= 1 if round_ else (np.abs(parts) <= 1).all(axis=1)
     if clear is not None:
         within &= (np.abs(parts) <= clear[:, :, None]).any(axis=1)
-    near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH
+    near = np.maximum(np.abs(x), np.abs(y)) < MIN_REACH_PX
     weights = (inside & (within | near)).astype(np.float32)
     return Windows(middle, x.astype(np.float32), y.astype(np.float32), levels * weights, weights)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._detection.pixels import Floats
     from smartcam.geometry._inside import Array
 
-SMOOTHED = 1.0
+SMOOTHING_PX = 1.0
 """The image is smoothed by a Gaussian of this standard deviation, pixels, before its second
 derivatives are taken."""
 
@@ -29,7 +29,7 @@ MIN_CURVATURE = 0.3
 """The bend of a saddle, ``f_xy^2 - f_xx f_yy`` in grey levels of 255 and pixels, must be larger
 than this; a sharp corner with a step of 15 grey levels has 1."""
 
-RADIUS = 3.0
+CIRCLE_RADIUS_PX = 3.0
 """Radius, pixels, of the circle around a saddle whose grey levels are tested; it fits squares of
 seven pixels."""
 
@@ -48,7 +48,7 @@ MAX_SADDLES_EXAMINED = 1500
 bounded time."""
 
 _ANGLES = np.arange(16) * np.pi / 8
-_CIRCLE = RADIUS * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+_CIRCLE = CIRCLE_RADIUS_PX * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _TWICE = np.column_stack([np.cos(2 * _ANGLES), np.sin(2 * _ANGLES)]) / 16
 
 
@@ -68,7 +68,7 @@ class Saddles(NamedTuple):
 def find_saddles(image: NDArray[np.uint8]) -> Saddles:
     """Return the corners that an image (H, W) may show."""
     cv2 = load("cv2")
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHED)
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTHING_PX)
     xx, yy, xy = (
         cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=0.25)
         for order in ((2, 0), (0, 2), (1, 1))
@@ -76,7 +76,7 @@ def find_saddles(image: NDArray[np.uint8]) -> Saddles:
     bent = xy * xy - xx * yy
     highest = cv2.dilate(bent, np.ones((5, 5), np.uint8))
     peaks = (bent == highest) & (bent > MIN_CURVATURE)
-    rim = int(RADIUS) + 1
+    rim = int(CIRCLE_RADIUS_PX) + 1
     inside = peaks[rim:-rim, rim:-rim]
     v, u = np.divmod(np.flatnonzero(inside), inside.shape[1])
     at = np.column_stack([u, v]) + rim

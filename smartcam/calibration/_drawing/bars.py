@@ -17,10 +17,10 @@ WIDTH, HEIGHT = 900.0, 260.0
 LEFT, HEAD, FOOT, GAP = 70.0, 66.0, 40.0, 30.0
 """Pixels beside a chart, above it, below it, and on the right."""
 
-ADVANCE: Final = 7.5
+LETTER_WIDTH_PX: Final = 7.5
 """Approximate width of a letter, pixels."""
 
-CUT: Final = 3.0
+MAX_BAR_RATIO: Final = 3.0
 """Bars longer than this many times the longest bar of a used view are cut, and their value is
 written."""
 
@@ -107,7 +107,9 @@ def _largest(chart: Chart) -> float:
     ]
     every = [value for one in chart.series for value in one.values if math.isfinite(value)]
     most = max(used, default=0.0)
-    return max(most, min(max(every), CUT * most)) if most else max(every, default=1.0) or 1.0
+    return (
+        max(most, min(max(every), MAX_BAR_RATIO * most)) if most else max(every, default=1.0) or 1.0
+    )
 
 
 def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
@@ -117,7 +119,7 @@ def _bars(chart: Chart, foot: float, zoom: float) -> Iterator[str]:
     shorts = short_names(chart.names)
     longest = max((len(one) for one in shorts), default=1)
     # a name at each bar where there is room, else at each second, fifth, tenth, ...
-    needed = math.ceil(ADVANCE * (min(longest, 12) + 1) / room)
+    needed = math.ceil(LETTER_WIDTH_PX * (min(longest, 12) + 1) / room)
     each = next(n for n in (1, 2, 5, 10, 20, 50, 100, 10**9) if n >= needed)
     for number, (name, short) in enumerate(zip(chart.names, shorts, strict=True)):
         middle = LEFT + (number + 0.5) * room
@@ -152,4 +154,4 @@ def _legend(chart: Chart, y: float) -> Iterator[str]:
     for kind, said in entries:
         yield rectangle((x, y - 10), (12, 12), f'class="{kind}"')
         yield text((x + 18, y), said)
-        x += 18 + ADVANCE * len(said) + 20
+        x += 18 + LETTER_WIDTH_PX * len(said) + 20

@@ -35,13 +35,13 @@ shorter."""
 ARROW: Final = 0.12
 """Length of the axes of a frame, as a part of the scene's extent."""
 
-LETTER: Final = (7.5, 15.0)
+LETTER_PX: Final = (7.5, 15.0)
 """Approximate width and height of a letter, pixels."""
 
-BELOW: Final = np.array([0.0, 14.0])
+LABEL_OFFSET_PX: Final = np.array([0.0, 14.0])
 """Offset of a label from its thing, pixels."""
 
-OFFSETS: Final = [(0.0, 0.0)] + [
+LABEL_OFFSETS_PX: Final = [(0.0, 0.0)] + [
     (reach * math.cos(angle), 0.7 * reach * math.sin(angle))
     for reach in (18, 30, 44, 60, 80, 105)
     for angle in np.linspace(0.0, math.tau, 12, endpoint=False).tolist()
@@ -155,7 +155,7 @@ def draw_scene(scene: DrawnScene, title: str) -> str:
         for tip, axis in zip(sight.pixels(tips), "xyz", strict=True):
             parts.append(line(start, tip, "axis", ' stroke-width="1.5"'))
             items.append(_Drawn(0.0, "", axis, tip))
-        items.append(_Drawn(0.0, "", one.name, start + BELOW))
+        items.append(_Drawn(0.0, "", one.name, start + LABEL_OFFSET_PX))
     parts += _labels([(one.label, one.at) for one in items[::-1] if one.label])
     parts += _scale(sight)
     return document(WIDTH + 2 * BORDER, HEAD + HEIGHT + FOOT, parts)
@@ -174,7 +174,7 @@ def _camera(sight: _Outlook, camera: DrawnCamera, shape: Array) -> _Drawn:
     centre, *rim = sight.pixels(shape)
     sides = [line(centre, one, "camera") for one in rim]
     drawn = "".join([polygon(np.array(rim), "camera", camera.name), *sides])
-    return _Drawn(sight.depth(shape), drawn, camera.name, centre + BELOW)
+    return _Drawn(sight.depth(shape), drawn, camera.name, centre + LABEL_OFFSET_PX)
 
 
 def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
@@ -183,8 +183,8 @@ def _labels(wanted: Sequence[tuple[str, Array]]) -> Iterator[str]:
     low = np.array([BORDER / 2, HEAD - 10])
     high = np.array([BORDER * 1.5 + WIDTH, HEAD + HEIGHT + 10])
     for label, at in wanted:
-        wide, tall = LETTER[0] * len(label) + 6.0, LETTER[1]
-        for offset in OFFSETS:
+        wide, tall = LETTER_PX[0] * len(label) + 6.0, LETTER_PX[1]
+        for offset in LABEL_OFFSETS_PX:
             x, y = at + offset
             box = (x - wide / 2, y - tall / 2, x + wide / 2, y + tall / 2)
             outside = box[0] < low[0] or box[1] < low[1] or box[2] > high[0] or box[3] > high[1]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 NAME = r"[A-Za-z0-9](?:[A-Za-z0-9_-]*[A-Za-z0-9])?"
 """Pattern of a name: no dot, no slash, nothing that a file system gives a meaning to."""
 
-MAX_NAME = 64
+MAX_NAME_LENGTH = 64
 """A name has at most this many characters."""
 
 EXPORTS = "exports"
@@ -135,18 +135,18 @@ class Folder:
 
 def _is_name(text: str) -> bool:
     return bool(
-        len(text) <= MAX_NAME and re.fullmatch(NAME, text) and not _RESERVED.fullmatch(text)
+        len(text) <= MAX_NAME_LENGTH and re.fullmatch(NAME, text) and not _RESERVED.fullmatch(text)
     )
 
 
 def _checked(name: str) -> str:
     if not _is_name(name):
-        raise _bad(name, f"1 to {MAX_NAME} letters, digits, '-' and '_'")
+        raise _bad(name, f"1 to {MAX_NAME_LENGTH} letters, digits, '-' and '_'")
     return name
 
 
 def _bad(name: str, expected: str) -> CalibrationError:
-    shown = repr(name) if len(name) <= MAX_NAME else f"{name[:MAX_NAME]!r}..."
+    shown = repr(name) if len(name) <= MAX_NAME_LENGTH else f"{name[:MAX_NAME_LENGTH]!r}..."
     return Code.BAD_NAME.refusal(
         f"the name {shown} cannot be used: expected {expected}", expected, name
     )

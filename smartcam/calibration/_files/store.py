@@ -41,7 +41,7 @@ UNITS: Mapping[str, str] = {"length": "m", "angle": "rad", "time": "s"}
 BACKUPS = 3
 """Number of earlier versions of a file that are kept."""
 
-MAX_FILE = 1 << 24
+MAX_FILE_BYTES = 1 << 24
 """A file has at most this many bytes: a calibration of 10,000 touches needs a quarter of them."""
 
 MIGRATIONS: dict[int, Callable[[dict[str, Any]], dict[str, Any]]] = {}
@@ -106,9 +106,11 @@ def write(
         raise Code.NOT_STORABLE.refusal(
             f"{path}: cannot be stored: {exc}; expected finite numbers, texts, lists and mappings"
         ) from exc
-    if len(body) > MAX_FILE:
+    if len(body) > MAX_FILE_BYTES:
         raise Code.NOT_STORABLE.refusal(
-            f"{path}: {len(body)} bytes, expected {MAX_FILE} at most", MAX_FILE, len(body)
+            f"{path}: {len(body)} bytes, expected {MAX_FILE_BYTES} at most",
+            MAX_FILE_BYTES,
+            len(body),
         )
     replace_file(Path(path), body, backups=backups)
 
@@ -133,9 +135,9 @@ def read_document(path: StrPath) -> Document:
     Raises ``BROKEN_FILE``, ``NEWER_VERSION``; and OSError if the file cannot be read.
     """
     with Path(path).open("rb") as stream:
-        body = stream.read(MAX_FILE + 1)
-    if len(body) > MAX_FILE:
-        raise _broken(path, f"more than {MAX_FILE} bytes")
+        body = stream.read(MAX_FILE_BYTES + 1)
+    if len(body) > MAX_FILE_BYTES:
+        raise _broken(path, f"more than {MAX_FILE_BYTES} bytes")
     try:
         parsed: Any = json.loads(body)
     except (ValueError, RecursionError) as exc:

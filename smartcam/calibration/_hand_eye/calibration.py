@@ -78,24 +78,24 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.models import Pose
 
-AT_ONCE = 100
+POSES_PER_EXTRA_REMOVAL = 100
 """One bad pose, and one more for each of this many poses, is left out before the others are solved
 again."""
 
-ADVISED_POSES = 8
+MIN_ADVISED_POSES = 8
 """With fewer poses than this, the residuals say little about the error."""
 
-ADVISED_TURN = math.radians(8.0)
+MIN_ADVISED_TURN_RADIANS = math.radians(8.0)
 """Least RMS turn of the poses about the second of their axes without a remark; leaving out some of
 eight poses changes it by two or three degrees."""
 
 MAX_SCALE_ERROR = 0.2
 """A target's size may be off by this part unless the user gives another."""
 
-SCALE_OFF = 0.005
+REMARKED_SCALE_ERROR = 0.005
 """A target's size that differs from the nominal one by more than this part is remarked on."""
 
-SURE_SIGMAS = 5.0
+REMARKED_SCALE_SIGMAS = 5.0
 """A target's size is remarked on, if it is not adjusted, when it differs by this many standard
 deviations."""
 
@@ -103,7 +103,7 @@ BAD_POSE_RATIO = 4.0
 """A pose is bad if its held-out error is more than this many times the median: of normal errors
 along two axes, one in 60000 is."""
 
-EXACT_M = 1e-7
+ROUNDING_ERROR_M = 1e-7
 """Errors below this length, metres, may be rounding errors."""
 
 MAX_BAD_POSE_SHARE = 1 / 3
@@ -115,11 +115,11 @@ MIN_GOOD_POSES = 5
 MIN_POSES_FOR_ERROR = 5
 """The scatter of at least this many poses gives an expected error."""
 
-POOR = RobotSigmas(math.radians(0.25), 2e-3)
+POOR_ROBOT = RobotSigmas(math.radians(0.25), 2e-3)
 """Standard deviations of a robot that is worse than most, 0.25 degrees and 2 mm: a held-out error
 beyond what they cause is remarked on."""
 
-POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
+ASSUMED_POSE_SIGMAS = RobotSigmas(1e-3, 1e-3)
 """Standard deviations (rad, m) of target poses without a covariance: only their ratio counts."""
 
 
@@ -286,7 +286,7 @@ def calibrate_hand_eye_from_poses(
     transforms, order, robot = _robot(robot_poses, len(target_poses), "poses of the target", setup)
     seen = [target_poses[i] for i in order]
     poses = Rigid.stacked(one.rigid for one in seen)
-    scale = np.repeat(1.0 / np.array(POSE_SIGMAS), 3)
+    scale = np.repeat(1.0 / np.array(ASSUMED_POSE_SIGMAS), 3)
     white = np.broadcast_to(np.diag(scale), (len(order), 6, 6))
     problem = Problem(
         robot=robot,
@@ -411,10 +411,10 @@ def _without_bad(
     result = _solved(problem.taken(used), asked, robot_poses[0])
     while len(bad := _bad(result)) and asked.drop_bad:
         worst = sorted(bad, key=lambda index: -result.leave_one_out[index])
-        worst = worst[: 1 + len(used) // AT_ONCE]
+        worst = worst[: 1 + len(used) // POSES_PER_EXTRA_REMOVAL]
         fewer = np.delete(used, worst)
         most = MAX_BAD_POSE_SHARE * problem.count
-        if len(fewer) < ADVISED_POSES or problem.count - len(fewer) > most:
+        if len(fewer) < MIN_ADVISED_POSES or problem.count - len(fewer) > most:
             break
         try:
             check_motion(problem.robot.taken(fewer))
@@ -482,7 +482,7 @@ def _bad(result: HandEyeCalibration) -> list[int]:
         return []
     errors = result.leave_one_out
     bad: list[int] = np.flatnonzero(
-        errors > BAD_POSE_RATIO * max(float(np.median(errors)), EXACT_M)
+        errors > BAD_POSE_RATIO * max(float(np.median(errors)), ROUNDING_ERROR_M)
     ).tolist()
     return bad
 
@@ -590,7 +590,7 @@ def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
     if found is None or not others or None in others:
         return
     sigma = math.sqrt(float(jackknife(np.array(others, dtype=np.float64)[:, None])[0, 0]))
-    if abs(found - 1.0) > max(SCALE_OFF, SURE_SIGMAS * sigma):
+    if abs(found - 1.0) > max(REMARKED_SCALE_ERROR, REMARKED_SCALE_SIGMAS * sigma):
         yield Code.SCALE_MISMATCH.remark(
             f"expected the target as large as it was said, got {found:.4f} times that by the "
             "robot's motions, and the size was not to be adjusted: measure the print; or the "
@@ -599,33 +599,33 @@ def _size_remark(problem: Problem, asked: _Asked) -> Iterator[Remark]:
 
 
 def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
-    if abs(result.target_scale - 1.0) > SCALE_OFF:
+    if abs(result.target_scale - 1.0) > REMARKED_SCALE_ERROR:
         yield Code.SCALE_MISMATCH.remark(
             f"expected the target as large as it was said, got {result.target_scale:.4f} times "
             "that by the robot's motions: measure the print; poses and errors are those of a "
             "target of that size"
         )
-    if problem.count < ADVISED_POSES:
+    if problem.count < MIN_ADVISED_POSES:
         yield Code.TOO_FEW.remark(
-            f"expected {ADVISED_POSES} poses or more for an error that can be relied on, got "
+            f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
             f"{problem.count}"
         )
     # a remark that one pose more or less would change helps nobody
     turn = float(second_turns(problem.robot).max())
-    if turn < ADVISED_TURN:
+    if turn < MIN_ADVISED_TURN_RADIANS:
         yield Code.INSUFFICIENT_ROTATION.remark(
-            f"expected the robot to turn by {math.degrees(ADVISED_TURN):g} deg rms about a second "
-            f"axis, got {math.degrees(turn):.1f} deg, whichever pose is left out: tilt it more to "
-            "both sides"
+            f"expected the robot to turn by {math.degrees(MIN_ADVISED_TURN_RADIANS):g} deg rms "
+            f"about a second axis, got {math.degrees(turn):.1f} deg, whichever pose is left out: "
+            "tilt it more to both sides"
         )
     if result.held_out_error is None:
         yield Code.NOT_HELD_OUT.remark("too few poses to leave one out: no held-out error")
-    elif result.held_out_error > (most := expected_error(problem, POOR)):
+    elif result.held_out_error > (most := expected_error(problem, POOR_ROBOT)):
         yield Code.POOR_FIT.remark(
             f"expected a held-out error of {1e3 * most:.3g} mm at most, as of a robot that is "
-            f"{1e3 * POOR.translation:g} mm and {math.degrees(POOR.rotation):g} deg off, got "
-            f"{1e3 * result.held_out_error:.3g} mm: did the robot stand still, does the target or "
-            "the camera slip, is a pose one of another view?"
+            f"{1e3 * POOR_ROBOT.translation:g} mm and {math.degrees(POOR_ROBOT.rotation):g} deg "
+            f"off, got {1e3 * result.held_out_error:.3g} mm: did the robot stand still, does the "
+            "target or the camera slip, is a pose one of another view?"
         )
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MIN_POSES = 3
 """Least number of poses: two motions about different axes determine the camera."""
 
-SAME_TURN = math.radians(0.5)
+SAME_TURN_RADIANS = math.radians(0.5)
 """Poses that are turned by less than this against each other count as one."""
 
 MAX_POSES_PAIRED = 40
@@ -82,7 +82,7 @@ def check_motion(robot: RobotPoses) -> None:
             f"hand-eye: expected at least {MIN_POSES} poses with a view", MIN_POSES, len(turns)
         )
     against = log_rotation(np.swapaxes(turns, 1, 2)[:, None] @ turns[None])
-    apart = np.linalg.norm(against, axis=-1) > SAME_TURN
+    apart = np.linalg.norm(against, axis=-1) > SAME_TURN_RADIANS
     distinct: list[int] = []
     for index in range(len(turns)):
         if apart[index, distinct].all():
@@ -90,8 +90,8 @@ def check_motion(robot: RobotPoses) -> None:
     if len(distinct) < MIN_POSES:
         raise Code.POSES_TOO_SIMILAR.refusal(
             f"hand-eye: expected at least {MIN_POSES} orientations of the robot that are "
-            f"{math.degrees(SAME_TURN):g} deg apart or more, got {len(distinct)}: pure shifts do "
-            "not tell where the camera is",
+            f"{math.degrees(SAME_TURN_RADIANS):g} deg apart or more, got {len(distinct)}: pure "
+            "shifts do not tell where the camera is",
             MIN_POSES,
             len(distinct),
         )

@@ -57,7 +57,7 @@ FIRST_DAMPING = 1e-6
 """Part of the diagonal that is added at first: closed forms are so near that hardly any damping is
 needed."""
 
-ROUNDING = 100.0
+ROUNDING_COST = 100.0
 """Squared standard deviations that are added to the cost with which a gain is compared, for
 rounding errors."""
 
@@ -379,7 +379,7 @@ def adjust(
 
     The ``cost`` of the result is infinite if the target begins behind the camera. If ``noise`` is
     None, the robot's poses are exact. The fit ends when a step gains less than the part ``gain`` of
-    the cost plus ROUNDING, since exact samples leave only rounding errors to gain.
+    the cost plus ROUNDING_COST, since exact samples leave only rounding errors to gain.
     """
     spread = seen if noise is None else seen.spread(noise.shared)
     change = start.change if start.change.size else np.zeros(seen.extra)
@@ -389,7 +389,7 @@ def adjust(
         lambda at: _normal(robot, spread, at),
         _stepped,
         gain=gain,
-        noise=ROUNDING,
+        noise=ROUNDING_COST,
         damping=FIRST_DAMPING,
     )
     if not math.isfinite(normal.cost):

@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from smartcam.calibration._hand_eye.equations import Observations, RobotPoses, Solution
     from smartcam.geometry._inside import Array
 
-FIRST = RobotSigmas(1e-3, 5e-4)
+FIRST_SIGMAS = RobotSigmas(1e-3, 5e-4)
 """Noise of the robot that the first adjustment assumes: 0.06 degrees and half a millimetre."""
 
-LEAST = RobotSigmas(1e-7, 1e-8)
+MIN_SIGMAS = RobotSigmas(1e-7, 1e-8)
 """Least noise that is considered for a robot: a hundredth of a micrometre."""
 
-MOST = RobotSigmas(0.3, 0.1)
+MAX_SIGMAS = RobotSigmas(0.3, 0.1)
 """Largest noise that is considered for a robot: 0.3 rad and 100 mm."""
 
-FIRST_SHARED = 5.0
+FIRST_SHARED_FACTOR = 5.0
 """Factor of the views' shared errors that the first adjustment assumes, if the factor is
 estimated."""
 
@@ -61,7 +61,7 @@ def adjust_noisy(robot: RobotPoses, seen: Observations, start: Solution) -> Solu
 
     ``seen`` is whitened. The adjustment begins at ``start``, and with its noise if it has one.
     """
-    noise = start.noise or RobotNoise(FIRST, FIRST_SHARED)
+    noise = start.noise or RobotNoise(FIRST_SIGMAS, FIRST_SHARED_FACTOR)
     found = adjust(robot, seen, start, noise, gain=ROUGH_GAIN)
     for number in range(MAX_ROUNDS):
         if not math.isfinite(found.cost):
@@ -88,7 +88,7 @@ def _estimate(
     ``search``: look everywhere, not only from ``noise`` on.
     """
     total = sums(robot, seen, at, poses_only=True)[0]
-    low, high = np.log([*LEAST, 1.0]), np.log([*MOST, MAX_SHARED_FACTOR])
+    low, high = np.log([*MIN_SIGMAS, 1.0]), np.log([*MAX_SIGMAS, MAX_SHARED_FACTOR])
 
     def cost(logs: Array) -> float:
         inside = np.clip(logs, low, high)

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 COARSE_STEPS = 41
 """The whole range is first searched at this many offsets."""
 
-FOLDS = 20
+LEFT_OUT_PARTS = 20
 """The offset is estimated again without each of this many parts of the views, for its sigma."""
 
 MIN_VIEWS_FOR_OFFSET = 10
 """An offset needs at least this many views: it is one more unknown, about which each view says
 little."""
 
-MAX_TOLD_SIGMA = 0.25
+MAX_SIGMA_SHARE = 0.25
 """An offset is returned only if its sigma is at most this part of the range."""
 
 
@@ -95,12 +95,12 @@ def estimate_time_offset(
     fit = _Moving(history, views, setup, most)
     everything = np.arange(len(views))
     found = fit.best(everything)
-    part = everything % FOLDS
+    part = everything % LEFT_OUT_PARTS
     folds = np.unique(part)
     others = [fit.refined(everything[part != fold], found) for fold in folds]
     scatter = math.sqrt(float(jackknife(np.array(others)[:, None])[0, 0]))
     sigma = max(scatter, fit.least_sigma(found, everything))
-    if abs(found) > 0.99 * most or sigma > MAX_TOLD_SIGMA * most:
+    if abs(found) > 0.99 * most or sigma > MAX_SIGMA_SHARE * most:
         raise Code.BAD_TIME.refusal(
             f"time offset: expected views that tell one within {most:g} s, got {found:.3g} s with "
             f"a sigma of {sigma:.2g} s: take pictures while the robot moves, or allow more",

@@ -39,17 +39,17 @@ if TYPE_CHECKING:
 CLOSED_FORMS: Final = ("park", "shah")
 """Closed forms that are tried. They are of different kinds: one works when the other fails."""
 
-POSES_OF_PART: Final = 4
+POSES_PER_GROUP: Final = 4
 """A group has this many poses, one more than a closed form needs."""
 
-MAX_PARTS: Final = 60
+MAX_GROUPS: Final = 60
 """At most this many groups are tried: if a third of the poses is wrong, one group in six has none
 of them."""
 
-GROSS_MEDIANS: Final = 10.0
+MIN_GROSS_ERROR_RATIO: Final = 10.0
 """A pose whose error is more than this many times the median belongs to another view."""
 
-OTHER_WAY: Final = 5.0
+MIN_INVERTED_FIT_RATIO: Final = 5.0
 """Poses are taken for inverted, or a view for numbered from the target's other end, only if they
 then fit this many times better."""
 
@@ -57,7 +57,7 @@ MIN_OTHER_FIT_RATIO: Final = 20.0
 """Poses are taken for transposed, mirrored or in another unit of length only if they then fit this
 many times better: such mistakes are rarer than a pose of another view."""
 
-WORST_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
+WORST_USABLE_ROBOT: Final = RobotSigmas(math.radians(2.0), 0.01)
 """Largest noise of a usable robot: 2 degrees and 10 mm."""
 
 MILLI: Final = 1e-3
@@ -80,7 +80,7 @@ class Agreed(NamedTuple):
 
     def gross(self, limit: float) -> NDArray[np.intp]:
         """Return the indices of poses whose error is above ``limit`` and far above the others'."""
-        return np.flatnonzero(self.off > max(limit, GROSS_MEDIANS * self.median))
+        return np.flatnonzero(self.off > max(limit, MIN_GROSS_ERROR_RATIO * self.median))
 
 
 def seen_poses(target_poses: Sequence[Transform]) -> list[Transform]:
@@ -123,7 +123,7 @@ def expected_error(problem: Problem, sigmas: RobotSigmas) -> float:
 
 def most_error(problem: Problem) -> float:
     """Return the error above which poses and views do not belong together, metres."""
-    return min(extent(problem), expected_error(problem, WORST_ROBOT))
+    return min(extent(problem), expected_error(problem, WORST_USABLE_ROBOT))
 
 
 def agreement(problem: Problem) -> Agreed | None:
@@ -143,10 +143,10 @@ def agreement(problem: Problem) -> Agreed | None:
 def _parts(count: int) -> Iterator[NDArray[np.intp]]:
     """Yield the indices of all poses, then those of groups of poses, which are always the same."""
     yield np.arange(count)
-    if count > POSES_OF_PART:
+    if count > POSES_PER_GROUP:
         random = np.random.default_rng(count)
-        for _ in range(MAX_PARTS):
-            yield np.sort(random.choice(count, POSES_OF_PART, replace=False))
+        for _ in range(MAX_GROUPS):
+            yield np.sort(random.choice(count, POSES_PER_GROUP, replace=False))
 
 
 def _better(
@@ -186,7 +186,7 @@ def other_numbering(robot: RobotPoses, poses: Rigid, turn: Rigid, arm: float) ->
         as_is, turned = (_apart(one, expected, arm) for one in (poses, poses @ turn))
         middle = float(np.median(np.minimum(as_is, turned)))
         if middle < least:
-            least, other = middle, OTHER_WAY * turned < as_is
+            least, other = middle, MIN_INVERTED_FIT_RATIO * turned < as_is
     return ~other if 2 * other.sum() > len(other) else other
 
 
@@ -198,7 +198,7 @@ def _readings(robot: RobotPoses) -> Iterator[tuple[RobotPoses, float, Code, str]
     """
     poses, in_hand = robot.poses, robot.in_hand
     how = "the other way round: they are inverted, or the camera is on the other side"
-    yield RobotPoses(poses, not in_hand), OTHER_WAY, Code.WRONG_FRAME, how
+    yield RobotPoses(poses, not in_hand), MIN_INVERTED_FIT_RATIO, Code.WRONG_FRAME, how
     turned = Rigid(np.swapaxes(poses.rotation, 1, 2), poses.translation)
     how = "with rotations transposed: their matrices or quaternions are those of the way back"
     yield RobotPoses(turned, in_hand), MIN_OTHER_FIT_RATIO, Code.WRONG_FRAME, how

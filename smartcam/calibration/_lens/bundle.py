@@ -47,7 +47,7 @@ part."""
 MAX_FEW_POSES: Final = 5
 """With at most this many poses, leaving one out changes the fit too much for a single step."""
 
-MAX_BEND: Final = 1.2
+MAX_ONE_STEP_COST_RATIO: Final = 1.2
 """A single step is not enough if the cost without a pose is more than this many times the cost that
 the step predicts, as happens when a lens' coefficients compensate each other."""
 
@@ -273,7 +273,10 @@ def leave_out(adjusted: AdjustedBundle, sights: Sequence[Sight]) -> list[LeftOut
         without = whole.moved(shared, part[3] - part[2] @ shared)
         squares = at.cost - float((at.own_right * part[3]).sum()) - 2.0 * part[1] @ shared
         squares += float(shared @ part[0] @ shared)
-        if len(poses) <= MAX_FEW_POSES or not equations.normal(without).cost <= MAX_BEND * squares:
+        if (
+            len(poses) <= MAX_FEW_POSES
+            or not equations.normal(without).cost <= MAX_ONE_STEP_COST_RATIO * squares
+        ):
             without = _fitted_without(adjusted, sights, pose, own)
         found.append(LeftOut(pose, without, residuals(without, own), by_noise[:count]))
     return found

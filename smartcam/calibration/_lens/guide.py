@@ -43,7 +43,7 @@ COLUMNS: Final = {0.0: "left", 0.5: "middle", 1.0: "right"}
 ROWS: Final = {0.0: "upper", 0.5: "middle", 1.0: "lower"}
 """Rows that the target may be brought to, as parts of its range in the image."""
 
-FILLS: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
+SIZES: Final = {0.85: "near", 0.6: "at a middle distance", 0.4: "far"}
 """Parts of the image's width or height that the target may take."""
 
 MAX_TILT_DEG: Final = 35.0
@@ -59,10 +59,10 @@ MARGIN_RATIO: Final = 0.02
 MAX_STEPS: Final = 12
 """A target is moved to its place in at most this many steps; most are there after five."""
 
-MAP: Final = (9, 12)
+MAP_SHAPE: Final = (9, 12)
 """Rows and columns of the map over which the uncertainty is averaged."""
 
-MAX_SAME_RAY_ANGLE: Final = 1e-3
+MAX_SAME_RAY_RADIANS: Final = 1e-3
 """A point that lies off the ray of its own pixel by more than this angle, radians, is where the
 lens' model is not valid."""
 
@@ -187,7 +187,7 @@ def _known(calibration: IntrinsicCalibration, basis: Array) -> tuple[Array, floa
 def _criterion(calibration: IntrinsicCalibration, distance: float | None) -> Array:
     """Return M such that ``trace(C M)`` is the mean variance of a coordinate for a covariance C."""
     camera = calibration.camera
-    points = points_at(camera, places(camera.size, MAP).reshape(-1, 2), distance)
+    points = points_at(camera, places(camera.size, MAP_SHAPE).reshape(-1, 2), distance)
     field = sensitivity(camera, known_points(points), far=distance is None)
     freed = field.freed(sensitivity(camera, known_points(calibration.target_points)))
     found: Array = np.einsum("nip,niq->pq", freed, freed) / len(freed)
@@ -221,7 +221,7 @@ def candidates(camera: CameraModel, target: Target, roll: float = 0.0) -> Candid
     )
     around = np.column_stack([rim * half, np.zeros(len(rim))])
     tilts = {"": (0.0, 0.0), **SIDES}
-    ways = list(itertools.product(FILLS, ROWS, COLUMNS, tilts))
+    ways = list(itertools.product(SIZES, ROWS, COLUMNS, tilts))
     turns = np.array([[*tilts[side], 0.0] for *_, side in ways]) * math.radians(MAX_TILT_DEG)
     upright = exp_rotation(np.array([0.0, 0.0, roll])) @ np.diag([1.0, -1.0, -1.0])
     rotations = exp_rotation(turns) @ upright
@@ -274,7 +274,7 @@ def _visible(camera: CameraModel, points: Array) -> Mask:
     back = points_at(camera, np.where(inside, seen, 0.0), None)
     ahead = flat / np.linalg.norm(flat, axis=1, keepdims=True)
     off = np.where(inside, np.abs(back - ahead), np.inf).reshape(len(points), -1)
-    good: Mask = off.max(axis=1) < MAX_SAME_RAY_ANGLE
+    good: Mask = off.max(axis=1) < MAX_SAME_RAY_RADIANS
     return good
 
 
@@ -289,4 +289,4 @@ def _words(fill: float, row: float, column: float, side: str, roll: float) -> st
     tilted = f"tilted by {MAX_TILT_DEG:.0f} degrees, its {side} side farther away"
     tilt = tilted if side else "not tilted"
     turned = f", turned by {abs(math.degrees(roll)):.0f} degrees" if roll else ""
-    return f"{place}, {FILLS[fill]}, {tilt}{turned}"
+    return f"{place}, {SIZES[fill]}, {tilt}{turned}"

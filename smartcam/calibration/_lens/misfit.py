@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     Mask = NDArray[np.bool_]
 
-WAYS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
+FLIPS: Final = {"left to right": (0,), "top to bottom": (1,), "by half a turn": (0, 1)}
 """Ways to flip a picture, each with the axes of the image whose direction changes."""
 
 DEFORMATIONS: Final = 5
@@ -46,7 +46,7 @@ SHUTTER: Final = 2
 """Number of ways in which a rolling shutter deforms a picture: leaning and stretching from row to
 row."""
 
-FURTHER: Final = DEFORMATIONS + SHUTTER + SMOOTH
+FURTHER_VALUES: Final = DEFORMATIONS + SHUTTER + SMOOTH
 """Number of values, beyond those of the lens, that may explain its misfit."""
 
 MIN_VIEWS_TO_EXPLAIN: Final = 4
@@ -116,7 +116,7 @@ class Equations(NamedTuple):
 def lens_alone(equations: Equations) -> Mask:
     """Return a mask of the shared unknowns that are values of the lens."""
     count = equations.by_shared.shape[2]
-    of_lens: Mask = np.arange(count) < count - FURTHER
+    of_lens: Mask = np.arange(count) < count - FURTHER_VALUES
     return of_lens
 
 
@@ -175,7 +175,7 @@ class _FlippedLens(NamedTuple):
     @classmethod
     def of(cls, camera: CameraModel, axes: Sequence[int]) -> _FlippedLens:
         """Return the effect of flipping pictures along some axes."""
-        values = np.concatenate([lens_values(camera), np.zeros(FURTHER)])
+        values = np.concatenate([lens_values(camera), np.zeros(FURTHER_VALUES)])
         mirror, goal = np.ones(len(values)), values.copy()
         for axis in axes:
             mirror[2 + axis], goal[2 + axis] = -1.0, camera.size[axis] - 1 - values[2 + axis]
@@ -222,9 +222,9 @@ def misfit_remarks(
     equations = [one.equations(more) for one in fitted]
     reduced, count = Reduced.of(equations), sum(one.residuals.size for one in equations)
     lens, views = len(free), len(fitted)
-    places = np.split(lens + np.arange(FURTHER), np.cumsum([DEFORMATIONS, SHUTTER]))
+    places = np.split(lens + np.arange(FURTHER_VALUES), np.cumsum([DEFORMATIONS, SHUTTER]))
     sheet, shutter, smooth = (one.tolist() for one in places)
-    usual = np.zeros(lens + FURTHER, dtype=np.bool_)
+    usual = np.zeros(lens + FURTHER_VALUES, dtype=np.bool_)
     usual[:lens], usual[sheet] = free, True
     other = usual.copy()
     other[smooth] = True
@@ -252,10 +252,10 @@ def misfit_remarks(
             f"{before / max(after, 1e-300):.3g} {told}"
         )
         return
-    flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in WAYS.values()]
+    flips = [_FlippedLens.of(fitted[0].camera, axes) for axes in FLIPS.values()]
     tried = [
         (how, *min((flip.best(reduced, usual, one) for one in guesses), key=lambda one: one[1]))
-        for (how, axes), flip in zip(WAYS.items(), flips, strict=True)
+        for (how, axes), flip in zip(FLIPS.items(), flips, strict=True)
         for guesses in [list(_guesses(reduced, [2 + axis for axis in axes]))]
     ]
     how, flipped, after = min(tried, key=lambda one: one[2])

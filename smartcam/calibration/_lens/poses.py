@@ -45,14 +45,14 @@ MIN_AGREEMENT: Final = 0.5
 """The agreement of a view with its target, from -1 to 1, must be below minus this value; above plus
 this value the view shows the sheet in a mirror. Views of steep sheets and of fisheyes have -0.8."""
 
-MAX_NUDGE: Final = 1e-9
+MAX_RAY_SHIFT_RATIO: Final = 1e-9
 """Rays are moved by at most this part of the focal length, to avoid rounding errors in a solver."""
 
 MAX_UNSURE_RATIO: Final = 4.0
 """Both poses are refined if the squared residuals of one are at most this many times those of the
 other."""
 
-MAX_SAME_TURN: Final = 1e-3
+MAX_SAME_TURN_RADIANS: Final = 1e-3
 """Two poses turned by less than this angle, rad, are the same minimum."""
 
 
@@ -118,7 +118,8 @@ def locate(view: TargetView, camera: CameraModel) -> TargetPose:
         found = [adjust(one.bundle, sights, more) for one in found]
     best, pose = found[0], found[0].bundle.poses
     other = next(
-        (one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > MAX_SAME_TURN), None
+        (one for one in found[1:] if pose.angle_to(one.bundle.poses)[0] > MAX_SAME_TURN_RADIANS),
+        None,
     )
     rms = view_rms(best.residuals[0])
     return TargetPose(
@@ -231,7 +232,9 @@ def plane_poses(view: TargetView, camera: CameraModel) -> list[Rigid]:
     rays = camera.directions(view.points)
     found = _ippe(view.object_points, rays)
     if not found:  # with exact rays OpenCV would take the root of a negative rounding error
-        found = _ippe(view.object_points, rays + MAX_NUDGE * np.sin(np.arange(len(rays)))[:, None])
+        found = _ippe(
+            view.object_points, rays + MAX_RAY_SHIFT_RATIO * np.sin(np.arange(len(rays)))[:, None]
+        )
     return found
 
 

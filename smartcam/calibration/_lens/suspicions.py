@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     Mask = NDArray[np.bool_]
 
-OFF: Final = ((7.0, 1.5), (12.0, 0.25))
+STRAY_LIMITS: Final = ((7.0, 1.5), (12.0, 0.25))
 """A point is a stray if it is off by both the standard deviations and the pixels of either pair. In
 200 recorded views, whose noise is not quite normal, the farthest points are 9.6 deviations and 0.8
 pixels off, or 5.9 and 1.8 (measured)."""
@@ -51,31 +51,31 @@ MIN_POINTS_KEPT: Final = 8
 """Strays are left out only if this many points are left: with fewer, any of them may be the wrong
 one."""
 
-MEDIAN: Final = 2.0 * math.log(2.0)
+MEDIAN_SQUARED_LENGTH: Final = 2.0 * math.log(2.0)
 """Median of the squared length of two independent normal numbers with a variance of 1."""
 
-MAX_NAMED: Final = 5
+MAX_POINTS_IN_MESSAGE: Final = 5
 """A message names at most this many points."""
 
 MAX_RMS_PX: Final = 10.0
 """Residual RMS, pixels, above which points are not the target's: the wrong model of a lens leaves
 less."""
 
-WORST_PART: Final = 0.015
+MAX_RMS_SHARE: Final = 0.015
 """The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
 
-WORST_SIGMAS: Final = 20.0
+MAX_RMS_SIGMAS: Final = 20.0
 """The limit MAX_RMS_PX as a multiple of the points' standard deviation; the larger holds."""
 
 MAX_TARGET_METRES: Final = 20.0
 """No target is longer than this many metres; a board whose squares are given in millimetres seems
 200 m long."""
 
-OFF_MIDDLE: Final = 0.2
+DOUBTED_CENTRE_OFFSET_SHARE: Final = 0.2
 """A principal point that lies this part of the image's sides off the centre may belong to another
 image."""
 
-SURE_SIGMAS: Final = 5.0
+DOUBTED_CENTRE_SIGMAS: Final = 5.0
 """Such a principal point is doubted only if it is this many standard deviations off the centre."""
 
 
@@ -148,7 +148,7 @@ def squares_off(equations: Equations, scale: float) -> Array:
 def _far(equations: Equations, squares: Array, scale: float) -> Mask:
     pixels = equations.deviations * np.sqrt(squares)
     times = np.sqrt(squares / max(scale, np.finfo(np.float64).tiny))
-    far: Mask = np.any([(times > most) & (pixels > least) for most, least in OFF], axis=0)
+    far: Mask = np.any([(times > most) & (pixels > least) for most, least in STRAY_LIMITS], axis=0)
     return far
 
 
@@ -157,7 +157,7 @@ def _stray_squares(equations: Sequence[Equations], used: Sequence[bool]) -> list
     of_used = itertools.compress(equations, used)
     # unlike the variance of all points, the median is hardly changed by a few strays
     middle = np.median(np.concatenate([(one.residuals**2).sum(axis=1) for one in of_used]))
-    return [squares_off(one, float(middle) / MEDIAN) for one in equations]
+    return [squares_off(one, float(middle) / MEDIAN_SQUARED_LENGTH) for one in equations]
 
 
 def without(views: Sequence[TargetView], found: Sequence[Stray]) -> list[TargetView]:
@@ -189,10 +189,14 @@ def stray_remarks(found: Sequence[Stray], names: Sequence[str], done: str) -> It
     rest = [one for one in found if one.ident not in often]
     if rest:
         each = [f"{one.ident} in {names[one.number]} ({one.off:.3g} pixels)" for one in rest]
-        more = f", and {len(each) - MAX_NAMED} more" if len(each) > MAX_NAMED else ""
+        more = (
+            f", and {len(each) - MAX_POINTS_IN_MESSAGE} more"
+            if len(each) > MAX_POINTS_IN_MESSAGE
+            else ""
+        )
         yield Code.OUTLIER.remark(
             f"points that are not where the others of their views have them: "
-            f"{', '.join(each[:MAX_NAMED])}{more}: each {done}"
+            f"{', '.join(each[:MAX_POINTS_IN_MESSAGE])}{more}: each {done}"
         )
 
 
@@ -257,9 +261,14 @@ def view_remarks(views: Sequence[TargetView], names: Sequence[str]) -> Iterator[
         groups[view.ids.tobytes(), view.points.tobytes()].append(name)
     copies = [", ".join(one) for one in groups.values() if len(one) > 1]
     if copies:
-        more = f", and {len(copies) - MAX_NAMED} more" if len(copies) > MAX_NAMED else ""
+        more = (
+            f", and {len(copies) - MAX_POINTS_IN_MESSAGE} more"
+            if len(copies) > MAX_POINTS_IN_MESSAGE
+            else ""
+        )
         yield Code.COINCIDENT.remark(
-            f"views that are the same to the last digit: {'; '.join(copies[:MAX_NAMED])}{more}: "
+            "views that are the same to the last digit: "
+            f"{'; '.join(copies[:MAX_POINTS_IN_MESSAGE])}{more}: "
             "they count as often as they are there, and errors come out too small"
         )
     length = float(np.ptp(views[0].target.points, axis=0).max())
@@ -274,7 +283,7 @@ def _remarks_on_middle(found: IntrinsicCalibration) -> Iterator[Remark]:
     size = np.array(found.camera.size)
     middle, sigmas = found.camera.matrix[:2, 2], np.sqrt(np.diag(found.covariance)[2:4])
     off = np.abs(middle - (size - 1) / 2)
-    if ((off > OFF_MIDDLE * size) & (off > SURE_SIGMAS * sigmas)).any():
+    if ((off > DOUBTED_CENTRE_OFFSET_SHARE * size) & (off > DOUBTED_CENTRE_SIGMAS * sigmas)).any():
         yield Code.WRONG_SIZE.remark(
             f"expected the principal point near the middle of an image of {size[0]} x {size[1]} "
             f"pixels, got ({middle[0]:.0f}, {middle[1]:.0f}): were points taken from an image of "
@@ -296,9 +305,9 @@ def check_rms(what: str, rms: float, views: Sequence[TargetView]) -> None:
 
 
 def most_rms(
-    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = WORST_PART
+    views: Sequence[TargetView], worst: float = MAX_RMS_PX, part: float = MAX_RMS_SHARE
 ) -> float:
     """Return the RMS of a coordinate, pixels, above which views are impossible."""
     noise = float(np.median(np.concatenate([one.sigmas for one in views])))
     longer = max(max(one.size) for one in views)
-    return max(worst, part * longer, WORST_SIGMAS * noise)
+    return max(worst, part * longer, MAX_RMS_SIGMAS * noise)

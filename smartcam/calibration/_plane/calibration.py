@@ -28,7 +28,7 @@ from smartcam.calibration._homography import element_derivatives
 from smartcam.calibration._one_blas_thread import one_blas_thread
 from smartcam.calibration._plane.diagnostics import (
     MAX_SIGMA,
-    TYPICAL_SIGMA,
+    TYPICAL_SIGMA_M,
     Evidence,
     check_side,
     findings,
@@ -67,14 +67,14 @@ KIND = "plane"
 
 PlaneModel: TypeAlias = Literal["auto", "rigid", "similarity", "affine", "homography"]
 
-POINTS_AT_ONCE = 16_384
+POINTS_PER_BLOCK = 16_384
 """Covariances are computed for this many points at a time, which takes 5 MB."""
 
-ENOUGH: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
+MIN_POINTS_FOR_VERDICT: dict[str, int] = {"rigid": 5, "similarity": 5, "affine": 6, "homography": 8}
 """A verdict needs this many points: fewer may fit the model although two of them are wrong by the
 same mistake (shown by simulation)."""
 
-TOUCHES_APART = 4.0
+MAX_TOUCH_SIGMAS = 4.0
 """A touch further than this many sigmas from the mean of its point's touches is remarked on: noise
 alone does it once in a thousand."""
 
@@ -247,7 +247,7 @@ class PlaneCalibration(storage.SavedCalibration):
         without = f" without point{'s' * (len(out) > 1)} {', '.join(map(str, out))}" if out else ""
         held_out, more = self.held_out_error, "touch more points"
         points = len(np.unique(self.camera_points[counted], axis=0))
-        if points < (least := ENOUGH.get(self.model, 0)):
+        if points < (least := MIN_POINTS_FOR_VERDICT.get(self.model, 0)):
             held_out = None
             more = f"two wrong ones of {points} points can look right: touch {least} or more"
         return judge(
@@ -355,7 +355,10 @@ class PlaneCalibration(storage.SavedCalibration):
         # J C J^T with the map's Jacobian by its parameters; C is derived in fitting.fit
         seen = as_points(points, 2, "camera points")
         return np.concatenate(
-            [self._joint(seen[i : i + POINTS_AT_ONCE]) for i in range(0, len(seen), POINTS_AT_ONCE)]
+            [
+                self._joint(seen[i : i + POINTS_PER_BLOCK])
+                for i in range(0, len(seen), POINTS_PER_BLOCK)
+            ]
             or [np.zeros((0, 3, 3))]
         )
 
@@ -598,7 +601,7 @@ def fit_plane(
         side=None if side is None else check_side(plane.frame[:, 2], side),
         numbers=1 + once.first[kept],
     )
-    estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA / place.robot_size)
+    estimate = _estimated(fitted, pairs.weights, TYPICAL_SIGMA_M / place.robot_size)
     if robust and touch_sigma is None and estimate is not None:
         check_lever(lever(touched[kept]), place.robot_size * estimate)
     off = np.setdiff1d(np.arange(len(marks)), kept)
@@ -635,7 +638,7 @@ def fit_plane(
     )
     remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
     apart = np.linalg.norm(beside, axis=1)
-    if apart.max() > TOUCHES_APART * most:
+    if apart.max() > MAX_TOUCH_SIGMAS * most:
         text = f"point {1 + int(apart.argmax())} was touched {1e3 * float(apart.max()):.3g} mm from"
         remarks.append(Code.OUTLIER.remark(f"{text} the mean of its touches"))
     return dataclasses.replace(found, warnings=(*remarks, *found.warnings))

@@ -34,7 +34,7 @@ SCALE_TOLERANCE = 0.005
 """A scale may be off the nominal one by this part: printers and heights of parts change it by as
 much."""
 
-MAX_SCALE_OFF = 0.1
+MAX_SCALE_ERROR = 0.1
 """A scale that is off the nominal one by more than this part comes from mixed-up units or
 sheets."""
 
@@ -52,7 +52,7 @@ always."""
 MIN_DEGREES_OF_FREEDOM = 6
 """An estimated sigma with fewer degrees of freedom is off by 30 percent and more (derived)."""
 
-TYPICAL_SIGMA = 0.0002
+TYPICAL_SIGMA_M = 0.0002
 """Sigma of a careful touch, metres, assumed for the degrees of freedom that an estimate lacks."""
 
 
@@ -140,7 +140,7 @@ def check_scale(measured: float, nominal: float, uncertainty: float, *, exact: b
     percent = f"{100 * off:+.2g}" if abs(off) < 0.1 else f"{100 * off:+.0f}"
     text = f"scale: expected {nominal:.6g} m for each unit of the camera, got {measured:.6g}"
     text += f" ({percent} %): the print, the units or the height are other than thought"
-    if exact or abs(off) > MAX_SCALE_OFF:
+    if exact or abs(off) > MAX_SCALE_ERROR:
         raise Code.SCALE_MISMATCH.refusal(text, nominal, measured)
     return text
 

@@ -43,7 +43,7 @@ ELLIPSE_POINTS: Final = 24
 MIN_ENLARGED_RATIO: Final = 1e-9
 """Errors below this part of the field's width are not drawn larger."""
 
-LOW, HIGH = (240, 247, 252), (246, 196, 140)
+LOW_COLOUR, HIGH_COLOUR = (240, 247, 252), (246, 196, 140)
 """Colours of the smallest and the largest predicted error."""
 
 STYLE: Final = """\
@@ -57,7 +57,7 @@ stroke-width: 2 }
 .ellipse { fill: none; stroke: #7d3c98 } .part { stroke: #0b7a4b; fill: none; stroke-width: 1.5 }
 .part-name { fill: #0b7a4b }"""
 
-HEADS: Final = "".join(
+ARROW_HEADS: Final = "".join(
     f'<marker id="{kind}-head" refX="8" refY="4" orient="auto" '
     f'markerUnits="userSpaceOnUse"><path d="M0 0 L8 4 L0 8" class="{kind}"/></marker>'
     for kind in ("camera", "robot")
@@ -121,7 +121,7 @@ def draw(
         else 1.0
     )
     shapes = [
-        f"<defs>{HEADS}</defs>",
+        f"<defs>{ARROW_HEADS}</defs>",
         *_heat(calibration, field),
         *_axes(calibration, field),
         *(
@@ -183,7 +183,7 @@ def _heat(calibration: PlaneCalibration, field: _DrawnPlane) -> Iterator[str]:
 def _cell(x: float, y: float, wide: float, tall: float, part: float) -> str:
     """Return a cell; its colour goes in steps, so that rounding does not change it."""
     level = round(20 * part) / 20
-    channels = (round(a + level * (b - a)) for a, b in zip(LOW, HIGH, strict=True))
+    channels = (round(a + level * (b - a)) for a, b in zip(LOW_COLOUR, HIGH_COLOUR, strict=True))
     colour = "".join(f"{channel:02x}" for channel in channels)
     return rectangle((x, y), (wide, tall), f'fill="#{colour}"')
 

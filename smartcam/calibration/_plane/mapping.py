@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MAX_POINTS_OF_NUMPY = 512
 """With at most this many points, numpy is faster than OpenCV, which is then not loaded."""
 
-POINTS_AT_ONCE = 65_536
+POINTS_PER_BLOCK = 65_536
 """Number of points that are mapped at a time: intermediate values stay in the processor's cache,
 and calls are few (blocks of 16,384 points take half as long again, of 10^6 a quarter; measured)."""
 
@@ -100,15 +100,15 @@ class PlaneMap:
                 _check_mapped(given, result)
             return result
         source = _Homogeneous(given)
-        for begin in range(0, len(given), POINTS_AT_ONCE):
-            block = given[begin : begin + POINTS_AT_ONCE]
+        for begin in range(0, len(given), POINTS_PER_BLOCK):
+            block = given[begin : begin + POINTS_PER_BLOCK]
             farthest = self._farthest(block)
             least = self._least_depth(farthest)
             if not least > 0:
                 self._check_horizon(block)
-            self._fill(source.block(begin), result[begin : begin + POINTS_AT_ONCE])
+            self._fill(source.block(begin), result[begin : begin + POINTS_PER_BLOCK])
             if not (least > 0 and self._most * max(farthest, 1.0) / least < MAX_COORDINATE):
-                _check_mapped(block, result[begin : begin + POINTS_AT_ONCE])
+                _check_mapped(block, result[begin : begin + POINTS_PER_BLOCK])
         return result
 
     def _farthest(self, points: Array) -> float:
@@ -220,7 +220,7 @@ class _Homogeneous:
         self._whole = points.shape[1] == 3
         if not self._whole:
             self._pairs = self._points.view(np.complex128)[:, 0]
-            self._buffer = np.ones((min(POINTS_AT_ONCE, len(points)), 3))
+            self._buffer = np.ones((min(POINTS_PER_BLOCK, len(points)), 3))
             self._places: NDArray[np.complex128] = np.ndarray(
                 (len(self._buffer),), np.complex128, self._buffer, strides=(24,)
             )
@@ -228,8 +228,8 @@ class _Homogeneous:
     def block(self, begin: int) -> Array:
         """Return the next points (n, 3), contiguous, valid until the next call."""
         if self._whole:
-            return self._points[begin : begin + POINTS_AT_ONCE]
-        pairs = self._pairs[begin : begin + POINTS_AT_ONCE]
+            return self._points[begin : begin + POINTS_PER_BLOCK]
+        pairs = self._pairs[begin : begin + POINTS_PER_BLOCK]
         self._places[: len(pairs)] = pairs
         return self._buffer[: len(pairs)]
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
-STEP: Final = 1e-4
+STEP_SHARE: Final = 1e-4
 """Length of the steps of numerical derivatives, as a part of the touched field."""
 
 
@@ -42,7 +42,7 @@ def robot_sigmas(
     """
     points = np.array([one.pose.position[:2] for one in seen])
     angles = np.array([one.pose.orientation.theta for one in seen])
-    step = STEP * size
+    step = STEP_SHARE * size
 
     def ahead(at: Array, turn: Array) -> Array:
         return at + step * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -65,7 +65,9 @@ def robot_sigmas(
         place = (transform(ends[0]) - transform(ends[1])) / (2 * step)
         turned = (directions(ends[0], angles) - directions(ends[1], angles)) / (2 * step)
         columns.append(pose_change(place, turned))
-    turned = (directions(points, angles + STEP) - directions(points, angles - STEP)) / (2 * STEP)
+    turned = (directions(points, angles + STEP_SHARE) - directions(points, angles - STEP_SHARE)) / (
+        2 * STEP_SHARE
+    )
     columns.append(pose_change(np.zeros_like(turned), turned))
     slopes = np.stack(columns, axis=2)
     own = np.array([_covariance(one.pose.sigma) for one in seen])

@@ -56,7 +56,7 @@ MAX_SUBSETS_TRIED = 500
 If half of the points are wrong, each of 500 subsets of four has a wrong one in 1 of 10^14 cases.
 """
 
-FITTED_PROPOSALS = 5
+MAX_FITTED_PROPOSALS = 5
 """Number of the best proposals that are fitted to the points that agree with them."""
 
 MAX_ROUNDS = 10
@@ -178,7 +178,7 @@ def _search(name: ModelName, pairs: Pairs, sigma: float | None) -> _Agreement | 
     # MSAC: sum min(r^2, threshold). Source: Torr and Zisserman, MLESAC (2000).
     costs = np.minimum(squared, threshold).sum(axis=1)
     found: dict[bytes, _Agreement] = {}
-    for index in np.argsort(costs, kind="stable")[:FITTED_PROPOSALS]:
+    for index in np.argsort(costs, kind="stable")[:MAX_FITTED_PROPOSALS]:
         one = _settle(name, pairs, squared[index] <= threshold, sigma, threshold)
         if one is not None:
             found.setdefault(one.mask.tobytes(), one)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from smartcam.geometry._inside import Array
     from smartcam.models import Localization
 
-_TURN: Final = 0.17
+_MIN_ORIENTATION_SPREAD: Final = 0.17
 """Least spread of the orientations: that of two touches 20 degrees apart."""
 
 
@@ -73,12 +73,12 @@ def fit_tool_tip(flanges: Sequence[Transform]) -> ToolTip:
     mean_turn, mean_place = turns.mean(axis=0), places.mean(axis=0)
     matrix = (turns - mean_turn).reshape(-1, 3)
     _, values, axes = np.linalg.svd(matrix / np.sqrt(len(flanges)), full_matrices=False)
-    seen = int((values > _TURN).sum())
+    seen = int((values > _MIN_ORIENTATION_SPREAD).sum())
     if seen < 2:  # turns about one axis have two equal eigenvalues
         raise Code.INSUFFICIENT_ROTATION.refusal(
             f"tool tip: expected the flange at orientations that differ, got a spread of "
-            f"{values[1]:.3g}, which must be above {_TURN:g}",
-            _TURN,
+            f"{values[1]:.3g}, which must be above {_MIN_ORIENTATION_SPREAD:g}",
+            _MIN_ORIENTATION_SPREAD,
             float(values[1]),
         )
     right = -(places - mean_place).reshape(-1)
@@ -126,11 +126,11 @@ def fit_rotation_centre(parts: Iterable[Localization]) -> RotationCentre:
     turns = np.exp(1j * np.array([pose.orientation.theta for pose in poses]))
     near = turns - turns.mean()
     spread = float(np.sqrt(np.mean(np.abs(near) ** 2)))
-    if not spread > _TURN:
+    if not spread > _MIN_ORIENTATION_SPREAD:
         raise Code.INSUFFICIENT_ROTATION.refusal(
             f"rotation centre: expected angles that differ, got a spread of {spread:.3g}, which "
-            f"must be above {_TURN:g}",
-            _TURN,
+            f"must be above {_MIN_ORIENTATION_SPREAD:g}",
+            _MIN_ORIENTATION_SPREAD,
             spread,
         )
     arm = np.vdot(near, places) / np.vdot(near, near)

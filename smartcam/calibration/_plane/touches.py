@@ -16,7 +16,12 @@ import numpy as np
 
 from smartcam._argument_checks import a_number, numbers, of_class, or_none, takes
 from smartcam.calibration._plane.calibration import PlaneCalibration, mean_axis
-from smartcam.calibration._plane.diagnostics import TYPICAL_SIGMA, check_side, remark_side, sigma_of
+from smartcam.calibration._plane.diagnostics import (
+    TYPICAL_SIGMA_M,
+    check_side,
+    remark_side,
+    sigma_of,
+)
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
 from smartcam.calibration._plane.validation import check_lever, check_positive
@@ -121,7 +126,7 @@ def fit_touches(
     axis = None if tool_z is None else mean_axis(tool_z, len(touched))
     side = None if axis is None else check_side(sheet.frame[:, 2], axis)
     freedom = 3 * len(groups[0]) + 2 * len(groups[1]) + 2 * len(groups[2]) - 6
-    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA)
+    sigma = sigma_of(float((sheet.residuals**2).sum()), freedom, TYPICAL_SIGMA_M)
     centre = np.array([origin.pose.position.x, origin.pose.position.y])
     theta = origin.pose.orientation.theta
     size = math.sqrt(float(np.mean(np.square(levers))))

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 Point: TypeAlias = tuple[float, float]
 """x and y, mm."""
 
-POINTS: Final = 72 / 25.4
+POINTS_PER_MM: Final = 72 / 25.4
 """PDF's units (points) per millimetre."""
 
-ARC: Final = 4 / 3 * (math.sqrt(2) - 1)
+ARC_CONTROL_RATIO: Final = 4 / 3 * (math.sqrt(2) - 1)
 """Distance between an end of a quarter circle and the next control point of its Bezier curve, as a
 part of the radius; the curve is off by at most 0.03 % of the radius."""
 
@@ -122,10 +122,10 @@ def _svg_texts(shapes: Iterable[Shape], height: float) -> Iterator[str]:
 
 def pdf(page: PrintedPage) -> bytes:
     """Return a PDF document of one page, which asks its viewer to print it at its true size."""
-    scale = f"{POINTS:.9f} 0 0 {POINTS:.9f} 0 0 cm"
+    scale = f"{POINTS_PER_MM:.9f} 0 0 {POINTS_PER_MM:.9f} 0 0 cm"
     lines = [scale, *_pdf_paths(page.shapes), "f", *_pdf_texts(page.shapes)]
     content = "\n".join(lines).encode("latin-1", "replace")
-    size = " ".join(_number(POINTS * side) for side in (page.width, page.height))
+    size = " ".join(_number(POINTS_PER_MM * side) for side in (page.width, page.height))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
@@ -169,7 +169,7 @@ def _pdf_circle(x: float, y: float, radius: float) -> str:
     for along, up in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         before, behind, end = (
             _pair(x + radius * (along * a - up * b), y + radius * (up * a + along * b))
-            for a, b in ((1, ARC), (ARC, 1), (0, 1))
+            for a, b in ((1, ARC_CONTROL_RATIO), (ARC_CONTROL_RATIO, 1), (0, 1))
         )
         parts.append(f"{before} {behind} {end} c")
     return " ".join([*parts, "h"])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._printing.page import Point
     from smartcam.calibration._targets import Target
 
-MM = 1e3
+MM_PER_METRE = 1e3
 """Millimetres per metre."""
 
 
@@ -53,23 +53,23 @@ def ink(target: Target) -> tuple[tuple[Polygon | Disc, ...], Box]:
 
 
 def _board(columns: int, rows: int, square: float) -> Box:
-    side = MM * square
+    side = MM_PER_METRE * square
     return Box(-side, -side, columns * side, rows * side)
 
 
 def _checkerboard(target: Checkerboard) -> Iterator[Polygon | Disc]:
-    side = MM * target.square
+    side = MM_PER_METRE * target.square
     for row in range(target.rows + 1):
         for column in range(row % 2, target.columns + 1, 2):
             yield rectangle((column - 1) * side, (row - 1) * side, side, side)
     if target.origin_mark:
-        x, y = (MM * target.corner_areas[0]).tolist()
-        yield Disc((x, y), MM * target.corner_area_diameter / 2)
+        x, y = (MM_PER_METRE * target.corner_areas[0]).tolist()
+        yield Disc((x, y), MM_PER_METRE * target.corner_area_diameter / 2)
 
 
 def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
     """Yield squares and markers; OpenCV counts both from the upper left."""
-    side, marker = MM * target.square, MM * target.marker
+    side, marker = MM_PER_METRE * target.square, MM_PER_METRE * target.marker
     first_black = 1 if target.legacy_pattern and target.rows % 2 == 0 else 0
     cells = [
         (column, row, box.left + column * side, box.high - (row + 1) * side)
@@ -91,18 +91,18 @@ def _charuco(target: Charuco, box: Box) -> Iterator[Polygon]:
 
 
 def _marker_box(target: MarkerGrid) -> Box:
-    around = MM * target.gap if target.kalibr else 0.0
-    right, high = (MM * target.points[-1, :2]).tolist()
+    around = MM_PER_METRE * target.gap if target.kalibr else 0.0
+    right, high = (MM_PER_METRE * target.points[-1, :2]).tolist()
     return Box(-around, -around, right + around, high + around)
 
 
 def _markers(target: MarkerGrid) -> Iterator[Polygon]:
     """Yield markers, and for Kalibr's grids the squares between their corners."""
-    side, gap = MM * target.marker, MM * target.gap
+    side, gap = MM_PER_METRE * target.marker, MM_PER_METRE * target.gap
     patterns = marker_patterns(target)
     module = side / len(patterns[0])
     for numbers, pattern in zip(target.corners, patterns, strict=True):
-        left, low = (MM * target.points[numbers, :2].min(axis=0)).tolist()
+        left, low = (MM_PER_METRE * target.points[numbers, :2].min(axis=0)).tolist()
         for loop in outlines(pattern):
             yield Polygon(tuple((left + x * module, low + y * module) for x, y in loop))
     if target.kalibr:
@@ -161,10 +161,10 @@ def _corners(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _dots(target: CircleGrid) -> tuple[tuple[Disc, ...], Box]:
-    centres = MM * target.points[:, :2]
-    radii = np.full(len(centres), MM * target.diameter / 2)
+    centres = MM_PER_METRE * target.points[:, :2]
+    radii = np.full(len(centres), MM_PER_METRE * target.diameter / 2)
     if target.origin_diameter is not None:
-        radii[0] = MM * target.origin_diameter / 2
+        radii[0] = MM_PER_METRE * target.origin_diameter / 2
     dots = tuple(
         Disc((x, y), radius)
         for (x, y), radius in zip(centres.tolist(), radii.tolist(), strict=True)

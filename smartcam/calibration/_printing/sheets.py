@@ -29,8 +29,13 @@ from smartcam.calibration._printing.page import (
     pdf,
     svg,
 )
-from smartcam.calibration._printing.page_layout import AREA_REACH, BORDER, RULER, PageLayout
-from smartcam.calibration._printing.shapes import MM, Box, ink, quartered
+from smartcam.calibration._printing.page_layout import (
+    AREA_REACH_SQUARES,
+    BORDER_MM,
+    RULER_MM,
+    PageLayout,
+)
+from smartcam.calibration._printing.shapes import MM_PER_METRE, Box, ink, quartered
 from smartcam.calibration._targets import (
     Charuco,
     Checkerboard,
@@ -49,7 +54,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._targets import Target
     from smartcam.exceptions import CalibrationError
 
-PAGES: Final[Mapping[str, tuple[float, float]]] = {
+PAGES_MM: Final[Mapping[str, tuple[float, float]]] = {
     "A5": (148.0, 210.0),
     "A4": (210.0, 297.0),
     "A3": (297.0, 420.0),
@@ -62,7 +67,7 @@ PAGES: Final[Mapping[str, tuple[float, float]]] = {
 }
 """Width and height of pages, mm; a sheet uses them in portrait or landscape format, as it fits."""
 
-MAX_PAGE: Final = 3000.0
+MAX_PAGE_MM: Final = 3000.0
 """Longest side of a page, mm."""
 
 MAX_SCALE_CHANGE: Final = 0.05
@@ -156,7 +161,7 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
 
     Args:
         target: target, or rays, on the sheet; lengths are printed as they are.
-        page: one of ``PAGES``, in portrait or landscape format as the target fits, or width and
+        page: one of ``PAGES_MM``, in portrait or landscape format as the target fits, or width and
             height in mm, such as ``300x200``, which is not turned.
 
     Raises:
@@ -166,15 +171,15 @@ def make_sheet(target: Target | Rays, *, page: str = "A4") -> Sheet:
     """
     pattern, box = _pattern(target)
     width, height = page_size(page)
-    turns = [(width, height), (height, width)] if page in PAGES else [(width, height)]
+    turns = [(width, height), (height, width)] if page in PAGES_MM else [(width, height)]
     marked = isinstance(target, Checkerboard) and target.origin_mark
     pitch = _pitch(target)
     layouts = [
         PageLayout(
             box,
             pitch=pitch,
-            areas=AREA_REACH * pitch if marked else 0.0,
-            texts=(_title(target), ADVICE.format(origin=ORIGINS[type(target)], ruler=RULER)),
+            areas=AREA_REACH_SQUARES * pitch if marked else 0.0,
+            texts=(_title(target), ADVICE.format(origin=ORIGINS[type(target)], ruler=RULER_MM)),
             width=wide,
             height=high,
         )
@@ -202,10 +207,10 @@ def _too_small(target: Target | Rays, page: str, layout: PageLayout) -> Calibrat
         if need > there
     ]
     text = f"{size[0]:g} x {size[1]:g} mm"
-    named = f"{page} ({text})" if page in PAGES else text
+    named = f"{page} ({text})" if page in PAGES_MM else text
     return Code.PAGE_TOO_SMALL.refusal(
         f"{_title(target).partition(': ')[2]}: does not fit on {named}: with rays, rulers and a "
-        f"border of {BORDER:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
+        f"border of {BORDER_MM:g} mm it takes {needed[0]:.1f} x {needed[1]:.1f} mm, "
         f"{' and '.join(over)}",
         needed,
         size,
@@ -221,15 +226,15 @@ def on_paper(data: Mapping[str, Any]) -> Target | Rays:
 
 def page_size(page: str) -> tuple[float, float]:
     """Return a page's width and height, mm; raise SHAPE if it has none."""
-    if page in PAGES:
-        return PAGES[page]
+    if page in PAGES_MM:
+        return PAGES_MM[page]
     sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", page)
     size = (float(sides[1]), float(sides[2])) if sides else (0.0, 0.0)
-    if not 0 < min(size) <= max(size) <= MAX_PAGE:
+    if not 0 < min(size) <= max(size) <= MAX_PAGE_MM:
         raise Code.SHAPE.refusal(
-            f"page: expected one of {', '.join(PAGES)}, or width and height in mm up to "
-            f"{MAX_PAGE:g}, such as 300x200, got {page[:64]!r}",
-            list(PAGES),
+            f"page: expected one of {', '.join(PAGES_MM)}, or width and height in mm up to "
+            f"{MAX_PAGE_MM:g}, such as 300x200, got {page[:64]!r}",
+            list(PAGES_MM),
             page[:64],
         )
     return size
@@ -249,14 +254,14 @@ def scaled(target: T, measured_ruler: tuple[float, float]) -> T:
         CalibrationError: SCALE_MISMATCH: a ruler is more than 5 % off 100 mm, or the rulers differ
             by more than 0.5 %.
     """
-    factors = [length / RULER for length in measured_ruler]
+    factors = [length / RULER_MM for length in measured_ruler]
     for axis, factor in zip("xy", factors, strict=True):
         if not abs(factor - 1) <= MAX_SCALE_CHANGE:
             raise Code.SCALE_MISMATCH.refusal(
-                f"ruler along {axis}: expected {RULER:g} mm within {MAX_SCALE_CHANGE:.0%}, "
-                f"got {RULER * factor:g} mm; print at 100 %, not fitted to the page",
-                RULER,
-                RULER * factor,
+                f"ruler along {axis}: expected {RULER_MM:g} mm within {MAX_SCALE_CHANGE:.0%}, "
+                f"got {RULER_MM * factor:g} mm; print at 100 %, not fitted to the page",
+                RULER_MM,
+                RULER_MM * factor,
             )
     if abs(factors[0] - factors[1]) > MAX_UNEQUAL_SCALES:
         raise Code.SCALE_MISMATCH.refusal(
@@ -328,7 +333,7 @@ ADVICE: Final = (
 
 
 def _mm(metres: float) -> str:
-    return f"{MM * metres:.6g} mm"
+    return f"{MM_PER_METRE * metres:.6g} mm"
 
 
 # ---------------------------------------------------------------------- shapes
@@ -337,7 +342,7 @@ def _mm(metres: float) -> str:
 def _pattern(target: Target | Rays) -> tuple[tuple[Polygon | Disc, ...], Box]:
     checked(target, (Checkerboard, Charuco, CircleGrid, MarkerGrid, Rays), "make_sheet: target")
     if isinstance(target, Rays):
-        return quartered(MM * target.diameter / 2)
+        return quartered(MM_PER_METRE * target.diameter / 2)
     return ink(target)
 
 
@@ -345,13 +350,13 @@ def _pitch(target: Target | Rays) -> float:
     """Return the distance between two neighbouring points, mm."""
     match target:
         case Checkerboard() | Charuco():
-            return MM * target.square
+            return MM_PER_METRE * target.square
         case CircleGrid():
-            return MM * target.spacing
+            return MM_PER_METRE * target.spacing
         case MarkerGrid():
-            return MM * (target.marker + target.gap)
+            return MM_PER_METRE * (target.marker + target.gap)
         case Rays():
-            return MM * target.diameter
+            return MM_PER_METRE * target.diameter
 
 
 def _moved(shape: Polygon | Disc, x: float, y: float) -> Shape:

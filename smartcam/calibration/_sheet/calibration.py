@@ -46,11 +46,11 @@ if TYPE_CHECKING:
 KIND = "sheet"
 """Name of these calibrations' files in the store."""
 
-UNEXPLAINED = {True: 0.3, False: 0.1}
+MAX_UNEXPLAINED_PX = {True: 0.3, False: 0.1}
 """Largest residual, pixels, beyond the points' noise without a remark. With a lens (True) it allows
 for errors of print, edges and lens; without a lens it is a tenth of usual distortion."""
 
-ONE_SCALE = frozenset({"rigid", "similarity", "touches"})
+ONE_SCALE_MODELS = frozenset({"rigid", "similarity", "touches"})
 """Models of a plane that do not change the shape of a sheet."""
 
 
@@ -319,7 +319,7 @@ def calibrate_sheet(
                 "lens is not, and grows outside of the target's points"
             )
         )
-    if found.unexplained > UNEXPLAINED[camera is not None]:
+    if found.unexplained > MAX_UNEXPLAINED_PX[camera is not None]:
         whose = "the lens distorts" if camera is None else "the lens is another one"
         remarks.append(
             Code.POOR_FIT.remark(
@@ -398,4 +398,4 @@ def fit_corners(
         )
 
     found = fitted("auto")
-    return found if found.model in ONE_SCALE else fitted("similarity")
+    return found if found.model in ONE_SCALE_MODELS else fitted("similarity")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MAX_RMS_PX: Final = 5.0
 """Residual RMS, pixels, above which the views of pairs do not belong together."""
 
-WORST_PART: Final = 0.005
+MAX_RMS_SHARE: Final = 0.005
 """The limit MAX_RMS_PX as a part of the longer side of the image; the larger of both holds."""
 
 EXCHANGED_RESIDUAL_RATIO: Final = 1.05
@@ -49,7 +49,7 @@ MIN_APART_CHI2: Final = 30.0
 """The cameras stand apart if their distance, squared and in standard deviations, is more than this:
 chance alone exceeds it, over three axes, once in a million."""
 
-UPRIGHT: Final = 1.0
+RIGHT_ANGLE_TRACE: Final = 1.0
 """Trace of the rotation between two cameras, one of which is turned by a right angle."""
 
 
@@ -174,7 +174,7 @@ def check_fit(rms: float, sights: Sequence[Sight], bad: Sequence[Sight]) -> None
     ``rms``: that of a coordinate of the residuals, pixels. ``sights``: the used views. ``bad``: the
     views that fit worst.
     """
-    most = most_rms([one.view for one in sights], MAX_RMS_PX, WORST_PART)
+    most = most_rms([one.view for one in sights], MAX_RMS_PX, MAX_RMS_SHARE)
     if rms <= most:
         return
     named = ", ".join(f"{label(one.view, one.pose)} ({SIDES[one.camera]})" for one in bad)
@@ -192,7 +192,7 @@ def remark_sides(transform: Transform) -> list[Remark]:
     """Return a remark if the right camera is left of the left one, by ``T_right_left``."""
     along = transform.translation
     beside = along[0] > 0 and along[0] == np.abs(along).max()
-    if not beside or float(np.trace(transform.rotation)) <= UPRIGHT:
+    if not beside or float(np.trace(transform.rotation)) <= RIGHT_ANGLE_TRACE:
         return []
     return [
         Code.SWAPPED_SIDES.remark(

@@ -34,7 +34,7 @@ SIDES: Final = (LEFT, RIGHT)
 MAX_GUESSES: Final = 20
 """At most this many pairs are tried for a first guess of the transform."""
 
-GROSS_RATIO: Final = 10.0
+MIN_GROSS_ERROR_RATIO: Final = 10.0
 """The views of a pair do not belong together if its error is more than this many times the median,
 and above MIN_FAR_SHARE as well."""
 
@@ -181,7 +181,7 @@ def _rig(
             f"stereo: expected one transform from left to right that fits most of the "
             f"{len(pairs)} pairs, got none: were the views taken at the same moments?"
         )
-    far = max(GROSS_RATIO * least, MIN_FAR_SHARE * max(right.size))
+    far = max(MIN_GROSS_ERROR_RATIO * least, MIN_FAR_SHARE * max(right.size))
     numbers, nearest = [number for number, *_ in pairs], off.min(axis=1).tolist()
     apart = {number: one for number, one in zip(numbers, nearest, strict=True) if one > far}
     turned = [number for number, one in zip(numbers, off, strict=True) if one[0] > one[-1]]

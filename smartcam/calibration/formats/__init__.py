@@ -32,7 +32,7 @@ from smartcam.calibration.formats._cameras import (
     write_camera_info,
     write_cameras,
 )
-from smartcam.calibration.formats._file_format import MAX_FILE, MAX_YAML, Format, named
+from smartcam.calibration.formats._file_format import MAX_FILE_BYTES, MAX_YAML_BYTES, Format, named
 from smartcam.calibration.formats._opencv import PlaneMatrix
 from smartcam.calibration.formats._plain import frame_name, known
 from smartcam.calibration.formats._planes import plane_frame
@@ -140,14 +140,14 @@ SAMPLES: Mapping[str, Format[Sequence[HandEyeSample]]] = {
         ".json",
         named(samples.parse_json),
         samples.compose_json,
-        most=MAX_FILE,
+        most=MAX_FILE_BYTES,
     ),
     "moveit_yaml": Format(
         "samples of MoveIt's hand-eye panel, YAML",
         ".yaml",
         named(samples.parse_yaml),
         samples.compose_yaml,
-        most=MAX_YAML,
+        most=MAX_YAML_BYTES,
     ),
 }
 """Formats of samples of a hand-eye calibration; they have no names of frames."""
@@ -158,14 +158,14 @@ TRAJECTORIES: Mapping[str, Format[Sequence[Transform]]] = {
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_asl,
-        most=MAX_FILE,
+        most=MAX_FILE_BYTES,
     ),
     "euroc": Format(
         "EuRoC: nanoseconds, the quaternion's real part first",
         ".csv",
         trajectories.parse_csv,
         trajectories.compose_euroc,
-        most=MAX_FILE,
+        most=MAX_FILE_BYTES,
     ),
 }
 """Formats of poses over time; both are read alike, since the file's header decides."""

@@ -57,7 +57,7 @@ CameraForm: TypeAlias = Literal[
 ]
 """Names of the formats."""
 
-MAX_FILE: Final = 1 << 20
+MAX_FILE_BYTES: Final = 1 << 20
 """A file has at most this many bytes; a chain of eight cameras has four thousand."""
 
 _KALIBR: Final[dict[DistortionModel, str]] = {"plumb_bob": "radtan", "equidistant": "equidistant"}
@@ -154,7 +154,7 @@ def read_cameras(
     if form != "opencv":
         raise _cannot(form, "one file", "extrinsics as well")
     with Path(extrinsics).open("rb") as stream:
-        more = stream.read(MAX_FILE + 1).decode("utf-8", "replace")
+        more = stream.read(MAX_FILE_BYTES + 1).decode("utf-8", "replace")
     return wanted.read(path, size, more, unit=unit)
 
 
@@ -440,7 +440,7 @@ def _form(
     parse: Callable[..., CameraChain | Measured[CameraChain]],
     compose: Callable[[CameraChain], str] | None = None,
 ) -> Format[CameraChain]:
-    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE)
+    return Format(title=name, suffix=".yaml", parse=parse, compose=compose, most=MAX_FILE_BYTES)
 
 
 def _foreign(

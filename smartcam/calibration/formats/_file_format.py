@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     import os
     from collections.abc import Callable
 
-MAX_TEXT = 1 << 16
+MAX_TEXT_BYTES = 1 << 16
 """A file with one pose has at most this many bytes; usual ones have some hundred."""
 
-MAX_YAML = 1 << 18
+MAX_YAML_BYTES = 1 << 18
 """A YAML file with samples has at most this many bytes, which hold some 400 samples. PyYAML may
 take seconds for it."""
 
-MAX_FILE = 1 << 24
+MAX_FILE_BYTES = 1 << 24
 """A JSON or CSV file has at most this many bytes: a ground truth of EuRoC has 6 MB."""
 
 T = TypeVar("T")
@@ -55,7 +55,7 @@ class Format(Generic[T]):
     # Errors are those of :func:`~smartcam.calibration.formats.write_transform`, and ``WRONG_FRAME``
     compose: Callable[[T], str] | None = None  # None: it is only read
     head: str = ""  # text at the beginning of each file
-    most: int = MAX_TEXT  # largest number of bytes of a file
+    most: int = MAX_TEXT_BYTES  # largest number of bytes of a file
 
     def read(
         self,

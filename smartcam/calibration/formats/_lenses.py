@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats._cameras import CameraForm
     from smartcam.geometry import Transform
 
-HEAD: Final = 1 << 16
+HEAD_BYTES: Final = 1 << 16
 """The beginning of a file, this many bytes, decides which format it has."""
 
-MARKS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
+FORMAT_PATTERNS: Final[Mapping[CameraForm, re.Pattern[bytes]]] = {
     "euroc": re.compile(rb"^sensor_type\s*:\s*camera", re.MULTILINE),
     "kalibr": re.compile(rb"^cam0\s*:", re.MULTILINE),
     "mrcal": re.compile(rb"LENSMODEL_"),
@@ -74,8 +74,8 @@ def read_lenses(
         OSError: the file cannot be read.
     """
     with Path(path).open("rb") as stream:
-        head = stream.read(HEAD)
-    for form, mark in MARKS.items():
+        head = stream.read(HEAD_BYTES)
+    for form, mark in FORMAT_PATTERNS.items():
         if mark.search(head):
             found = read_cameras(path, form, size=size, unit=unit)
             lenses = tuple(Lens(one) for one in found.cameras)
@@ -83,9 +83,9 @@ def read_lenses(
     if head.lstrip().startswith(b"{"):
         return _ours(path)
     raise Code.UNKNOWN_FORMAT.refusal(
-        f"{path}: expected a calibration of smartcam, or one of {', '.join(MARKS)}; got none of "
-        "them",
-        list(MARKS),
+        f"{path}: expected a calibration of smartcam, or one of {', '.join(FORMAT_PATTERNS)}; got "
+        "none of them",
+        list(FORMAT_PATTERNS),
     )
 
 

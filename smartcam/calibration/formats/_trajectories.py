@@ -24,7 +24,7 @@ from smartcam.geometry import Code, Transform
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-MAX_LINE = 4096
+MAX_LINE_LENGTH = 4096
 """A line has at most this many characters; EuRoC's have some 200."""
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -78,8 +78,8 @@ def parse_csv(
     header: _Columns | None = None
     found: list[Transform] = []
     for index, line in enumerate(map(str.strip, text.splitlines()), 1):
-        if len(line) > MAX_LINE:
-            raise malformed(f"line {index}", f"{MAX_LINE} characters at most", len(line))
+        if len(line) > MAX_LINE_LENGTH:
+            raise malformed(f"line {index}", f"{MAX_LINE_LENGTH} characters at most", len(line))
         if not line or (header is not None and line.startswith("#")):
             continue
         if header is not None:

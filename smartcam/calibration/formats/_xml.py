@@ -12,7 +12,7 @@ from smartcam.exceptions import CalibrationError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MAX_ELEMENTS: Final = 20_000
+MAX_XML_ELEMENTS: Final = 20_000
 """A file has at most this many elements; a robot's description has some hundred."""
 
 
@@ -52,8 +52,10 @@ def load_xml(text: str) -> XmlElement:
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal count
         count += 1
-        if count > MAX_ELEMENTS or len(opened) > MAX_DEPTH:
-            raise malformed("file", f"{MAX_ELEMENTS} elements at most, {MAX_DEPTH} in each other")
+        if count > MAX_XML_ELEMENTS or len(opened) > MAX_DEPTH:
+            raise malformed(
+                "file", f"{MAX_XML_ELEMENTS} elements at most, {MAX_DEPTH} in each other"
+            )
         element = XmlElement(tag.rpartition(":")[2], attributes)
         opened[-1].children.append(element)
         opened.append(element)

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from smartcam.geometry import CameraModel, Transform
     from smartcam.geometry._inside import Array
 
-SAMPLES = 4
+SAMPLES_PER_SIDE = 4
 """A pixel is drawn from this many samples along each side."""
 
-QUIET = 1.0
+QUIET_ZONE_SQUARES = 1.0
 """Width of the white paper around a target, in sides of its squares or distances of its dots."""
 
 
@@ -67,7 +67,7 @@ def render(
     """
     cv2 = load("cv2")
     image = np.full(camera.size[::-1], background, dtype=np.float32)
-    paper = _outline(target, QUIET)
+    paper = _outline(target, QUIET_ZONE_SQUARES)
     left, top, right, bottom = _box(paper, camera, T_camera_target, 2 + 4 * blur)
     if left < right and top < bottom:
         u, v = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
@@ -75,7 +75,9 @@ def render(
         inked = white + (black - white) * _black(target, sheet)
         fine = background + (inked - background) * _rectangle(sheet, paper)
         if blur > 0:
-            fine = cv2.GaussianBlur(fine, (0, 0), blur * SAMPLES, borderType=cv2.BORDER_REPLICATE)
+            fine = cv2.GaussianBlur(
+                fine, (0, 0), blur * SAMPLES_PER_SIDE, borderType=cv2.BORDER_REPLICATE
+            )
         size = (right - left, bottom - top)
         image[top:bottom, left:right] = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
     if noise > 0:
@@ -149,13 +151,13 @@ def _sheet(
     slope = np.minimum(rays @ normal, -1e-6)  # beyond the horizon, so far away
     seen = (rays * (normal @ pose.translation / slope)[:, None] - pose.translation) @ pose.rotation
     rows, columns = u.shape
-    fine = (columns * SAMPLES, rows * SAMPLES)
+    fine = (columns * SAMPLES_PER_SIDE, rows * SAMPLES_PER_SIDE)
     parts = []
     for axis in (0, 1):
         coarse = seen[:, axis].reshape(rows, columns).astype(np.float32)
         place = cv2.resize(coarse, fine, interpolation=cv2.INTER_LINEAR)
         by_row, by_column = np.gradient(coarse)
-        grain = (np.abs(by_row) + np.abs(by_column)) / SAMPLES
+        grain = (np.abs(by_row) + np.abs(by_column)) / SAMPLES_PER_SIDE
         parts += [place, cv2.resize(grain, fine, interpolation=cv2.INTER_LINEAR)]
     return _Samples(parts[0], parts[2], parts[1], parts[3])
 

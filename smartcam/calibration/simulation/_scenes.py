@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 MIN_VISIBLE_POINTS = 4
 """A view must have at least this many points in the image."""
 
-GOLDEN = math.pi * (3.0 - math.sqrt(5.0))
+GOLDEN_ANGLE_RADIANS = math.pi * (3.0 - math.sqrt(5.0))
 """Angle between neighbours of a spiral that covers a disc evenly, radians."""
 
-EXACT = 1e-9
+EXACT_SIGMA_PX = 1e-9
 """Standard deviation, pixels, that views without noise state for their points."""
 
 
@@ -77,7 +77,7 @@ def view(
             MIN_VISIBLE_POINTS,
             len(ids),
         )
-    variance = max(sigma, EXACT) ** 2
+    variance = max(sigma, EXACT_SIGMA_PX) ** 2
     covariance = np.broadcast_to(variance * np.eye(2), (len(ids), 2, 2)).copy()
     return TargetView(
         target=target,
@@ -108,7 +108,7 @@ def around(
     poses = []
     for number in range(count):
         polar = tilt * math.sqrt((number + 0.5) / count)
-        azimuth = number * GOLDEN
+        azimuth = number * GOLDEN_ANGLE_RADIANS
         out = np.array(
             [
                 math.sin(polar) * math.cos(azimuth),

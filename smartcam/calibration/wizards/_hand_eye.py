@@ -25,7 +25,7 @@ from smartcam.calibration._verdict import VIEW_CURES, Judgement, refused
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.formats._robots import ROBOTS, pose_from
 from smartcam.calibration.wizards._pictures import (
-    MAX_PREVIEW,
+    MAX_PREVIEW_BYTES,
     PICTURE_TIMEOUT,
     how_to_take,
     taker,
@@ -331,7 +331,7 @@ class _Views:
             suggested=following.outline,
             title=f"{name}; orange: the next one, about",
         )
-        return view, svg if len(svg) <= MAX_PREVIEW else "", following
+        return view, svg if len(svg) <= MAX_PREVIEW_BYTES else "", following
 
     def _views(self) -> list[TargetView]:
         """Return the views, named by their numbers."""

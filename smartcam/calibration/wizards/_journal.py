@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAX_ENTRIES = 10_000
 """A journal has at most this many entries; a calibration by hand has some dozens."""
 
-MAX_LINE = 1 << 20
+MAX_LINE_BYTES = 1 << 20
 """An entry has at most this many bytes; a result of 900 localizations has a quarter of them."""
 
 _MAX_FILE = 1 << 28
@@ -125,9 +125,9 @@ class Journal:
             line = json.dumps(value, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         except (TypeError, ValueError, RecursionError) as exc:
             raise Code.NOT_STORABLE.refusal(f"{self.path}: cannot be stored: {exc}") from exc
-        if len(line) > MAX_LINE:
+        if len(line) > MAX_LINE_BYTES:
             raise Code.NOT_STORABLE.refusal(
-                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE} at most"
+                f"{self.path}: an entry of {len(line)} bytes, expected {MAX_LINE_BYTES} at most"
             )
         try:
             self._put(line)

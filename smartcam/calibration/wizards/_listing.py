@@ -9,7 +9,7 @@ from smartcam.calibration._files.load import KINDS
 from smartcam.calibration._files.store import read_document
 from smartcam.calibration._hand_eye.result import HandEyeCalibration
 from smartcam.calibration._sheet.calibration import SheetCalibration
-from smartcam.calibration.wizards._journal import MAX_LINE
+from smartcam.calibration.wizards._journal import MAX_LINE_BYTES
 from smartcam.exceptions import CalibrationError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from smartcam.calibration._files.directory import Folder
 
-MOST: Final = 200
+MAX_CALIBRATIONS: Final = 200
 """At most this many calibrations, the first by name, are read."""
 
 
@@ -28,7 +28,7 @@ def listing(folder: Folder) -> list[dict[str, Any]]:
     checked_at`` and ``stale`` of the last check (None without a check)``, problem`` (None without
     one). A file that cannot be read has a ``problem`` and nothing else.
     """
-    return [_row(folder, name) for name in folder.names()[:MOST]]
+    return [_row(folder, name) for name in folder.names()[:MAX_CALIBRATIONS]]
 
 
 def _row(folder: Folder, name: str) -> dict[str, Any]:
@@ -66,8 +66,8 @@ def _last_check(path: Path) -> dict[str, Any]:
     """Return the last whole line of a file of checks, which may be being written."""
     try:
         with path.open("rb") as stream:
-            stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE))
-            *whole, _ = stream.read(2 * MAX_LINE).split(b"\n")
+            stream.seek(max(0, stream.seek(0, 2) - 2 * MAX_LINE_BYTES))
+            *whole, _ = stream.read(2 * MAX_LINE_BYTES).split(b"\n")
     except FileNotFoundError:
         return {}
     try:

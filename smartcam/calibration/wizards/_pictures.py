@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 
 from smartcam._extras import load
-from smartcam.calibration._detection.image import MAX_SIDE, HasGrey
+from smartcam.calibration._detection.image import MAX_SIDE_PX, HasGrey
 from smartcam.geometry import Code
 
 if TYPE_CHECKING:
@@ -52,23 +52,23 @@ def taker(pictures: TakePicture | Pictures) -> TakePicture:
     return take
 
 
-MAX_PREVIEW: Final = 700_000
+MAX_PREVIEW_BYTES: Final = 700_000
 """Largest number of bytes of a picture's preview, which is kept with its step: a line of a journal
 holds 1 MiB."""
 
 PICTURE_TIMEOUT: Final = 60.0
 """Seconds that taking a picture and finding things in it may take."""
 
-MAX_PICTURE: Final = 1 << 26
+MAX_PICTURE_BYTES: Final = 1 << 26
 """Largest number of bytes of a picture's file: 20 million pixels of colour in a bitmap."""
 
 MAX_FILES: Final = 10_000
 """Largest number of entries of a folder of pictures, which is listed several times a second."""
 
-DEADLINE: Final = 25.0
+PICTURE_DEADLINE: Final = 25.0
 """Seconds to wait for a picture in a folder."""
 
-PERIOD: Final = 0.2
+LISTING_PERIOD: Final = 0.2
 """Seconds between two listings of a folder; a file with the same length in both is complete."""
 
 SUFFIXES: Final = frozenset(
@@ -85,8 +85,8 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
     BAD_PICTURE if the file has too many bytes or pixels, or is no picture; MissingExtraError:
     OpenCV is not installed.
     """
-    if len(data) > MAX_PICTURE:
-        raise _bad(name, f"{MAX_PICTURE} bytes at most", f"{len(data)}")
+    if len(data) > MAX_PICTURE_BYTES:
+        raise _bad(name, f"{MAX_PICTURE_BYTES} bytes at most", f"{len(data)}")
     cv2 = load("cv2")
     try:
         how = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
@@ -95,8 +95,10 @@ def decode_picture(data: bytes, name: str = "picture") -> NDArray[Any]:
         image = None
     if image is None or image.dtype not in (np.uint8, np.uint16):
         raise _bad(name, "a bitmap, JPEG, PNG or TIFF", f"{len(data)} bytes: {data[:16].hex(' ')}")
-    if max(image.shape) > MAX_SIDE:
-        raise _bad(name, f"{MAX_SIDE} pixels along each side", f"{image.shape[1]}x{image.shape[0]}")
+    if max(image.shape) > MAX_SIDE_PX:
+        raise _bad(
+            name, f"{MAX_SIDE_PX} pixels along each side", f"{image.shape[1]}x{image.shape[0]}"
+        )
     picture: NDArray[Any] = image
     return picture
 
@@ -123,7 +125,7 @@ class PictureFolder:
         CalibrationError: NO_PICTURE: the path is no folder.
     """
 
-    def __init__(self, path: str | os.PathLike[str], *, deadline: float = DEADLINE) -> None:
+    def __init__(self, path: str | os.PathLike[str], *, deadline: float = PICTURE_DEADLINE) -> None:
         self.path: Path = Path(path)
         self.deadline: float = deadline
         self._look()
@@ -154,7 +156,7 @@ class PictureFolder:
         try:
             async with asyncio.timeout(self.deadline):
                 while True:
-                    await asyncio.sleep(PERIOD)
+                    await asyncio.sleep(LISTING_PERIOD)
                     now = self._look()
                     fresh = [
                         name
@@ -214,7 +216,7 @@ class PictureFolder:
     def _read(self, name: str) -> NDArray[Any]:
         try:
             with (self.path / name).open("rb") as stream:
-                data = stream.read(MAX_PICTURE + 1)
+                data = stream.read(MAX_PICTURE_BYTES + 1)
         except OSError as exc:
             raise _bad(name, "a file that can be read", str(exc.strerror)) from exc
         return decode_picture(data, name)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from smartcam.calibration._plane.calibration import KIND, fit_plane
-from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration._printing.page_layout import RULER_MM
 from smartcam.calibration.wizards._marks import Mark, MarkCamera, clickable
 from smartcam.calibration.wizards._points import (
     MAX_POINTS,
@@ -159,7 +159,7 @@ class _MarkSource(PointSource):
             "be, so what the ruler really measures is the scale.",
             inputs=(ruler("ruler"),),
         )
-        return float((await ask(step))["ruler"]) / RULER
+        return float((await ask(step))["ruler"]) / RULER_MM
 
     async def _seen(self, step: Step) -> Sequence[Mapping[str, Any]]:
         """Ask for a picture; remember the direction of its y axis."""

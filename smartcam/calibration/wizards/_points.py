@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 MAX_POINTS = 200
 """A calibration has at most this many touches."""
 
-LEAST = 3
+MIN_TOUCHES = 3
 """A plane needs at least this many touches."""
 
 _SIGNS_OF_OUTLIERS = frozenset({Code.OUTLIER, Code.POOR_FIT, Code.NOT_PLANAR})
@@ -77,7 +77,7 @@ class PointSource(Touches, ABC):
 
     KIND: ClassVar[str]
     """Kind of the calibration in the store."""
-    FIRST: ClassVar[int] = LEAST
+    FIRST: ClassVar[int] = MIN_TOUCHES
     """Number of points that are touched before the result is shown."""
     POINTS: ClassVar[str]
     """Name of the points, for people."""
@@ -188,7 +188,7 @@ class PointSource(Touches, ABC):
         while True:
             while len(self.touches) < wanted:
                 await self.add()
-            wanted = LEAST
+            wanted = MIN_TOUCHES
             plane, notes, judgement = self._try_fit(robust=robust)
             judgement = _other_advice(judgement, again, len(self.touches))
             order = self._better_order() if judgement.verdict.level == "poor" else None
@@ -314,14 +314,14 @@ def _other_advice(judgement: Judgement, again: Collection[int], count: int) -> J
     number = judgement.number
     if judgement.option != "redo" or number not in again:
         return judgement
-    leave = "remove it, and touch another one" if count > LEAST else "touch more points first"
+    leave = "remove it, and touch another one" if count > MIN_TOUCHES else "touch more points first"
     text = (
         f"Not good enough: point {number} was touched again, and still does not agree with the "
         f"others. Look whether its mark has moved, whether another mark was touched, and whether "
         f"the tool is held as at the others; or {leave}"
     )
     verdict = replace(judgement.verdict, text=text)
-    return judgement._replace(verdict=verdict, option="remove" if count > LEAST else "more")
+    return judgement._replace(verdict=verdict, option="remove" if count > MIN_TOUCHES else "more")
 
 
 def about_step(

@@ -32,11 +32,11 @@ if TYPE_CHECKING:
     from smartcam.calibration._files.store import Document
     from smartcam.calibration.wizards._sequence import Wizard
 
-JOURNALS = 5
+MAX_EARLIER_JOURNALS = 5
 """Number of journals of earlier runs that are kept for each name."""
 
 
-MATRIX = ".yaml"
+MATRIX_SUFFIX = ".yaml"
 """Suffix of a file that holds only a matrix."""
 
 
@@ -184,11 +184,11 @@ class CalibrationService:
         document = read_document(source)
         if form is None and path.suffix == ".json":
             body = source.read_bytes()
-        elif form is None and path.suffix != MATRIX:
+        elif form is None and path.suffix != MATRIX_SUFFIX:
             raise Code.UNKNOWN_FORMAT.refusal(
                 f"{path.name}: expected the format to be named, or a file that ends in .json or "
-                f"{MATRIX}",
-                [".json", MATRIX],
+                f"{MATRIX_SUFFIX}",
+                [".json", MATRIX_SUFFIX],
                 path.suffix,
             )
         else:
@@ -258,7 +258,7 @@ def _put_aside(path: Path) -> None:
     except CalibrationError as exc:
         if exc.code != Code.BROKEN_FILE:
             raise
-    keep_backup(path, JOURNALS)
+    keep_backup(path, MAX_EARLIER_JOURNALS)
     path.unlink(missing_ok=True)
 
 

@@ -23,7 +23,7 @@ from smartcam.calibration._targets import Charuco
 from smartcam.calibration._views import TargetView
 from smartcam.calibration.wizards._marks import Mark
 from smartcam.calibration.wizards._pictures import (
-    MAX_PREVIEW,
+    MAX_PREVIEW_BYTES,
     PICTURE_TIMEOUT,
     how_to_take,
     taker,
@@ -313,7 +313,7 @@ def _found(image: Any, target: Target, lens: CameraModel | None) -> dict[str, An
     return {
         "view": view.to_data(),
         "camera": None if lens is None else lens.to_data(),
-        "preview": preview if len(preview) <= MAX_PREVIEW else "",
+        "preview": preview if len(preview) <= MAX_PREVIEW_BYTES else "",
     }
 
 

@@ -28,7 +28,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 Answers = dict[str, Any]
 """Answers by the names of their inputs."""
 
-_SHOWN = 40
+_MAX_SHOWN_LENGTH = 40
 """A message shows at most this many characters of a wrong answer."""
 
 _YES_NO = {"no": False, "yes": True}
@@ -37,7 +37,7 @@ _YES_NO = {"no": False, "yes": True}
 
 def _shown(value: object) -> str:
     text = repr(value)
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+    return text if len(text) <= _MAX_SHOWN_LENGTH else f"{text[:_MAX_SHOWN_LENGTH]}..."
 
 
 def _misfit(value: object, expected: str) -> ValueError:

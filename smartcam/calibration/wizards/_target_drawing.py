@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._views import TargetView
     from smartcam.geometry._inside import Array
 
-MAX_SIDE: Final = 640
+MAX_SIDE_PX: Final = 640
 """Largest width and height of the camera's picture in the preview, pixels."""
 
 CELLS: Final = (6, 8)
@@ -36,7 +36,7 @@ WIDTH: Final = 900.0
 BORDER, HEAD, FOOT = 20.0, 40.0, 60.0
 """Pixels of the preview beside, above and below its picture."""
 
-LONGEST: Final = 0.05
+LONGEST_RESIDUAL_SHARE: Final = 0.05
 """Approximate length at which the longest residual is drawn, as a part of the picture's width."""
 
 END: Final = "</svg>"
@@ -177,7 +177,7 @@ def _shaped(given: ArrayLike, count: int) -> Array:
 def _png(image: NDArray[np.uint8]) -> str:
     cv2 = load("cv2")
     height, width = image.shape
-    factor = MAX_SIDE / max(width, height)
+    factor = MAX_SIDE_PX / max(width, height)
     if factor < 1:
         size = (max(round(width * factor), 1), max(round(height * factor), 1))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -235,4 +235,4 @@ def _enlargement(longest: float) -> float:
     """Return 1, 2 or 5 times a power of ten, a factor that makes the longest residual visible."""
     if not longest > 1e-6:
         return 1.0
-    return round_down(LONGEST * WIDTH / longest)
+    return round_down(LONGEST_RESIDUAL_SHARE * WIDTH / longest)

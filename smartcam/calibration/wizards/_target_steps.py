@@ -6,7 +6,7 @@ import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from smartcam.calibration._printing.page_layout import RULER
+from smartcam.calibration._printing.page_layout import RULER_MM
 from smartcam.calibration._printing.sheets import scaled
 from smartcam.calibration._targets import target_from_data, target_to_data
 from smartcam.calibration.wizards._sequence import ask
@@ -59,11 +59,11 @@ def ruler(name: str, along: str = "") -> Number:
     """Return an input for the length of a printed ruler, mm."""
     return Number(
         name=name,
-        label=f"Length of the printed ruler{along}, which should be {RULER:g} mm",
+        label=f"Length of the printed ruler{along}, which should be {RULER_MM:g} mm",
         unit="mm",
-        default=RULER,
-        minimum=0.5 * RULER,
-        maximum=2.0 * RULER,
+        default=RULER_MM,
+        minimum=0.5 * RULER_MM,
+        maximum=2.0 * RULER_MM,
     )
 
 
@@ -84,7 +84,7 @@ async def ask_target(
     step = Step(
         id="rulers",
         title="Was the sheet printed true to size?",
-        description=f"Printers scale. Measure both rulers; leave {RULER:g} mm where the lengths "
+        description=f"Printers scale. Measure both rulers; leave {RULER_MM:g} mm where the lengths "
         "that were given are already those of the paper.",
         inputs=tuple(ruler(f"ruler_{axis}", f" along {axis}") for axis in "xy"),
     )

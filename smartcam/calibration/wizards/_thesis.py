@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
 
-from smartcam.calibration._files.directory import MAX_NAME, NAME, Folder
+from smartcam.calibration._files.directory import MAX_NAME_LENGTH, NAME, Folder
 from smartcam.calibration.wizards._hand_eye import hand_eye_wizard
 from smartcam.calibration.wizards._plane import plane_wizard
 from smartcam.calibration.wizards._services import CalibrationService
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 SMARTCAMERA: Final = "SMARTCAMERA"
 """Text that stands in place of a topic for the smart camera itself."""
 
-ABANDONED: Final = 1800.0
+ABANDONED_AFTER: Final = 1800.0
 """Seconds without a call after which a running calibration is given up; its journal stays."""
 
 FIXED: Final[Mapping[str, str]] = {
@@ -228,7 +228,7 @@ class ThesisCalibration:
     """
 
     def __init__(
-        self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED
+        self, folder: str | os.PathLike[str], name: str, *, abandoned: float = ABANDONED_AFTER
     ) -> None:
         self._files = CalibrationService(Folder(folder))
         self._name, self._abandoned = name, abandoned
@@ -599,10 +599,10 @@ def _first_step(asked: CalibrationStart, camera: str) -> Step:
         Text(
             name="name",
             label="Name of the calibration",
-            default=re.sub("[^A-Za-z0-9]+", "-", camera)[:MAX_NAME].strip("-") or "camera",
+            default=re.sub("[^A-Za-z0-9]+", "-", camera)[:MAX_NAME_LENGTH].strip("-") or "camera",
             pattern=NAME,
             expected="letters, digits, '-' and '_'",
-            max_length=MAX_NAME,
+            max_length=MAX_NAME_LENGTH,
         )
     ]
     if not asked.source:

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from smartcam.calibration.wizards._touches import Touch
     from smartcam.geometry._inside import Array
 
-CELLS = 24
+HEAT_MAP_CELLS = 24
 """Number of cells of the heat map along its longer side."""
 
-MARGIN = 0.25
+MARGIN_RATIO = 0.25
 """Width of the border around the drawn points, as a part of their extent."""
 
 
@@ -118,7 +118,7 @@ def _view(points: Array, others: Array) -> Array:
     near = flat[((flat > low - half) & (flat < high + half)).all(axis=1)]
     shown = np.vstack([low, high, near])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = MARGIN * float((high - low).max())
+    margin = MARGIN_RATIO * float((high - low).max())
     return np.array([low - margin, high + margin])
 
 
@@ -127,7 +127,9 @@ def _heat(
 ) -> list[list[float]] | None:
     """Return the predicted errors at the centres of the view's cells, mm."""
     low, extent = view[0], view[1] - view[0]
-    columns, rows = np.maximum(1, np.round(CELLS * extent / extent.max())).astype(int).tolist()
+    columns, rows = (
+        np.maximum(1, np.round(HEAT_MAP_CELLS * extent / extent.max())).astype(int).tolist()
+    )
     x = low[0] + extent[0] * (np.arange(columns) + 0.5) / columns
     y = low[1] + extent[1] * (np.arange(rows) + 0.5) / rows
     middles = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

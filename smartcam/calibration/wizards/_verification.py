@@ -45,10 +45,10 @@ WIZARD = "drift"
 CHECKS = "smartcam.checks/1"
 """Name of the format of a file of checks, in its first line."""
 
-KNOCK = 0.001
+KNOCK_M = 0.001
 """Shift of a camera that was knocked, metres: a check should notice it."""
 
-NOTICED = 0.95
+NOTICED_SHARE = 0.95
 """Part of all checks that should notice such a knock."""
 
 MAX_TOUCHES = 100
@@ -100,8 +100,8 @@ def touches_needed(
     calibration: PlaneCalibration,
     camera_point: ArrayLike,
     *,
-    knock: float = KNOCK,
-    noticed: float = NOTICED,
+    knock: float = KNOCK_M,
+    noticed: float = NOTICED_SHARE,
 ) -> int | None:
     """Return the number of touches of one mark that are needed to notice a knock.
 
@@ -117,13 +117,13 @@ def touches_needed(
     for count in range(1, MAX_TOUCHES + 1):
         # variance of the mean of the touches minus their place by the calibration
         variance = known + sigma**2 / count
-        shift = min(knock**2 / max(variance, knock**2 / _PLAIN), _PLAIN)
+        shift = min(knock**2 / max(variance, knock**2 / _MAX_SHIFT), _MAX_SHIFT)
         if _power(STALE_LEVEL if count == 1 else 0.5 * STALE_LEVEL, freedom, shift) >= noticed:
             return count
     return None
 
 
-_PLAIN = 1e4
+_MAX_SHIFT = 1e4
 """A shift whose square is more than this many times its variance is always noticed."""
 
 
@@ -325,7 +325,7 @@ class _DriftCheck(Touches):
 def _notes(figures: Mapping[str, Any]) -> list[str]:
     """Return the notes on a verdict, a line each."""
     count, offsets = figures["touches"], figures["offsets_mm"]
-    knock = f"a knock of {1e3 * KNOCK:g} mm is noticed in {100 * NOTICED:g} of 100 checks"
+    knock = f"a knock of {1e3 * KNOCK_M:g} mm is noticed in {100 * NOTICED_SHARE:g} of 100 checks"
     needed = figures["needed"]
     return [
         f"{_touches(count)}: {figures['rms_mm']:.3f} mm rms off, where noise explains "

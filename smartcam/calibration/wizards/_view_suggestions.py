@@ -57,7 +57,7 @@ LOOKS: Final = (
 )
 """Views to take, in the best order."""
 
-ROLLS: Final = (0.0, math.pi / 2, -math.pi / 2)
+ROLLS_RADIANS: Final = (0.0, math.pi / 2, -math.pi / 2)
 """Turns about the line of sight, radians, one after the other, which a camera on a robot needs."""
 
 
@@ -96,11 +96,13 @@ def _guided(views: Sequence[TargetView]) -> NextView | None:
         return None
     # parts will be about as far away as the target is
     distance = float(np.median(np.linalg.norm(lens.target_points, axis=1)))
-    found = suggest_views(lens, distance=distance, roll=ROLLS[len(views) % len(ROLLS)])
+    found = suggest_views(
+        lens, distance=distance, roll=ROLLS_RADIANS[len(views) % len(ROLLS_RADIANS)]
+    )
     return found[0] if found else None
 
 
-FOCAL: Final = 1.2
+FOCAL_LENGTH_WIDTHS: Final = 1.2
 """Focal length, in image widths, of the camera that outlines are drawn for."""
 
 
@@ -116,7 +118,7 @@ def outline(look: Look, target: Target, size: tuple[int, int]) -> Array:
     facing = np.diag([1.0, -1.0, -1.0])
     tilted = rotation_zyx(axis, 0.0, tilt) @ rotation_zyx(-axis, 0.0, 0.0) @ facing
     placed = corners @ (rotation_zyx(roll, 0.0, 0.0) @ tilted).T
-    focal, image = FOCAL * size[0], np.array(size, dtype=np.float64)
+    focal, image = FOCAL_LENGTH_WIDTHS * size[0], np.array(size, dtype=np.float64)
     away = 10.0 * float(np.linalg.norm(half))
     for _ in range(5):  # moving it a little nearer or farther changes the perspective slightly, too
         seen = focal * placed[:, :2] / (placed[:, 2:] + away)
