@@ -103,7 +103,7 @@ def _pack(field: Field, text: str | None) -> bytes:
 
 
 def _real(text: str) -> float:
-    """Parse a number; raise ValueError if it is none, or too large."""
+    """Parse a number; raise ValueError if it is no number, or too large."""
     if not _NUMBER.fullmatch(text.strip()):
         raise ValueError("no number")
     number = float(text)

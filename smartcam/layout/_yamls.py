@@ -17,8 +17,8 @@ with everything that it stands for: that is 50,000 applications of a scenario. P
 many in about 15 seconds."""
 
 MAX_DEPTH = 50
-"""Values of a YAML document are nested at most this deep; smartcam's files have ten levels. PyYAML
-examines all open brackets for each token, and recurses for each of them."""
+"""Largest number of values of a YAML document are nested this deep; smartcam's files have ten
+levels. PyYAML examines all open brackets for each token, and recurses for each of them."""
 
 MAX_BITS = 64
 """An integer has at most this many bits, as the largest in a container.
