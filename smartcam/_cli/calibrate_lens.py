@@ -31,7 +31,7 @@ MIN_NEW_VIEW_SHARE: Final = 0.05
 MAX_VIEWS: Final = 200
 
 MAX_DESCRIPTION: Final = 65_536
-"""Bytes of a target's description."""
+"""Largest number of bytes of a target's description."""
 
 
 @dataclass(slots=True)

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
     from smartcam.calibration.formats import LengthUnit
 
 MAX_FILE_BYTES: Final = 1 << 30
-"""Bytes of a file that is read, at most."""
+"""Largest number of bytes of a file that is read."""
 
 MAX_HEAD: Final = 1 << 12
-"""Bytes of a file in which a comment says the unit."""
+"""Largest number of bytes of a file in which a comment says the unit."""
 
 UNIT: Final = re.compile(rb"^(?:comment|#) unit (m|cm|mm|inch)\r?$", re.MULTILINE)
 """The comment with which :func:`save_cloud` says the unit."""

@@ -28,7 +28,7 @@ MAX_PLACE = (1 << 63) - 1
 """The last place that an entry may have."""
 
 MAX_REASON_CHARACTERS = 500
-"""Characters of the reasons of a gap, which may be several gaps in one."""
+"""Largest number of characters of the reasons of a gap, which may be several gaps in one."""
 
 MAX_DAMAGED_FILES = 3
 """Damaged spools that are kept beside the new one."""

@@ -33,7 +33,8 @@ VERSION = 2
 """Version of the store's own tables, in the file's ``user_version``."""
 
 MAX_COLUMNS = 500
-"""Columns of an application's table; what has more stays in ``results.value`` alone."""
+"""Largest number of columns of an application's table; what has more stays in ``results.value``
+alone."""
 
 MAX_COLUMN_CHARACTERS = 100
 

@@ -21,7 +21,7 @@ MAX_BETWEEN_BYTES: Final = 1 << 20
 """Bytes in a row that belong to no picture, after which it is no stream of pictures."""
 
 MAX_HEAD_BYTES: Final = 8 << 10
-"""Bytes before a picture in which its length is looked for."""
+"""Largest number of bytes before a picture in which its length is looked for."""
 
 START, END = b"\xff\xd8", b"\xff\xd9"
 SCAN, MIN_SEGMENT = 0xDA, 0xC0

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Mapping, Sequence
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Bytes of an answer's lines at most."""
+"""Largest number of bytes of an answer's lines."""
 
 MAX_REFUSALS: Final = 3
-"""Refusals for a password, such as by a nonce that is too old."""
+"""Largest number of refusals for a password, such as by a nonce that is too old."""
 
 MAX_LINE_BYTES: Final = 4096
-"""Bytes of a line before a chunk."""
+"""Largest number of bytes of a line before a chunk."""
 
 PIECE_BYTES: Final = 64 << 10
 """Bytes that are taken at a time."""

@@ -45,7 +45,8 @@ MAX_TIME_BEHIND_FIRST = 0.1
 all the time that it waits for a trigger."""
 
 MAX_REPLAY = 1 << 30
-"""Bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times a second."""
+"""Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
+a second."""
 
 
 @dataclass(slots=True)

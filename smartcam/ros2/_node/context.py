@@ -28,7 +28,7 @@ ROUTER = "tcp/localhost:7447"
 """Endpoint of the router of rmw_zenoh's nodes (``DEFAULT_RMW_ZENOH_SESSION_CONFIG.json5``)."""
 
 MAX_LONG_MESSAGE_BYTES = 1 << 26
-"""Bytes of long messages that wait to be said; the oldest of a topic go first."""
+"""Largest number of bytes of long messages that wait to be said; the oldest of a topic go first."""
 
 SETTINGS: Mapping[str, Any] = {
     # who publishes latched keeps messages by their times

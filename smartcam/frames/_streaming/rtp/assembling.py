@@ -15,7 +15,7 @@ START, END = 0x80, 0x40
 START_CODE: Final = b"\0\0\0\1"
 
 MAX_ACCESS_UNIT_BYTES: Final = 16 << 20
-"""Bytes of an access unit: one that is larger is damaged."""
+"""Largest number of bytes of an access unit: one that is larger is damaged."""
 
 
 class AccessUnit(NamedTuple):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 MAX_WAITING_PACKETS: Final = 1024
-"""Packets that may wait for missing ones."""
+"""Largest number of packets that may wait for missing ones."""
 
 LOOK_INTERVAL: Final = 0.005
 """Seconds between two looks at what is missing."""
@@ -35,7 +35,8 @@ PAUSE: Final = 0.008
 else that is only seen when the next frame comes."""
 
 MAX_PACKETS_REQUESTED: Final = 256
-"""Packets requested at a time; if more are missing, a key frame is requested instead."""
+"""Largest number of packets requested at a time; if more are missing, a key frame is requested
+instead."""
 
 REORDER_GRACE: Final = 0.02
 """Seconds that a packet is waited for where the sender sends none again."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MAX_LINES: Final = 1000
-"""Lines of a description that are read."""
+"""Largest number of lines of a description that are read."""
 
 CODINGS: Final = {"H264": H264, "H265": H265, "HEVC": H265, "JPEG": JPEG}
 """The encodings that can be received, by their names."""

@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 
 
 MAX_UNSENT_BYTES: Final = 64 << 10
-"""Bytes that may wait for a server; what would come on top, such as a report, is left out."""
+"""Largest number of bytes that may wait for a server; what would come on top, such as a report, is
+left out."""
 
 MAX_REFUSALS: Final = 3
-"""Refusals of one request for its password, such as by a nonce that is too old."""
+"""Largest number of refusals of one request for its password, such as by a nonce that is too
+old."""
 
 MAX_UNANSWERED: Final = 32
 """Unanswered requests that are remembered, since their answers may come late."""
