@@ -45,8 +45,8 @@ class Reordered(NamedTuple):
 
     Attributes:
         order: (N,), for each mark the index of the touch that belongs to it.
-        before: sigma of a touch that the order as given speaks of, in the unit of the touches.
-        after: sigma of a touch that the better order speaks of, in the unit of the touches.
+        before: sigma of a touch that the order as given speaks of, metres.
+        after: sigma of a touch that the better order speaks of, metres.
         sure: True if every other order that does as well moves far more touches: marks in a regular
             grid look alike from several sides.
     """
@@ -61,26 +61,23 @@ class Reordered(NamedTuple):
         """Indices of the marks that get another touch."""
         return tuple(np.flatnonzero(self.order != np.arange(len(self.order))).tolist())
 
-    def remark(self, numbers: NDArray[np.intp], mm: float = 1e3) -> Remark:
-        """Return a remark that tells of the better order.
-
-        ``numbers`` (N,): what texts call the points. ``mm``: millimetres for each unit of touches.
-        """
+    def remark(self, numbers: NDArray[np.intp]) -> Remark:
+        """Return a remark on the better order; ``numbers`` (N,): what texts call the points."""
         moved = [int(numbers[i]) for i in self.moved]
         which = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
         how = "exchanged" if len(moved) == 2 else "in the wrong order"
         several = "" if self.sure else "; more than one order does as well: touch them anew"
         return Code.WRONG_ORDER.remark(
             f"the touches of points {which} look {how}: as given they speak of a touch with a "
-            f"sigma of {mm * self.before:.3g} mm, put right of {mm * self.after:.3g} mm{several}"
+            f"sigma of {1e3 * self.before:.3g} mm, put right of {1e3 * self.after:.3g} mm{several}"
         )
 
 
 def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
     """Return the order of touches that explains them far better than the one given, if any does.
 
-    ``camera`` (N, 2), ``robot`` (N, 3), in the order as given. ``sigma``: the most that one
-    coordinate of a touch may be off, in the robot's unit.
+    ``camera`` (N, 2), ``robot`` (N, 3), metres, in the order as given. ``sigma``: the most that one
+    coordinate of a touch may be off, metres.
     """
     count = len(camera)
     if not 3 < count <= MAX_POINTS_TO_ORDER:
