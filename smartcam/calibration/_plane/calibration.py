@@ -544,8 +544,9 @@ def fit_plane(
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
             COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, UNIT_UNKNOWN: a field of more
-            than 20 m, SCALE_MISMATCH where ``rigid`` was asked for, or with ``robust`` OUTLIER: no map agrees with more than half
-            of the points; OUT_OF_FIELD: one left out is behind the plane's horizon.
+            than 20 m, SCALE_MISMATCH where ``rigid`` was asked for, or with ``robust`` OUTLIER: no
+            map agrees with more than half of the points; OUT_OF_FIELD: one left out is behind the
+            plane's horizon.
         MissingExtraError: SciPy is not installed.
         ValueError: no model has that name.
     """
