@@ -101,12 +101,14 @@ class FrameDriver(ABC):
     Attributes:
         times_frames: ``captured`` of its frames is their time on our clock, also where they have a
             ``device_time``; else the source finds it out.
+        lists_features: whether its device tells which features it has, if it has any.
         form: format of the stream since a feature changed it; None: as :meth:`open` returned it.
         waits_for: what the device waits for before each picture, as a text for errors, such as
             ``TriggerSource is Line1``; ``""``: it streams by itself. One that waits is never stuck.
     """
 
     times_frames: ClassVar[bool] = False
+    lists_features: ClassVar[bool] = True
     form: StreamFormat | None = None
     waits_for: str = ""
 
@@ -131,8 +133,8 @@ class FrameDriver(ABC):
             UnsupportedError: devices of this kind have none.
         """
         raise UnsupportedError(
-            f"{self.name}: a source of this kind has no features to read or set; those of gige: "
-            "and v4l2: have them"
+            f"{self.name}: a source of this kind has no features to read or set; those of gige:, "
+            "v4l2: and rtsp: have them"
         )
 
     async def watch_events(

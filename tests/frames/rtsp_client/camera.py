@@ -60,6 +60,7 @@ class Request:
     method: str
     url: str
     headers: dict[str, str]
+    body: str = ""
 
     @property
     def cseq(self) -> str:
@@ -152,7 +153,9 @@ class Session:
         start, *lines = text.strip().split("\r\n")
         headers = dict(line.split(": ", 1) for line in lines)
         method, url, *_ = start.split()
-        return Request(method, url, {key.lower(): value for key, value in headers.items()})
+        headers = {key.lower(): value for key, value in headers.items()}
+        body = await self.reader.readexactly(int(headers.get("content-length", "0")))
+        return Request(method, url, headers, body.decode())
 
     def answer(self, request: Request, status: str = "200 OK", body: str = "") -> None:
         camera, method = self.camera, request.method
