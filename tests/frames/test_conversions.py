@@ -383,7 +383,11 @@ async def test_jpegxl_is_converted_and_stands_beside_other_pictures(tmp_path: Pa
         ("cut.jxl", lambda whole: whole[:-20], "expected a whole picture"),
         ("none.jxl", lambda _: b"GIF89a", "expected a JPEG XL"),
         ("empty.jxl", lambda _: b"", "expected a JPEG XL"),
-        ("named.bin", lambda whole: whole, "expected video that FFmpeg decodes here, got piped jpegxl"),
+        (
+            "named.bin",
+            lambda whole: whole,
+            "expected video that FFmpeg decodes here, got piped jpegxl",
+        ),
         ("array.npy", lambda _: b"\x93NUMPY", "cannot be read: Invalid data"),
     ],
 )
