@@ -87,6 +87,8 @@ class Camera:
         default=lambda data, sequence, stamp: numbered(data, sequence, stamp)
     )
     channel: int = 0
+    sender: str = "127.0.0.1"
+    source: str = ""
     session: str = "17;timeout=60"
     base: bool = True
     every: float = 0.01
@@ -180,10 +182,11 @@ class Session:
             channels = f"{self.camera.channel}-{self.camera.channel + 1}"
             return f"RTP/AVP/TCP;unicast;interleaved={channels}"
         made = socket.socket(type=socket.SOCK_DGRAM)
-        made.bind(("127.0.0.1", 0))
+        made.bind((self.camera.sender, 0))
         self.udp = (made, int(found[1]))
         port = made.getsockname()[1]
-        return f"{said};server_port={port}-{port + 1};ssrc=00000007"
+        source = f";source={self.camera.source}" if self.camera.source else ""
+        return f"{said}{source};server_port={port}-{port + 1};ssrc=00000007"
 
     async def play(self) -> None:
         camera = self.camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ipaddress
 import re
 from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import unquote, urljoin, urlsplit
@@ -89,6 +90,7 @@ class RtspConversation:
         self._parameters = False  # whether the server takes GET_PARAMETER
         self._doing = "the connection"
         self._sockets: SocketPair | None = None
+        self._source = ""  # another host that sends the packets, as the server says
         self._alive: asyncio.Task[None] | None = None
 
     @property
@@ -97,6 +99,16 @@ class RtspConversation:
         if self._link is None:
             raise self._plan.wrong("it is not connected")
         return self._link
+
+    @property
+    def senders(self) -> tuple[str, ...]:
+        """Addresses that packets may come from: the server's, and the one that it says.
+
+        Behind a recorder the camera itself may send, and behind a router the address that a camera
+        says of itself means nothing here.
+        """
+        peer = str(self.link.peer[0]).partition("%")[0]
+        return (peer, self._source) if self._source else (peer,)
 
     async def set_up(self) -> None:
         """Ask for the stream, and have its packets come to us once it plays.
@@ -305,6 +317,7 @@ class RtspConversation:
             said = options_of(answer.header("transport"))
             self._check_transport(said, "RTP/AVP")
             self.ways = pair
+            self._source = _address(said.get("source", ""))
             ports = pair_of(said.get("server_port", ""), 65535)
             if ports is not None:
                 _open_firewall(pair, str(link.peer[0]), ports)
@@ -386,6 +399,15 @@ class RtspConversation:
     def _expect_ok(self, method: str, answer: ServerAnswer) -> None:
         if answer.status != 200:
             raise self._plan.wrong(f"{method}: {answer.status} {answer.reason}".rstrip())
+
+
+def _address(text: str) -> str:
+    """Return the address of one host, or "" where a text is none."""
+    try:
+        found = ipaddress.ip_address(text)
+    except ValueError:
+        return ""
+    return "" if found.is_multicast or found.is_unspecified else str(found)
 
 
 def _open_firewall(pair: SocketPair, host: str, ports: tuple[int, int]) -> None:

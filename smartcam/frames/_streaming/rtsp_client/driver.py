@@ -223,7 +223,7 @@ class _Playing:
         self._watching: asyncio.Task[None] | None = None
         self._receiver = StreamReceiver(
             *(conversation.ways, track.payload_type, 0.0, self._decoding.take, self._said_goodbye),
-            only=str(conversation.link.peer[0]).partition("%")[0],
+            only=conversation.senders,
             kind=kind,
             agreed=True,
             proofs=proofs,
