@@ -50,13 +50,13 @@ from smartcam.protocols import (
     Transport,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
 from smartcam.protocols._insight.answers import MAX_IMAGE
 from smartcam.protocols._insight.dialect import NATIVE
 from smartcam.protocols._insight.machine import InSightMachine
 from smartcam.protocols._insight.words import MAX_LINE
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, grown, streamed
+from tests.machines import B16, BID, THESIS
 
 UDP_BYTES = 65_507
 """Bytes of the largest datagram."""

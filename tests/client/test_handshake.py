@@ -25,7 +25,6 @@ from smartcam.models import Status
 from smartcam.observers import TraceEntry
 from smartcam.protocols import BVS, State
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import THESIS
 from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
@@ -52,6 +51,7 @@ from tests.handmade import (
     scripted,
     until,
 )
+from tests.machines import THESIS
 
 RUNNING = m.StatusReport(status=Status(0x280))
 ANSWERS = [m.ConnectAnswer(version=1), RUNNING, m.QueryAnswer(application=21)]

@@ -22,11 +22,11 @@ from smartcam.models import Status
 from smartcam.protocols import Frame, Machine, Role
 from smartcam.protocols import Transport as CarriedBy
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import MESSAGES, THESIS
 from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import RawClient, UdpClient
 from tests.handmade import until
+from tests.machines import MESSAGES, THESIS
 
 if TYPE_CHECKING:
     from smartcam.emulator._client_link import Trace

@@ -18,9 +18,9 @@ from smartcam.exceptions import FrameError, MessageError
 from smartcam.models import Status
 from smartcam.protocols import FramedDialect, Machine, Role, State, Transport
 from smartcam.protocols import messages as m
-from smartcam.protocols._bvs import B16, BID, CODES, THESIS
 from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy, ResultCode
 from tests.fuzz.fuzz_input import Choices
+from tests.machines import B16, BID, CODES, THESIS
 
 DIALECTS = (HANDBOOK, THESIS, B16, BID, B16.with_quirks(["code"]))
 QUIRKS = (

@@ -33,11 +33,10 @@ from smartcam.protocols import (
 )
 from smartcam.protocols import messages as m
 from smartcam.protocols._framed import framing
-from smartcam.protocols._framed.machine import TRANSITIONS
 from smartcam.protocols._inside import POLICIES, Event, Policy
 from tests.fuzz.fuzz_framing import write
 from tests.fuzz.fuzz_input import Choices, check_decoding
-from tests.machines import DIALECTS, EXAMPLES, one_by_one
+from tests.machines import DIALECTS, EXAMPLES, TRANSITIONS, one_by_one
 
 OWN_POLICY = None
 CHOSEN_POLICIES = (

@@ -14,8 +14,8 @@ from smartcam.emulator._generators import generator_names
 from smartcam.interpreters._inside import LocalizationsInterpreter
 from smartcam.layout._inside import TYPES, UNITS
 from smartcam.protocols import BVS
-from smartcam.protocols._bvs import B16, MESSAGES
 from smartcam.protocols._inside import MessageId
+from tests.machines import B16, MESSAGES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -25,9 +25,8 @@ from smartcam.protocols import (
 )
 from smartcam.protocols import messages as m
 from smartcam.protocols._base import UNDOCUMENTED
-from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import HANDBOOK, POLICIES, Policy
-from tests.machines import CODE, NO_ID
+from tests.machines import B16, BID, CODE, NO_ID, THESIS
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT
 TCP, UDP = Transport.TCP, Transport.UDP
