@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
-from smartcam.emulator._application import BUILTIN_APPLICATIONS
 from smartcam.emulator._client_link import MAX_INPUT
 from smartcam.emulator._links import TcpListener, _TcpLink
 from smartcam.emulator.faults._base import WireFault
@@ -24,6 +23,7 @@ from smartcam.protocols import Transport as CarriedBy
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
+from tests.emulator.builtins import BUILTIN_APPLICATIONS
 from tests.emulator.camera_wire import RawClient, UdpClient
 from tests.handmade import until
 from tests.machines import MESSAGES, THESIS

@@ -11,8 +11,7 @@ import pytest
 
 import smartcam.fleet
 from smartcam.emulator import Application, EmulatedCamera
-from smartcam.fleet import FleetFile, FleetServer
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetFile, FleetServer, MemoryBus
 from smartcam.protocols import messages as m
 from tests.fleet.fleetkit import until
 from tests.processes import free_place

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from smartcam.emulator import Application, EmulatedCamera
-from smartcam.fleet import FleetCamera, FleetFile, FleetServer
+from smartcam.fleet import FleetCamera, FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._agent.host import CATCH_UP, STATUS_DELAY
-from smartcam.fleet._bus.bus import MemoryBus
 from smartcam.fleet._inside import FleetAddress
 from smartcam.fleet._program.program import Program
 from smartcam.settings import CameraSettings

@@ -11,8 +11,7 @@ import pytest
 
 from smartcam.emulator import faults
 from smartcam.exceptions import ConnectionLostError, ReservationLostError, SmartCamError
-from smartcam.fleet import FleetCamera, ReservationLost
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import FleetCamera, MemoryBus, ReservationLost
 from smartcam.fleet._bus.wire import decode, decode_order, encode
 from smartcam.fleet._program.program_name import ProgramName, in_words
 from smartcam.protocols import messages as m

@@ -6,29 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from smartcam.calibration.formats._plain import load_yaml as load_plain
 from smartcam.emulator import EmulatedCamera, load_scenarios
-from smartcam.exceptions import CalibrationError, ConfigurationError
+from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
 from smartcam.layout import _yamls as yamls
 from smartcam.layout._inside import BadYamlError, load
-
-
-def laughs(levels: int) -> str:
-    """Return lists of ten of the one before."""
-    rows = [
-        f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * 10)}]" for level in range(1, levels)
-    ]
-    return "\n".join(["a0: &a0 [1, 2]", *rows])
-
-
-def merges(levels: int) -> str:
-    """Return mappings, each merged of the one before, twice."""
-    rows = [
-        f"m{level}: &m{level}\n  <<: [*m{level - 1}, *m{level - 1}]\n  k{level}: 1"
-        for level in range(1, levels)
-    ]
-    return "\n".join(["m0: &m0 {x: 1}", *rows])
+from tests.layout.bombs import laughs, merges
 
 
 @pytest.mark.parametrize("text", [laughs(30), merges(40), laughs(9), "- a\n" * 6000])
@@ -122,34 +105,3 @@ def test_emulated_camera_giant_active_is_refused() -> None:
 def test_layout_bombs_are_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match="nor is it YAML: line"):
         Layout.from_yaml(text)
-
-
-def test_calibration_formats_bombs_are_refused() -> None:
-    for text in (laughs(30), merges(40)):
-        with pytest.raises(CalibrationError) as told:
-            load_plain(text)
-        assert told.value.code == "MALFORMED"
-
-
-class _Count:
-    """A value that counts how often it is compared."""
-
-    compared = 0
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-    def __hash__(self) -> int:
-        return hash(self.number)
-
-    def __eq__(self, other: object) -> bool:
-        _Count.compared += 1
-        return bool(isinstance(other, _Count) and self.number == other.number)
-
-
-def test_scenario_ids_are_compared_once_each() -> None:
-    from smartcam.emulator._scenario.scenario import _first_double
-
-    _Count.compared = 0
-    assert _first_double(_Count(number) for number in range(5000)) is None
-    assert _Count.compared < 5000

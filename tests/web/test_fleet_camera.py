@@ -13,8 +13,7 @@ import pytest
 import smartcam.fleet
 from smartcam.emulator import EmulatedCamera
 from smartcam.exceptions import ConnectionTakenError
-from smartcam.fleet import Fleet, FleetFile
-from smartcam.fleet._bus.bus import MemoryBus
+from smartcam.fleet import Fleet, FleetFile, MemoryBus
 from smartcam.web import FleetSite
 from smartcam.web import _fleet as fleet_module
 from smartcam.web._fleet import LINGER, MAX_CAMERAS

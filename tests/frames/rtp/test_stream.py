@@ -36,9 +36,8 @@ from smartcam.frames._streaming.rtp.packets import (
     parse_rtcp,
 )
 from smartcam.frames._streaming.rtp.sockets import host_and_port
-from smartcam.frames._synthetic import stripes, write_stamp
 from tests.frames.drivers import GoneError, scripted
-from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped
+from tests.frames.pictures import HEIGHT, WIDTH, frame_of, stamped, stripes, write_stamp
 from tests.frames.rtp.ways import HOST, two_ports, way
 
 if TYPE_CHECKING:

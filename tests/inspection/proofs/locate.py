@@ -1,6 +1,6 @@
 """The judge of locating: errors against predicted ones, against the bound, and false finds.
 
-``python -m tests.proofs.locate [--scenes N] [--kind TEXT] [--photographs FOLDER] [--others]``
+``python -m tests.inspection.proofs.locate [--scenes N] [--kind TEXT] [--photographs FOLDER] [--others]``
 
 Draws parts at exact poses in scenes of 29 kinds, five pictures of each drawing, locates them by a
 model that was taught from another picture, and compares. No estimate without a bias can be better
@@ -417,7 +417,7 @@ def main() -> int:
         _say("\n".join(found))
         good &= not found and count > 0
     if given.others:
-        from tests.proofs import locating_of_others
+        from tests.inspection.proofs import locating_of_others
 
         _say("| way | found | missed | false | median px | median degrees | ms |")
         _say("\n".join(["| --- " * 7 + "|", *locating_of_others.compare(given.scenes, given.seed)]))

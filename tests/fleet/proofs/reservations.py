@@ -14,7 +14,7 @@ The camera does what it is told by the agent whose session is the newest. Wrong 
 * ``behind``: a command of a block is done after another program's command in this block;
 * ``twice``: a call is done twice.
 
-``python -m tests.proofs.reservations`` visits each variant and prints what was found.
+``python -m tests.fleet.proofs.reservations`` visits each variant and prints what was found.
 """
 
 from __future__ import annotations
