@@ -24,8 +24,7 @@ from smartcam.frames._codecs.bitmap import MAX_PIXEL_BYTES as MAX_BITMAP
 from smartcam.frames._codecs.jpeg import decode_jpeg
 from smartcam.frames._gige import description as _description
 from smartcam.frames._gige import expressions as _expressions
-from smartcam.frames._gige.features import GenicamFeatures
-from smartcam.frames._inside import entry_point, jpeg_header, read_bitmap
+from smartcam.frames._inside import GenicamFeatures, entry_point, jpeg_header, read_bitmap
 from smartcam.inspection import load_cell
 from smartcam.inspection._read.gs1 import elements
 from smartcam.inspection._read.tool import MAX_TEXT_BYTES as MAX_CODE_BYTES

@@ -36,8 +36,7 @@ from smartcam.frames._streaming.rtsp_client.ways import options_of
 from smartcam.frames._video import multipart as _multipart
 from smartcam.frames._video import redirects as _redirects
 from smartcam.gateway._lines import MAX_LINE_BYTES, NotWritableError, RequestReader
-from smartcam.makes import PCIC
-from smartcam.makes._ifm.chunks import ImageChunk, read_chunks
+from smartcam.makes import PCIC, ImageChunk, read_chunks
 from smartcam.makes._ifm.layouts import check_layout
 from smartcam.models import Status
 from smartcam.protocols import (
@@ -248,7 +247,7 @@ def _line_codec() -> LineCodec:
 
 
 def _line_server(pieces: list[bytes]) -> None:
-    from smartcam.emulator._line_codec import LineServer
+    from smartcam.emulator._inside import LineServer
 
     codec = _line_codec()
     server = LineServer(codec, Transport.TCP, lambda *_: None)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from smartcam._cli.calibrate import calibrate
 from smartcam._extras import load
 from smartcam.calibration import (
     CameraModel,
@@ -32,6 +31,7 @@ from smartcam.exceptions import FrameSourceError
 from smartcam.frames import FrameSink, StreamFormat, find_format
 from smartcam.registry import FRAMES
 from tests.cli.commandline import closed_port, emulators, run
+from tests.cli.inside import calibrate
 from tests.frames.drivers import ShowingDriver, frame
 from tests.processes import Outcome, Process, printed_by
 

@@ -13,7 +13,6 @@ import pytest
 
 from smartcam._client import handshake
 from smartcam._client._inside import Session, Try
-from smartcam._client.handshake import establish
 from smartcam.exceptions import (
     ConfigurationError,
     ConnectFailedError,
@@ -28,6 +27,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
+from tests.client.inside import establish
 from tests.handmade import (
     BUSY,
     CONNECT,

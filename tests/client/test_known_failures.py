@@ -17,7 +17,6 @@ import pytest
 
 import smartcam
 from smartcam import Camera, ConnectionLostError, FrameError, ResponseTimeoutError, Result
-from smartcam._client.link import Link
 from smartcam.testing import LinkProxy
 from smartcam.testing.proxy import Rule, SplitBytes
 from tests.client.camera_by_hand import (
@@ -32,6 +31,7 @@ from tests.client.camera_by_hand import (
     words,
 )
 from tests.client.clientkit import FAST, SHORT, SOON, balance, bid_by_hand, by_hand, gone, steps
+from tests.client.inside import Link
 from tests.handmade import until
 from tests.protocols.frame_times import give_frames
 

@@ -11,7 +11,8 @@ from tests.processes import PATIENCE
 if TYPE_CHECKING:
     import pytest
 
-    from smartcam.doctor._findings import Exit, Severity
+    from smartcam.doctor._findings import Severity
+    from tests.doctor.inside import Exit
 
 STEP = 1.0
 """Seconds of a step that is not meant to run out."""

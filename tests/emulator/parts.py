@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 from smartcam.emulator import Device, ManualClock, Quirks, Scenario
 from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.emulator._clock import NANOSECONDS
-from smartcam.emulator._generators import generator_names
 from smartcam.emulator._insight.commands import InSightCommands
 from smartcam.emulator._insight.device import InSightDevice
 from smartcam.emulator._scenario.timeline import Timeline
+from tests.emulator.inside import generator_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

@@ -6,10 +6,10 @@ import re
 from typing import TYPE_CHECKING
 
 from smartcam.emulator import load_scenario
-from smartcam.emulator._generators import generator_names
 from smartcam.protocols._inside import StatusCode, words
 from tests import ROOT
 from tests.emulator.builtins import BUILTIN_APPLICATIONS
+from tests.emulator.inside import generator_names
 
 if TYPE_CHECKING:
     from pathlib import Path

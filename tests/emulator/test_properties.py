@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from smartcam.emulator import Application, Device, EmulatedCamera, ManualClock, Quirks, faults
 from smartcam.emulator._client_link import MAX_INPUT
-from smartcam.emulator._links import TcpListener, _TcpLink
+from smartcam.emulator._links import TcpListener
 from smartcam.emulator.faults._base import WireFault
 from smartcam.emulator.faults._matching import FaultQueue
 from smartcam.emulator.faults._wire_effects import WireMessage, apply_faults
@@ -25,6 +25,7 @@ from smartcam.protocols._inside import HANDBOOK
 from tests.emulator import camera_wire as wire
 from tests.emulator.builtins import BUILTIN_APPLICATIONS
 from tests.emulator.camera_wire import RawClient, UdpClient
+from tests.emulator.inside import _TcpLink
 from tests.handmade import until
 from tests.machines import MESSAGES, THESIS
 

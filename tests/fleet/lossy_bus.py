@@ -9,8 +9,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 
 from smartcam.fleet import MemoryBus
-from smartcam.fleet._bus.bus import Data
-from tests.fleet.fleetkit import MemoryEnd
+from tests.fleet.inside import Data, MemoryEnd
 
 Fate = Callable[[str, bytes], Sequence[float]]
 """Tells after how many seconds each copy of something said arrives; none: it is lost."""

@@ -20,8 +20,8 @@ from tests.timed_loop import TimedLoop
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-    from smartcam.fleet._bus.bus import Publisher
     from smartcam.fleet._inside import Bus
+    from tests.fleet.inside import Publisher
 
 PREFIX = "smartcam/plant"
 NAME = "line1/cam3"

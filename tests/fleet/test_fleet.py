@@ -39,11 +39,9 @@ from smartcam.fleet import (
     FleetServer,
     MemoryBus,
 )
-from smartcam.fleet._bus.bus import Handle
-from smartcam.fleet._program.program_name import in_words
 from smartcam.makes import EmulatedIfm
 from tests.client.clientkit import cancelled
-from tests.fleet.fleetkit import MemoryEnd
+from tests.fleet.inside import Handle, MemoryEnd, in_words
 from tests.handmade import until
 
 LOOK = {"application": 21, "interpret_as": "text: string[20]"}

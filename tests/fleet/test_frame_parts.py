@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 import smartcam
 from smartcam.exceptions import RemoteProtocolError
-from smartcam.fleet._bus.bus import Data
 from smartcam.fleet._frames import collector as _frame_collector
 from smartcam.fleet._frames.collector import FrameCollector, Incoming
 from smartcam.fleet._frames.features import feature_fields, read_feature
@@ -29,8 +28,9 @@ from smartcam.fleet._frames.wire import MAX_FRAME_BYTES, FramePart, decode_part,
 from smartcam.fleet._inside import Keys
 from smartcam.frames import Feature
 from tests.client.clientkit import gone
-from tests.fleet.fleetkit import FLEET, PATIENCE, MemoryEnd, until
+from tests.fleet.fleetkit import FLEET, PATIENCE, until
 from tests.fleet.framekit import FramePlant, looking
+from tests.fleet.inside import Data, MemoryEnd
 from tests.fleet.lossy_bus import LossyBus, only
 from tests.fleet.partner import partner
 from tests.frames.drivers import frame

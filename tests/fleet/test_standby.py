@@ -21,14 +21,16 @@ from smartcam.exceptions import (
     TriggerTimeoutError,
 )
 from smartcam.fleet import Fleet, FleetCamera, FleetFile, MemoryBus
-from smartcam.fleet._agent.agent import Agent
-from smartcam.fleet._agent.claims import ASK_TIMEOUT, HOLD_OFF, RETURN_WAIT
-from smartcam.fleet._file.standby import Standby
 from smartcam.fleet._inside import Keys
-from smartcam.fleet._program.program import Program
 from smartcam.models import Connected, Disconnected, Reconnected
 from smartcam.settings import Address, CameraSettings
-from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, MemoryEnd, NumberedCamera, until
+from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
+from tests.fleet.inside import Agent, MemoryEnd, Program, Standby
+
+ASK_TIMEOUT = 0.5
+HOLD_OFF = 0.2
+RETURN_WAIT = 4.0
+
 
 QUICK = Backoff(initial=0.1, maximum=0.2, jitter=0.0)
 STANDS_BY = Standby.model_validate({})

@@ -13,12 +13,11 @@ import smartcam
 from smartcam import Backoff
 from smartcam.exceptions import ConnectionTakenError, ResponseTimeoutError
 from smartcam.fleet import FleetCamera, MemoryBus
-from smartcam.fleet._agent.agent import Agent
 from smartcam.fleet._agent.host import Host
 from smartcam.fleet._inside import Bus, Keys
-from smartcam.fleet._program.program import Program
 from smartcam.settings import Address, CameraSettings
 from tests.fleet.fleetkit import FLEET, LAYOUT, NAME, PATIENCE, NumberedCamera, until
+from tests.fleet.inside import Agent, Program
 
 QUICK = Backoff(initial=0.1, maximum=0.2, jitter=0.0)
 

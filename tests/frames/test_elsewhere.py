@@ -19,13 +19,15 @@ from smartcam import frames
 from smartcam.exceptions import FrameFormatError, FrameSourceError, SmartCamError
 from smartcam.fleet._inside import make_certificates
 from smartcam.frames import RtspServer
-from smartcam.frames._video.redirects import MAX_REDIRECTS
 from tests.frames.gige.camera import camera as gige_camera
 from tests.frames.pictures import served as listening
 from tests.frames.pictures import write_video
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
+
+MAX_REDIRECTS = 5
+
 
 pytestmark = pytest.mark.real_time
 

@@ -13,10 +13,10 @@ from smartcam import frames
 from smartcam.frames import RtpSender
 from smartcam.frames._gige.discovery import MAX_ANSWERS_OF_ONE_ADDRESS, Network, _Asking
 from smartcam.frames._gige.stream import StreamSocket
-from smartcam.frames._streaming.rtp.packets import RtpPacket
 from smartcam.frames._streaming.rtp.receiver import NEW_HOST_DELAY
 from smartcam.frames._streaming.rtsp.delivery import _ControlPort
 from tests.frames.gige.camera import camera as gige_camera
+from tests.frames.inside import RtpPacket
 from tests.frames.rtp.test_stream import DRAWN, LIMIT, SIZE, number_of, seen
 from tests.frames.rtp.ways import HOST, two_ports
 

@@ -21,4 +21,7 @@ def give_frames(monkeypatch: pytest.MonkeyPatch, **times: float) -> None:
 
 def small_reads(**sizes: Any) -> AbstractContextManager[object]:
     """Have a framer read into small buffers, such as ``FIRST_READ=16`` bytes."""
-    return mock.patch.multiple(framing, MIN_OWN_BUFFER_BYTES=32, **sizes)
+    patched: AbstractContextManager[object] = mock.patch.multiple(
+        framing, MIN_OWN_BUFFER_BYTES=32, **sizes
+    )
+    return patched

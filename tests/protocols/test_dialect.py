@@ -24,7 +24,6 @@ from smartcam.protocols import (
     Verdict,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._base import UNDOCUMENTED
 from smartcam.protocols._framed.dialect import MAX_KNOWN, SWITCH_CODES
 from smartcam.protocols._inside import HANDBOOK, ResultCode
 from tests.machines import (
@@ -41,6 +40,7 @@ from tests.machines import (
     THESIS,
     label,
 )
+from tests.protocols.inside import UNDOCUMENTED
 from tests.strategies import over
 
 CAMERA, CLIENT = m.Sender.CAMERA, m.Sender.CLIENT

@@ -30,7 +30,6 @@ from smartcam.protocols import (
     Transport,
 )
 from smartcam.protocols import messages as m
-from smartcam.protocols._framed.machine import MAX_FAMILIAR
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK, Event, Policy, ResultBurst
 from tests.machines import (
     B16,
@@ -53,6 +52,9 @@ from tests.machines import (
     request_for,
 )
 from tests.strategies import over
+
+MAX_FAMILIAR = 64
+
 
 TCP, UDP = Transport.TCP, Transport.UDP
 CLIENT, CAMERA = m.Sender.CLIENT, m.Sender.CAMERA

@@ -45,8 +45,8 @@ from smartcam.models import (
 from smartcam.recording import BagCounts, BagRecorder, Recorder, load_recording, write_bag
 from smartcam.recording._bags.items import topic_of_camera
 from smartcam.recording._inside import BagConversion
-from smartcam.recording._mcap.form import nanoseconds as recorded_time
 from tests.recording.bagkit import nanoseconds, on, read, read_by_rosbags, read_raw
+from tests.recording.inside import nanoseconds as recorded_time
 from tests.recording.recordingkit import COUNTER, URL, at, container, containers, session, write
 from tests.ros2.typekit import forget_stores
 

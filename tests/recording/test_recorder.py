@@ -26,7 +26,7 @@ from smartcam.exceptions import (
 from smartcam.models import Connected, Disconnected, Result, StatusChanged
 from smartcam.recording import Recorder, load_recording
 from smartcam.recording import _recorder as recorder
-from smartcam.recording._mcap.form import KINDS
+from tests.recording.inside import KINDS
 from tests.recording.recordingkit import COUNTER, at, frame, record, write
 
 

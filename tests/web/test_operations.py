@@ -20,10 +20,12 @@ from smartcam.exceptions import ConfigurationError, MissingExtraError, SmartCamE
 from smartcam.fleet import Fleet, FleetFile, FleetServer, MemoryBus
 from smartcam.fleet._inside import exposition, read_numbers
 from smartcam.web import OperationsSite
-from smartcam.web._connections import MAX_CONNECTIONS
 from tests import ROOT
 from tests.fleet.fleetkit import PATIENCE, NumberedCamera, until
 from tests.processes import free_place
+
+MAX_CONNECTIONS = 64
+
 
 parser = pytest.importorskip("prometheus_client.parser")
 

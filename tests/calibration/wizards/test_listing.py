@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Folder, PlaneCalibration, fit_plane
-from smartcam.calibration._files.directory import MAX_NAME
-from smartcam.calibration._files.store import BACKUPS, read_document, write
 from smartcam.calibration._inside import listing
-from smartcam.calibration._printing.page_layout import RULER
 from smartcam.calibration.wizards import CalibrationService
-from smartcam.calibration.wizards._services import JOURNALS
 from tests import ROOT
+from tests.calibration.inside import read_document, write
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+BACKUPS = 3
+JOURNALS = 5
+MAX_NAME = 64
+RULER = 100.0
+
 
 MARKS = np.array([(0.0, 0.0), (0.3, 0.0), (0.0, 0.2), (0.3, 0.2)])
 

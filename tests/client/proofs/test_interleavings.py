@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from smartcam._client.results import PendingTrigger, Results
+from tests.client.inside import PendingTrigger, Results
 from tests.client.proofs.interleavings import FRAMED, ROWS, Variant, table, visit
 
 PROMISES = Path(__file__).parents[3] / "results" / "promises.md"

@@ -29,8 +29,9 @@ from typing import Any, Literal
 
 from smartcam.exceptions import ReservationLostError
 from smartcam.fleet._agent.agent import CallNumbers
-from smartcam.fleet._agent.gate import Gate, InLine
-from smartcam.fleet._program.caller import Caller, Lease, Met
+from smartcam.fleet._agent.gate import InLine
+from smartcam.fleet._program.caller import Lease, Met
+from tests.fleet.inside import Caller, Gate
 
 Move = tuple[Any, ...]
 Wrong = Literal["between", "behind", "twice"]

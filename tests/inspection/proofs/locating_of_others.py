@@ -1,4 +1,4 @@
-"""OpenCV's ways of finding a part, in the scenes that :mod:`tests.inspection.proofs.locate` draws."""
+"""OpenCV's ways of finding a part, in the scenes of :mod:`tests.inspection.proofs.locate`."""
 
 from __future__ import annotations
 

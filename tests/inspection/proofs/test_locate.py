@@ -1,4 +1,4 @@
-"""The proof of locating in its short form; ``python -m tests.inspection.proofs.locate`` is the long one."""
+"""The short form of the proof of locating, ``python -m tests.inspection.proofs.locate``."""
 
 from __future__ import annotations
 
