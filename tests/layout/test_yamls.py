@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from smartcam.emulator import EmulatedCamera, load_scenarios
+from smartcam.emulator import EmulatedCamera, load_scenario, load_scenarios
 from smartcam.exceptions import ConfigurationError
 from smartcam.layout import Layout
+from smartcam.layout import _yaml_files as yaml_files
 from smartcam.layout import _yamls as yamls
 from smartcam.layout._inside import BadYamlError, load
 from tests.layout.bombs import laughs, merges
@@ -105,3 +107,38 @@ def test_emulated_camera_giant_active_is_refused() -> None:
 def test_layout_bombs_are_refused(text: str) -> None:
     with pytest.raises(ConfigurationError, match="nor is it YAML: line"):
         Layout.from_yaml(text)
+
+
+def test_scenario_with_many_mistakes_tells_some(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    meant = yaml_files._meant
+
+    def counted(*given: Any) -> str:
+        asked.append(given)
+        return meant(*given)
+
+    monkeypatch.setattr(yaml_files, "_meant", counted)
+    path = tmp_path / "a.yaml"
+    path.write_text("".join(f"no{n}: 1\n" for n in range(500)))
+    with pytest.raises(ConfigurationError, match="no0"):
+        load_scenario(path)
+    assert len(asked) == 20
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 1000, "{a: " * 1000, "- " * 1000, "\n".join(" " * n + "a:" for n in range(1000))],
+)
+def test_yaml_nested_too_deep_says_where(text: str) -> None:
+    with pytest.raises(
+        BadYamlError, match=f"nested too deep: expected {yamls.MAX_DEPTH} "
+    ) as caught:
+        load(text)
+    assert caught.value.line is not None
+
+
+def test_yaml_nested_as_deep_as_it_may_be_is_read() -> None:
+    text = "[" * (yamls.MAX_DEPTH - 1) + "1" + "]" * (yamls.MAX_DEPTH - 1)
+    assert str(load(text)) == text
