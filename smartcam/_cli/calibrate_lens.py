@@ -214,10 +214,10 @@ def _files(pictures: Sequence[str]) -> Iterator[Path]:
 
 def _view_of_file(path: Path, target: Target) -> TargetView:
     from smartcam.calibration import find_target
-    from smartcam.calibration._inside import MAX_PICTURE, decode_picture
+    from smartcam.calibration._inside import MAX_PICTURE_BYTES, decode_picture
 
     with naming(str(path)), path.open("rb") as stream:
-        data = stream.read(MAX_PICTURE + 1)
+        data = stream.read(MAX_PICTURE_BYTES + 1)
     return find_target(decode_picture(data, path.name), target, name=path.name)
 
 

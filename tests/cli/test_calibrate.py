@@ -15,11 +15,14 @@ from typing import Any
 
 import pytest
 
-from smartcam._cli.calibrate import STALE, calibrate
 from smartcam.calibration import PlaneCalibration, fit_plane
 from smartcam.emulator._inside import PIECES
 from tests.cli.commandline import closed_port, emulators, run
+from tests.cli.inside import calibrate
 from tests.processes import PATIENCE, Outcome, Process, printed_by
+
+STALE = 7
+
 
 YAW, OFFSET = math.radians(120.0), (0.5, -0.1, 0.02)
 

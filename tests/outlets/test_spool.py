@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from smartcam.exceptions import ConfigurationError
-from smartcam.outlets._entry import OutletAccount, OutletEntry
+from smartcam.outlets import OutletAccount, OutletEntry
 from smartcam.outlets._spool import ROW_BYTES, Spool, read_account
 
 

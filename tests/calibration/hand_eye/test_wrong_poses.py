@@ -21,7 +21,7 @@ from tests.calibration.scenes import CAMERA, refused, scene
 
 if TYPE_CHECKING:
     from smartcam.calibration import TargetView
-    from smartcam.calibration._hand_eye.equations import Setup
+    from tests.calibration.inside import Setup
 
 TRUTH = scene("eye-in-hand", poses=6)
 NOISE = RobotSigmas(math.radians(0.02), 1e-4)

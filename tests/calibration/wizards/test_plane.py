@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import PlaneCalibration
-from smartcam.calibration._files.store import read_document
 from smartcam.calibration.wizards import WizardSession, plane_wizard
-from smartcam.calibration.wizards._journal import Journal
-from smartcam.calibration.wizards._marks import MAX_MARKS
+from tests.calibration.inside import Journal, read_document
 from tests.calibration.wizards.bench import GRID, OFFSET, Bench, say, where
 from tests.processes import printed_by
+
+MAX_MARKS = 25
 
 
 def begin(

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from smartcam.calibration import Checkerboard, SheetCalibration
-from smartcam.calibration._files.store import read_document
 from smartcam.calibration.simulation import render
 from tests.calibration import sheetkit
+from tests.calibration.inside import read_document
 from tests.calibration.sheetkit import (
     CAMERA,
     LIES,
