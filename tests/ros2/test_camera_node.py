@@ -297,7 +297,7 @@ async def test_the_agent_s_settings_are_those_that_are_shown() -> None:
 def test_options_that_cannot_be() -> None:
     for wrong in [{"diagnostics_period": 0.0}, {"status_rate": float("nan")}]:
         with pytest.raises(ConfigurationError, match=next(iter(wrong))):
-            CameraNodeOptions(**wrong)
+            CameraNodeOptions(**wrong)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("refuses", ["~/status", "/diagnostics", "~/transition_event"])

@@ -153,10 +153,11 @@ class WebStream:
         ]
         self._writer.write("\r\n".join((*lines, "", "")).encode())
         self._rest = b""
+        answer = await self._head()
         for _ in range(MAX_INTERIM_ANSWERS):
-            answer = await self._head()
             if answer.status not in INTERIM:
                 break
+            answer = await self._head()
         return answer
 
     async def _head(self) -> WebAnswer:
