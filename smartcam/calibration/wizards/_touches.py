@@ -112,7 +112,7 @@ class Touches:
 
     @property
     def typed(self) -> bool:
-        """Whether the robot's pose is typed."""
+        """True if the user types the robot's pose."""
         return self._read_robot is None
 
     @property
