@@ -46,6 +46,8 @@ _VERBS = ("trigger", "switch")
 _ENTRIES = ("result/", "error/", "gap/")
 """Beginnings of the topics of entries."""
 
+_NO_TOPIC = dict.fromkeys(map(ord, "+#\0"), "_")
+
 
 def _broker(text: str) -> str:
     try:
@@ -199,6 +201,10 @@ class MqttOutlet(Outlet[MqttSettings]):
 
         inner.publish, inner.on_publish = publish, on_publish
 
+    def _topic(self, kind: str, camera: str) -> str:
+        """Return the topic of a camera; what no topic may have in its name is _ there."""
+        return f"{self.settings.topic}/{kind}/{camera.translate(_NO_TOPIC)}"
+
     async def deliver(self, entries: Sequence[OutletEntry]) -> None:
         """Publish entries to TOPIC/KIND/CAMERA; the broker has acknowledged each one then."""
         messages = [_message(entry) for entry in entries]
@@ -207,7 +213,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         bad = next((place for place, size in enumerate(sizes) if size > largest), None)
         if bad is not None:
             count = bad
-        topics = [f"{self.settings.topic}/{one.kind}/{one.camera or 'all'}" for one in entries]
+        topics = [self._topic(one.kind, one.camera or "all") for one in entries]
         await self._while_here(
             [
                 self._client.publish(topic, message, qos=1)
@@ -293,7 +299,7 @@ class MqttOutlet(Outlet[MqttSettings]):
                 camera = self._fresh.pop()
                 try:
                     text = object_text({"camera": camera, **self._states[camera]})
-                    topic = f"{self.settings.topic}/state/{camera}"
+                    topic = self._topic("state", camera)
                     await client.publish(topic, text, qos=1, retain=True)
                 except BaseException:
                     self._fresh.add(camera)

@@ -116,6 +116,19 @@ async def test_what_the_broker_refuses_is_told_and_not_lost(tmp_path: Path) -> N
         assert outlets.states["mqtt"].account.spooled == 1
 
 
+async def test_a_camera_whose_name_is_no_topic_keeps_nothing_back(tmp_path: Path) -> None:
+    async with broker(tmp_path) as there, listener(there.port, "smartcam/+/#") as heard:
+        async with Outlets(section(there.url), tmp_path) as outlets:
+            outlets.state_changed("a+b", {"connected": True})
+            for name in ("a+b/#", "c"):
+                outlets.offer_result(result(1, name))
+            await until(lambda: outlets.states["mqtt"].account.delivered == 2)
+        await until(lambda: sum("result" in str(one.topic) for one in heard) == 2)
+        topics = {str(one.topic): json.loads(one.payload) for one in heard}
+    assert topics["smartcam/result/a_b/_"]["camera"] == "a+b/#"
+    assert topics["smartcam/state/a_b"]["camera"] == "a+b"
+
+
 async def test_an_answer_that_the_broker_refuses_keeps_no_result_back(tmp_path: Path) -> None:
     import aiomqtt
     from paho.mqtt.packettypes import PacketTypes
