@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from smartcam.calibration._files import store
 from smartcam.calibration._files.store import keep_backup, read, read_document, replace_file, write
 from smartcam.calibration._hand_eye.closed_forms import LINEAR
 from smartcam.calibration._hand_eye.equations import Setup
@@ -11,6 +12,7 @@ from smartcam.calibration._lens.poses import half_turned
 from smartcam.calibration._printing.sheets import Rays
 from smartcam.calibration._solvers import CameraPosition2D, RealWorldPosition
 from smartcam.calibration.formats._cameras import CameraForm
+from smartcam.calibration.simulation import _scenes
 from smartcam.calibration.wizards._journal import Journal
 from smartcam.calibration.wizards._view_suggestions import outline
 
@@ -22,6 +24,7 @@ __all__ = [
     "Rays",
     "RealWorldPosition",
     "Setup",
+    "_scenes",
     "apply_homography",
     "fit_homography",
     "half_turned",
@@ -31,6 +34,7 @@ __all__ = [
     "read",
     "read_document",
     "replace_file",
+    "store",
     "with_lens",
     "write",
 ]
