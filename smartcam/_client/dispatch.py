@@ -39,7 +39,7 @@ FEWEST_GATHERED = 6
 """Events of a chunk that are worth to be looked through: two results, each between statuses."""
 
 MAX_NOTICE = 4096
-"""Characters of a camera's remark that are kept."""
+"""Largest number of characters of a camera's remark that are kept."""
 
 _LOGGED = (
     (

@@ -144,8 +144,8 @@ PARSERS: tuple[Parser, ...] = (
         "calibrations",
         from_file(_read_stored, "a.json"),
         _STORED,
-        store.MAX_FILE,
-        "calibration._files.store.MAX_FILE",
+        store.MAX_FILE_BYTES,
+        "calibration._files.store.MAX_FILE_BYTES",
     ),
     *(
         Parser(

@@ -126,7 +126,7 @@ def test_calibrate_ends_with_lines_that_work_as_printed(url: str, tmp_path: Path
 
 
 def test_calibrate_y_down_is_kept_and_wanted_by_the_check(url: str, tmp_path: Path) -> None:
-    lines = as_lines({**ABOUT, "side": "unknown"}, {}, {}, *TOUCHES, {}, {})
+    lines = as_lines({**ABOUT, "side": "unknown"}, {}, {}, *TOUCHES, {"next": "accept"}, {})
     calibrating(url, tmp_path, lines, "--json", "--y-down").done()
     assert PlaneCalibration.load(tmp_path / "plane.json").y_down is True
     calibrating(url, tmp_path, [], "--check", "plane").failed(

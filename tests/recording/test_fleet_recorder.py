@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from smartcam.exceptions import ConfigurationError, NotRunningError, RecordingError
-from smartcam.models import ApplicationChanged, Connected, Status, StatusChanged
+from smartcam.models import ApplicationChanged, Connected, Result, Status, StatusChanged
 from smartcam.recording import FleetRecorder, Recorder, load_recording
 from smartcam.recording._folder import RecordingFolder
 from smartcam.recording._folders import files as folder_files
@@ -130,6 +130,11 @@ async def test_each_file_says_what_the_camera_was(
     # the seam may have cut one off from its trigger, not more
     assert len(runs(found)) - 1 <= len(triggered) <= len(runs(found))
     assert found.camera(NAME).interpret_as is not None
+    for path in rest:  # the state's time is not that of writing, or a replay began too early
+        state, behind, *_ = load_recording(path).all_items(NAME)
+        assert isinstance(state, RecordedState)
+        assert state.at is not None
+        assert state.at == (behind.received_at if isinstance(behind, Result) else behind.at)
 
 
 async def test_file_is_over_when_it_is_old_also_of_a_silent_camera(tmp_path: Path) -> None:

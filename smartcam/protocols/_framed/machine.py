@@ -48,14 +48,16 @@ the receive task takes in a turn, so that reading would have to pause after each
 
 
 MAX_FAMILIAR = 64
-"""Messages of a kind that are known by their frames: of statuses and answers a camera has a handful
-each, and a peer could send any."""
+"""Largest number of messages of a kind that are known by their frames: of statuses and answers a
+camera has a handful each, and a peer could send any."""
 
 MAX_KNOWN_CHUNKS = 16
-"""Chunks that a camera's machine knows as a whole: a client has a handful of short requests."""
+"""Largest number of chunks that a camera's machine knows as a whole: a client has a handful of
+short requests."""
 
 MAX_KNOWN_CHUNK_BYTES = 64
-"""Bytes of the longest of these chunks: a Query, a sequence number and a Trigger have 40."""
+"""Largest number of bytes of the longest of these chunks: a Query, a sequence number and a Trigger
+have 40."""
 
 
 _SESSION_REQUESTS = (

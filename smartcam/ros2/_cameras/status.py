@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 
 MAX_WAITING_EVENTS = 64
-"""Events that wait; what counts is the state after them."""
+"""Largest number of events that wait; what counts is the state after them."""
 
 RISING: Mapping[str, str] = {
     "dropped": "results were dropped: a subscriber is too slow",

@@ -28,7 +28,7 @@ MAX_NAMES = 1024
 """Most names in a request; one with more is refused: list gives nothing, set gives the reason."""
 
 MAX_REASON_CHARACTERS = 1000
-"""Characters of the reason why parameters could not be set."""
+"""Largest number of characters of the reason why parameters could not be set."""
 
 NAMES_PER_TURN = 64
 """Names until other things have their turn."""

@@ -29,7 +29,7 @@ SET_TIMEOUT = 10.0
 """Seconds that a hook may take, and that a set waits for those before it."""
 
 MAX_VALUE_SIZE = 1 << 16
-"""Characters, bytes or elements of a value."""
+"""Largest number of characters, bytes or elements of a value."""
 
 MAX_NAME_CHARACTERS = 256
 MAX_PARAMETERS = 1024
