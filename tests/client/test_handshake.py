@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from smartcam._client import handshake
 from smartcam._client._inside import Session, Try
 from smartcam.exceptions import (
     ConfigurationError,
@@ -27,7 +26,7 @@ from smartcam.protocols import messages as m
 from smartcam.protocols._inside import HANDBOOK, Event, load_protocol
 from smartcam.registry import PROTOCOLS
 from smartcam.settings import CameraSettings
-from tests.client.inside import establish
+from tests.client.inside import establish, handshake
 from tests.handmade import (
     BUSY,
     CONNECT,

@@ -16,12 +16,12 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.inspection import ToolSetup
 from smartcam.inspection._read import ladder
 from smartcam.inspection._read.codes import formats_of, read_codes
-from smartcam.inspection._read.gs1 import elements
 from smartcam.inspection._read.ladder import CONFIRMED, RUNGS
 from smartcam.inspection._read.patterns import TextPattern
 from smartcam.inspection._read.tool import ReadSettings, ReadTool
 from tests.inspection.cells import inspected
 from tests.inspection.drawn_codes import Look, draw_code
+from tests.inspection.inside import elements
 from tests.inspection.proofs import codes
 
 if TYPE_CHECKING:

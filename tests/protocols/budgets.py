@@ -10,12 +10,11 @@ from smartcam.protocols import FramedDialect, LineDialect, LineMachine, Machine,
 from smartcam.protocols import messages as m
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
 from smartcam.protocols._insight.answers import MAX_IMAGE
-from smartcam.protocols._insight.dialect import NATIVE
-from smartcam.protocols._insight.machine import InSightMachine
 from smartcam.protocols._insight.words import MAX_LINE
 from tests.budgets.inputs import LINE_ROWS, TEXT_LINES, UDP_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, streamed
 from tests.machines import B16, BID, THESIS
+from tests.protocols.inside import NATIVE, InSightMachine
 
 
 def _session(dialect: FramedDialect, role: Role, transport: Transport, pieces: list[bytes]) -> None:
