@@ -102,7 +102,7 @@ ROUTER_TIMEOUT = 3.0
 NOT_ZENOH = "nothing there speaks Zenoh"
 
 MAX_DECLARED_AT_ONCE = 32
-"""Declarations made in one turn of the event loop at most."""
+"""Largest number of declarations made in one turn of the event loop."""
 
 _ONE = (1).to_bytes(8, sys.byteorder)
 

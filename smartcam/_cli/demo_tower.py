@@ -60,7 +60,7 @@ SIDE_RATIO: Final = (2.2, 3.8)
 """Longer side of a block in the picture over the shorter one, from least to most."""
 
 MIN_FULLNESS: Final = 0.8
-"""Share of its rectangle that a block fills at least."""
+"""A block fills at least this share of its rectangle."""
 
 RIM: Final = 2
 """Pixels at a region's rim whose depth is a mixture."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 logger: logging.Logger = logging.getLogger("smartcam.systemd")
 
-MAX_STATUS = 500
+MAX_STATUS_CHARACTERS = 500
 """Largest number of characters of a status: one line in ``systemctl status``."""
 
 MAX_UNSENT = 32
@@ -79,7 +79,7 @@ class Notifier:
             self._socket = None
 
     def _status_line(self, status: str) -> str:
-        self._status = " ".join(status.split())[:MAX_STATUS]
+        self._status = " ".join(status.split())[:MAX_STATUS_CHARACTERS]
         return f"STATUS={self._status}"
 
     def _send(self, *lines: str, keep: bool = False) -> None:

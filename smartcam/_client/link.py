@@ -20,7 +20,7 @@ from time import perf_counter, thread_time
 from typing import TYPE_CHECKING, Any
 
 from smartcam._client.doorbell import make_doorbell
-from smartcam._datagrams import LARGEST_DATAGRAM, read_no_more_than_needed, second_socket
+from smartcam._datagrams import MAX_DATAGRAM_BYTES, read_no_more_than_needed, second_socket
 from smartcam.exceptions import ConnectionLostError, RemoteProtocolError
 from smartcam.observers import TraceEntry
 from smartcam.protocols import Dialect, LinkFailed, LinkMachine, Role, State, Transport
@@ -86,7 +86,7 @@ LARGEST_CHUNK = 512
 """Largest number of frames of a chunk, however fast they are worked off: the next ones may take
 longer."""
 
-MAX_REST = 256
+MAX_REST_BYTES = 256
 """Largest number of bytes of an unfinished frame that a trace shows: it may be as long as the
 largest frame."""
 
@@ -386,7 +386,7 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         """
         for _ in range(min(MAX_DATAGRAMS_AT_ONCE, MAX_DATAGRAMS) - 1):
             try:
-                data = sock.recv(LARGEST_DATAGRAM)
+                data = sock.recv(MAX_DATAGRAM_BYTES)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError as exc:
@@ -528,7 +528,7 @@ async def open_link(
         note(_trace_entry(name, machine.dialect, sender, frame))
 
     def on_rest(rest: bytes) -> None:
-        text, shown = f"{len(rest)} bytes that make no whole frame", rest[:MAX_REST].hex()
+        text, shown = f"{len(rest)} bytes that make no whole frame", rest[:MAX_REST_BYTES].hex()
         note(TraceEntry(datetime.now(UTC), name, "!", None, text, None, shown))
 
     traced = trace is not None or logger.isEnabledFor(logging.DEBUG)

@@ -37,7 +37,7 @@ GRIP: Final = 5e-3
 """Metres by which the gripper may miss a block and still take it."""
 
 MIN_GAP_METRES: Final = 0.01
-"""Metres between things on the table at least, for a gripper and for the eye."""
+"""Least distance, metres, between things on the table, for a gripper and for the eye."""
 
 GREY_SIGMA: Final = 3.0
 """Noise of a picture's levels."""

@@ -44,7 +44,7 @@ MIDDLE_GREY: Final = 128
 """Grey level that is taken off, so that squares keep their digits."""
 
 MIN_WINDOW_PIXELS: Final = 12
-"""Pixels of a window at least, whose least squares have two unknowns."""
+"""Least number of pixels of a window, whose least squares have two unknowns."""
 
 GAIN_SIGMA: Final = 0.3
 """Standard deviation, about 1, that the gain between the pictures is taken to have beforehand."""

@@ -78,7 +78,7 @@ MAX_SECONDS = 86_400
 """Seconds that a camera is watched at most: a day."""
 
 MAX_TRIGGERS = 10_000
-"""Triggers of an examination at most, since their times are kept."""
+"""Largest number of triggers of an examination, since their times are kept."""
 
 
 class _DoctorCheck(NamedTuple):

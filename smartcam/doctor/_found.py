@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Evidence = Literal["greeted", "silent", "said", "ended", "other"]
 
 MAX_PORTS = 32
-"""Ports of one address that a search opens at most."""
+"""Largest number of ports of one address that a search opens."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

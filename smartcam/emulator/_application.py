@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from smartcam.models import ByteOrder
 
-MAX_CONTAINER = 1 << 16
+MAX_CONTAINER_BYTES = 1 << 16
 """Largest number of bytes of a result container: about 64 kB (HALCON script manual p. 15,
 published)."""
 
@@ -161,9 +161,9 @@ class Application(EmulatorData):
             slots=self.slots,
             sequence=None if field is None else wrap_number(field, number),
         )
-        if len(data) > MAX_CONTAINER:
+        if len(data) > MAX_CONTAINER_BYTES:
             raise ConfigurationError(
-                f"application {self.id}: a container has at most {MAX_CONTAINER} bytes, "
+                f"application {self.id}: a container has at most {MAX_CONTAINER_BYTES} bytes, "
                 f"these values make {len(data)}"
             )
         return data

@@ -17,7 +17,7 @@ from smartcam._arguments import check_application, check_flag, check_port, check
 from smartcam.emulator._bvs.behaviour import behaviour_of
 from smartcam.emulator._bvs.clock_and_input import LOST_CLOCK
 from smartcam.emulator._bvs.device import Device
-from smartcam.emulator._client_link import MAX_INPUT, SecondClientSession
+from smartcam.emulator._client_link import MAX_INPUT_BYTES, SecondClientSession
 from smartcam.emulator._clock import ManualClock, nanoseconds
 from smartcam.emulator._inspected import InspectedApplication
 from smartcam.emulator._scenario.merge import make_plan
@@ -353,7 +353,7 @@ class EmulatedCamera(WireCamera):
             self.spoken,
             Role.CAMERA,
             transport,
-            max_length=MAX_INPUT,
+            max_length=MAX_INPUT_BYTES,
             policy=self._policy(transport),
             trace=trace,
         )

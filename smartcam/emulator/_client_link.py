@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.emulator")
 
-MAX_INPUT = 1 << 16
+MAX_INPUT_BYTES = 1 << 16
 """Largest number of bytes of payload the camera takes: input data has the container's limit of
 about 64 kB (HALCON script manual p. 35, published for the other direction)."""
 
@@ -342,7 +342,7 @@ class FaultyLink:
             if not heard or self.machine.buffered:
                 self._link.feed(data)
                 return
-            self._framer = self._owner.codec.framer(MAX_INPUT)
+            self._framer = self._owner.codec.framer(MAX_INPUT_BYTES)
         for message in cut(data, self._framer, self._owner.codec):
             if self.dead or self._link.closed:
                 return

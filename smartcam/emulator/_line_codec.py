@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from smartcam.emulator._client_link import Trace
     from smartcam.protocols import LineRow, Transport
 
-MAX_LOGGED = 4096
+MAX_LOGGED_BYTES = 4096
 """Largest number of bytes of a line, or of an answer of several, that the log keeps."""
 
 HIDDEN = b"***"
@@ -340,7 +340,7 @@ class LineServer:
     def send(self, message: SaidLine) -> None:
         """Say bytes."""
         self._outbox.append(message.data)
-        self._trace(m.Sender.CAMERA, Frame(message.row, message.data[:MAX_LOGGED]))
+        self._trace(m.Sender.CAMERA, Frame(message.row, message.data[:MAX_LOGGED_BYTES]))
 
     def data_to_send(self) -> list[bytes]:
         """Return the bytes to write, in order."""

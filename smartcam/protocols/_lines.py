@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     Script = Generator[str, str, Told]
     """Yields lines, is sent the answer to each, and returns what it found out."""
 
-READ_SIZE = 1 << 15
+MAX_READ_BYTES = 1 << 15
 """Largest number of bytes that one read takes."""
 
 DONE = CodeMeaning("done", Verdict.DONE)
@@ -415,7 +415,7 @@ class LineMachine:
         self._trace = trace
         self._max_length = max_length
         self._reader = dialect.reader(max_length)
-        self._store = memoryview(bytearray(READ_SIZE))
+        self._store = memoryview(bytearray(MAX_READ_BYTES))
         self._asked: list[_OpenRequest] = []  # in order; at most one of a kind
         self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)

@@ -31,7 +31,7 @@ connection from its beginning."""
 KEEP_ALIVE = 60.0
 """Seconds that a connection stays open without a request, or with an answer that nobody reads."""
 
-MAX_HEAD = 1 << 15
+MAX_HEAD_BYTES = 1 << 15
 """Largest number of bytes of a request's head: about four times what a browser with many cookies
 sends."""
 
@@ -169,8 +169,8 @@ class Visitor(asyncio.Protocol):
         end = head.find(_HEAD_END, known)
         if end >= 0:
             self._head = None
-        if (end if end >= 0 else len(head)) > MAX_HEAD:
-            self.turn_away(f"the head of its request has more than {MAX_HEAD} bytes")
+        if (end if end >= 0 else len(head)) > MAX_HEAD_BYTES:
+            self.turn_away(f"the head of its request has more than {MAX_HEAD_BYTES} bytes")
 
 
 def visitor_of(request: web.BaseRequest) -> Visitor | None:

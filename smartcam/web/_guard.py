@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from aiohttp import web
 
-MIN_TOKEN = 16
+MIN_TOKEN_CHARACTERS = 16
 """Least number of characters of a token, so that nobody guesses it; made ones have 32."""
 
 BEARER = "bearer."
@@ -146,9 +146,9 @@ def checked_token(token: str) -> str:
             carry.
     """
     signs = token.replace("-", "").replace("_", "")
-    if len(token) < MIN_TOKEN or not (signs.isascii() and signs.isalnum()):
+    if len(token) < MIN_TOKEN_CHARACTERS or not (signs.isascii() and signs.isalnum()):
         raise ConfigurationError(
-            f"web: a token has {MIN_TOKEN} letters, digits, '-' and '_' at least, "
+            f"web: a token has {MIN_TOKEN_CHARACTERS} letters, digits, '-' and '_' at least, "
             f"this one has {len(token)} characters"
         )
     return token

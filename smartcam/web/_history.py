@@ -34,7 +34,7 @@ MAX_PICTURES: Final = 12
 MAX_PICTURE_BYTES: Final = 1 << 25
 """Largest number of bytes that the pictures of failures may have together."""
 
-MAX_TEXT: Final = 300
+MAX_TEXT_CHARACTERS: Final = 300
 """Largest number of characters that say what failed."""
 
 KINDS: Final = ("passed", "failed", "other", "errors")
@@ -138,13 +138,13 @@ class ShiftHistory:
     def _tell(self, at: float, number: int | None, what: str) -> None:
         self.version += 1
         last = self._failures[-1] if self._failures else None
-        if last is not None and last.what == what[:MAX_TEXT] and not self._passed:
+        if last is not None and last.what == what[:MAX_TEXT_CHARACTERS] and not self._passed:
             last.count += 1
             last.until = at
             return
         self._passed = False
         self._serial += 1
-        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT]))
+        self._failures.append(Failure(self._serial, at, at, number, what[:MAX_TEXT_CHARACTERS]))
 
     # ------------------------------------------------------------------ pictures
 

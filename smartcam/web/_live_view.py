@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 MAX_RESULTS = 100
 """Largest number of results that the page can show: those before are on it no more."""
 
-MAX_VALUE = 20_000
+MAX_VALUE_CHARACTERS = 20_000
 """Largest number of characters of JSON that a value may have on the page; a larger one is cut."""
 
 MAX_PARTS = 500
 """Localizations of a result that the page draws."""
 
-MAX_SHOWN_RAW = 64
+MAX_SHOWN_RAW_BYTES = 64
 """Largest number of bytes of a container that the page shows."""
 
 SERIES = 300
@@ -71,7 +71,7 @@ class ShownResult(NamedTuple):
             "received_at": result.received_at.timestamp(),
             "latency": result.latency,
             "size": len(result.raw),
-            "raw": result.raw[:MAX_SHOWN_RAW].hex(" "),
+            "raw": result.raw[:MAX_SHOWN_RAW_BYTES].hex(" "),
             **shown_value(result.value, self.layout),
         }
 
@@ -319,8 +319,8 @@ def shown_value(value: Any, layout: Layout | None = None) -> dict[str, Any]:
     text = json.dumps(value)
     shown = (
         {"value": value, "units": units}
-        if len(text) <= MAX_VALUE
-        else {"cut": text[: MAX_VALUE // 10]}
+        if len(text) <= MAX_VALUE_CHARACTERS
+        else {"cut": text[: MAX_VALUE_CHARACTERS // 10]}
     )
     return {"verdicts": verdicts(value), **shown}
 

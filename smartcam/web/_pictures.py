@@ -47,7 +47,7 @@ MAX_VIEWERS: Final = 32
 PROTOCOL: Final = "smartcam.frames"
 """Subprotocol of the WebSockets that send pictures."""
 
-MAX_PICTURE: Final = 1 << 24
+MAX_PICTURE_BYTES: Final = 1 << 24
 """Largest number of bytes of a picture that is sent; what a camera sends as a JPEG may be of any
 size."""
 
@@ -203,9 +203,9 @@ def _pressed(frame: Frame, quality: int) -> bytes:
     with from_part("frames", "pictures on a page need"):
         from smartcam.web._jpeg import jpeg
     data = jpeg(frame, quality)
-    if len(data) > MAX_PICTURE:
+    if len(data) > MAX_PICTURE_BYTES:
         raise FrameFormatError(
-            f"{frame.source}: a JPEG of {len(data)} bytes; expected {MAX_PICTURE} at most",
+            f"{frame.source}: a JPEG of {len(data)} bytes; expected {MAX_PICTURE_BYTES} at most",
             source=frame.source,
         )
     return data

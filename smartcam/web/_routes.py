@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("smartcam.web")
 
-MAX_BODY = 1 << 18
+MAX_BODY_BYTES = 1 << 18
 """Largest number of bytes of a call's body: room for a fault that inserts 64 kB, in hex."""
 
 READ_TIMEOUT = 10.0
@@ -249,7 +249,7 @@ def _translated(error: web.HTTPException, prefix: str) -> RefusedError:
                 405, f"the method {error.method}", allowed, headers={"Allow": allowed}
             )
         case web.HTTPRequestEntityTooLarge():
-            return RefusedError(413, "a larger body", f"{MAX_BODY} bytes at most")
+            return RefusedError(413, "a larger body", f"{MAX_BODY_BYTES} bytes at most")
         case web.HTTPNotFound():
             return RefusedError(404, "an unknown path", f"one of those that GET {prefix} lists")
         case _:

@@ -33,9 +33,9 @@ from smartcam.ros1._json_messages import from_json
 from smartcam.ros1._link import MAX_MESSAGE_BYTES as LARGEST_OPERATION
 from smartcam.ros2 import RosTypes
 from smartcam.ros2._node.tokens import Entity
-from smartcam.web._connections import MAX_HEAD, Visitor, Visitors
+from smartcam.web._connections import MAX_HEAD_BYTES, Visitor, Visitors
 from smartcam.web._errors import RefusedError
-from smartcam.web._routes import MAX_BODY, CallBody, _parsed, _validate
+from smartcam.web._routes import MAX_BODY_BYTES, CallBody, _parsed, _validate
 from tests.budgets.parser import Make, Parser, fill, fill_text, from_file, grown, streamed
 from tests.budgets.texts import _JSON
 
@@ -456,7 +456,7 @@ BUS: tuple[Parser, ...] = (
         "pages: bodies of calls",
         _body,
         _BODIES,
-        MAX_BODY,
+        MAX_BODY_BYTES,
         "web._routes.MAX_BODY",
         refuses=(RefusedError,),
         needs=("aiohttp",),
@@ -465,7 +465,7 @@ BUS: tuple[Parser, ...] = (
         "pages: heads of requests",
         _heads,
         streamed(_HEADS),
-        MAX_HEAD,
+        MAX_HEAD_BYTES,
         "web._connections.MAX_HEAD",
         needs=("aiohttp",),
     ),

@@ -32,8 +32,8 @@ from smartcam.inspection._read.tool import MAX_TEXT_BYTES as MAX_CODE_BYTES
 from smartcam.interpreters import Context, Reader, resolve, run
 from smartcam.layout import Layout
 from smartcam.layout._inside import load, pack_texts
-from smartcam.layout._text import MAX_TEXT as MAX_LAYOUT
-from smartcam.layout._yamls import MAX_YAML_TEXT
+from smartcam.layout._text import MAX_TEXT_CHARACTERS as MAX_LAYOUT
+from smartcam.layout._yamls import MAX_YAML_TEXT_CHARACTERS
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH
 from smartcam.ros2._types.definitions import parse_message
 from tests.budgets.parser import Make, Parser, fill, fill_text, from_file, grown
@@ -614,7 +614,7 @@ TEXTS: tuple[Parser, ...] = (
                 for kind in ("keys", "aliases of aliases", "nested brackets")
             },
         },
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -647,7 +647,7 @@ TEXTS: tuple[Parser, ...] = (
         "YAML",
         load,
         _YAML,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -658,7 +658,7 @@ TEXTS: tuple[Parser, ...] = (
         "scenarios",
         from_file(load_scenario, "a.yaml"),
         _SCENARIOS,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -669,7 +669,7 @@ TEXTS: tuple[Parser, ...] = (
         "fleet files",
         from_file(load_fleet, "a.yaml"),
         _FLEETS,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -679,7 +679,7 @@ TEXTS: tuple[Parser, ...] = (
         "cell files",
         from_file(load_cell, "a.yaml"),
         _CELL_FILES,
-        MAX_YAML_TEXT,
+        MAX_YAML_TEXT_CHARACTERS,
         "layout._yamls.MAX_YAML_TEXT",
         size=2500,
         short=PAST_LOOKAHEAD,
@@ -711,7 +711,7 @@ TEXTS: tuple[Parser, ...] = (
             "zeros, by bzip2": _bomb(zipfile.ZIP_BZIP2),
             "zeros, by LZMA": _bomb(zipfile.ZIP_LZMA),
         },
-        _description.LARGEST_PACKED,
+        _description.MAX_PACKED_BYTES,
         "frames._gige.description.LARGEST_PACKED",
     ),
     Parser(

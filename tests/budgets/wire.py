@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from smartcam.emulator._inside import HeardLine, LineCodec
 from smartcam.emulator._line_camera import MAX_INPUT_BYTES
-from smartcam.emulator._ticketed_camera import MAX_REQUEST
+from smartcam.emulator._ticketed_camera import MAX_REQUEST_BYTES
 from smartcam.exceptions import SmartCamError
 from smartcam.frames._gige import gvcp as _gvcp
 from smartcam.frames._gige import setup as _setup
@@ -52,10 +52,10 @@ from smartcam.protocols import (
 from smartcam.protocols import messages as m
 from smartcam.protocols._bvs import B16, BID, THESIS
 from smartcam.protocols._inside import DEFAULT_MAX_LENGTH, HANDBOOK
-from smartcam.protocols._insight.answers import MAX_IMAGE
+from smartcam.protocols._insight.answers import MAX_IMAGE_BYTES
 from smartcam.protocols._insight.dialect import NATIVE
 from smartcam.protocols._insight.machine import InSightMachine
-from smartcam.protocols._insight.words import MAX_LINE
+from smartcam.protocols._insight.words import MAX_LINE_BYTES as MAX_INSIGHT_LINE_BYTES
 from tests.budgets.parser import Make, Parser, drain, fill, fill_text, grown, streamed
 
 UDP_BYTES = 65_507
@@ -711,14 +711,14 @@ WIRE: tuple[Parser, ...] = (
                 "empty lines": fill(b"\r\n", b"1\r\n9\r\n"),
             }
         ),
-        2 * MAX_IMAGE,
+        2 * MAX_IMAGE_BYTES,
         "protocols._insight.answers.MAX_IMAGE, in hex",
     ),
     Parser(
         "In-Sight: lines",
         functools.partial(_insight_answers, m.GetStatus),
         streamed(_TEXT_LINES),
-        MAX_LINE,
+        MAX_INSIGHT_LINE_BYTES,
         "protocols._insight.words.MAX_LINE",
         size=1000,
     ),
@@ -757,7 +757,7 @@ WIRE: tuple[Parser, ...] = (
             "open brackets": fill_text("["),
             "a long text": _ifm_layout('{"type":"string","id":"s","value":"aaaaaaaaaaaaaaaa"},'),
         },
-        MAX_REQUEST,
+        MAX_REQUEST_BYTES,
         "emulator._ticketed_camera.MAX_REQUEST",
         refuses=(ValueError, RecursionError),
     ),
@@ -848,7 +848,7 @@ WIRE: tuple[Parser, ...] = (
         "redirects of a server",
         _redirect,
         streamed(_REDIRECT),
-        _redirects.LARGEST_HEAD,
+        _redirects.MAX_HEAD_BYTES,
         "frames._video.redirects.LARGEST_HEAD",
         size=1000,
         refuses=(SmartCamError, ValueError),
@@ -878,7 +878,7 @@ WIRE: tuple[Parser, ...] = (
         "GigE: packets of a stream",
         _gvsp,
         _GVSP,
-        _setup.LARGEST_FRAME,
+        _setup.MAX_FRAME_BYTES,
         "frames._gige.setup.LARGEST_FRAME",
         size=1 << 15,
     ),
@@ -887,7 +887,7 @@ WIRE: tuple[Parser, ...] = (
         "GigE: chunk data",
         _chunk_data,
         _CHUNK_DATA,
-        _setup.LARGEST_FRAME,
+        _setup.MAX_FRAME_BYTES,
         "frames._gige.setup.LARGEST_FRAME",
     ),
     Parser(

@@ -28,7 +28,7 @@ INSPECTIONS = 3
 """Inspections that are looked at: an order that changes shows."""
 
 REBOOT_POLL_INTERVAL = 0.25
-"""Seconds between two Connects to a camera that restarts, at most."""
+"""Seconds after which a camera that restarts gets the next Connect at the latest."""
 
 
 def _once(observe: Callable[[CameraUnderTest], T]) -> Callable[[CameraUnderTest], T]:

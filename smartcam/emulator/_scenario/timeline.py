@@ -49,7 +49,7 @@ MAX_AT_ONCE = 1000
 with a warning."""
 
 MAX_FAULTS_OF_CUE = 100
-"""Faults of one cue at most, far more than anybody writes."""
+"""Largest number of faults of one cue, far more than anybody writes."""
 
 _MOMENTS = ("at", "entering", "command")
 

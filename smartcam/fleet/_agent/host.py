@@ -59,7 +59,8 @@ CATCH_UP = 0.2
 the reply may have been lost, and nothing else would tell."""
 
 RESULTS_INTERVAL = 0.002
-"""Seconds between two messages with results, at least: those that come faster go together."""
+"""Seconds that must pass between two messages with results: those that come faster are sent
+together."""
 
 FULL_MESSAGE_BYTES = 1 << 16
 """Bytes of results that go at once, however soon after the last."""

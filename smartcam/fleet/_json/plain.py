@@ -57,7 +57,7 @@ MAX_CONCURRENT_CALLS = 256
 """Largest number of commands to one camera that may be under way at a time, and questions."""
 
 MAX_WAITING_REPEATS = 16
-"""Questions that wait for the answer of one call at most."""
+"""Largest number of questions that wait for the answer of one call."""
 
 MAX_ANSWERS_REMEMBERED, MAX_ANSWER_BYTES_REMEMBERED = 4096, 1 << 24
 """Answers of commands with an id that are remembered, and their bytes; the oldest are forgotten.

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from smartcam.protocols import Counters
 
 MAX_DRIFT_RATIO = 1e-4
-"""Seconds in a second by which two clocks go apart at most."""
+"""Largest drift between two clocks, seconds per second."""
 
 HELLO_TIMEOUT = 2.0
 """Seconds for the answer to a hello; then it is said again, as long as the agent is there."""

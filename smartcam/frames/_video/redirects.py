@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 MAX_REDIRECTS: Final = 5
 
-LARGEST_HEAD: Final = 64 << 10
+MAX_HEAD_BYTES: Final = 64 << 10
 """Largest number of bytes of the head of an answer, or of a body that is skipped."""
 
 REDIRECTS: Final = range(300, 400)
@@ -245,6 +245,6 @@ def _receive(link: socket.socket, end: float, before: int) -> bytes:
     """
     link.settimeout(_left(end))
     came = link.recv(4096)
-    if not came or before + len(came) > LARGEST_HEAD:
+    if not came or before + len(came) > MAX_HEAD_BYTES:
         raise ValueError("no end of an answer")
     return came

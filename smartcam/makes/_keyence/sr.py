@@ -12,7 +12,7 @@ from smartcam.exceptions import ConfigurationError
 from smartcam.makes._keyence.words import (
     ENCODING,
     LINE_END,
-    MAX_LINE,
+    MAX_LINE_BYTES,
     READY,
     asked_word,
     check_done,
@@ -150,7 +150,7 @@ LINES = SrDialect(
     rows=_rows(None),
     ids=range(LAST_BANK + 1),
     line_end=LINE_END,
-    max_line=MAX_LINE,
+    max_line=MAX_LINE_BYTES,
     encoding=ENCODING,
     split=_split,
     at_once=True,

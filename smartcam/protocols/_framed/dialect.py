@@ -126,7 +126,7 @@ MAX_KNOWN = 256
 any."""
 
 
-MAX_SURPLUS = 1 << 12
+MAX_SURPLUS_BYTES = 1 << 12
 """Largest number of bytes that a body may be longer than documented, where that is a matter of a
 fixed length: newer firmware may append fields, which are a few words. More is a length that is
 wrong."""
@@ -188,7 +188,7 @@ class Codec:
     def lengths(self) -> range:
         """The lengths of a body that are accepted."""
         least = self.size if self._code is None else min(self._code.size, self.size)
-        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS + 1)
+        return range(least, sys.maxsize if self.has_data else self.size + MAX_SURPLUS_BYTES + 1)
 
     def fits(self, size: int) -> bool:
         """Return True if a body has the documented length."""

@@ -36,8 +36,8 @@ Read: TypeAlias = "Callable[[Buffer, int], tuple[Any, ...]]"
 """Reads fields at a place of a buffer."""
 
 
-FIRST_READ = 1 << 12
-"""Largest number of bytes that one read takes, at first. It doubles each time that a read took so
+FIRST_READ_BYTES = 1 << 12
+"""Largest number of bytes that one read takes at first. It doubles each time that a read took so
 many."""
 
 MAX_READ_BYTES = 1 << 15
@@ -179,7 +179,7 @@ class Framer:
         if self._large is not None:
             return self._large[self._filled :]
         if not self._store:
-            self._window = self._store = memoryview(bytearray(FIRST_READ))
+            self._window = self._store = memoryview(bytearray(FIRST_READ_BYTES))
         return self._window
 
     def filled(self, count: int) -> bool:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from smartcam.protocols._machine import Frame
 
-MAX_LOGIN = 255
+MAX_LOGIN_CHARACTERS = 255
 """Largest number of characters of a user's name or password; the camera's own bound is not
 published."""
 
@@ -105,7 +105,7 @@ class InSightDialect(Dialect):
         Raises ConfigurationError: a cell is not valid, or a text cannot be sent.
         """
         for key in ("user", "password"):
-            problem = unsendable(parameters.get(key, ""), MAX_LOGIN)
+            problem = unsendable(parameters.get(key, ""), MAX_LOGIN_CHARACTERS)
             if problem is not None:
                 raise ConfigurationError(f"{key}: {problem}")
         counter = _cell_names(parameters.get("counter", ""))

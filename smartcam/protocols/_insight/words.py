@@ -45,7 +45,7 @@ LOGGED_IN = "User Logged In"
 INVALID_PASSWORD = "Invalid Password"  # noqa: S105 - the camera's words
 """The line that refuses a login (clients, derived)."""
 
-MAX_LINE = 4096
+MAX_LINE_BYTES = 4096
 """Largest number of bytes of a line, its end not counted, that either side takes. The longest
 regular ones are values of cells; the camera's own bound is not published."""
 
@@ -427,4 +427,4 @@ before it is dropped, since ``\r\0`` is telnet's bare CR."""
 
 def command_reader() -> LineReader:
     """Return a new reader that cuts a client's bytes into lines."""
-    return LineReader(COMMAND_ENDS, max_line=MAX_LINE, encoding=ENCODING)
+    return LineReader(COMMAND_ENDS, max_line=MAX_LINE_BYTES, encoding=ENCODING)

@@ -14,7 +14,7 @@ from smartcam.recording._folder import FileName, RecordingFolder
 from smartcam.recording._folders.files import Limits
 from smartcam.recording._folders.writer import FolderWriter
 from smartcam.recording._mcap.form import (
-    MAX_NAME,
+    MAX_NAME_CHARACTERS,
     MAX_PICTURE_SIZE_BYTES,
     RecordedPicture,
     captured_at,
@@ -140,7 +140,7 @@ class RotatingRecorder:
             ConfigurationError: an argument is wrong.
         """
         check_kind(frame, Frame, "frame", "a Frame", "recordings")
-        camera = check_text(camera, "camera", "recordings", most=MAX_NAME)
+        camera = check_text(camera, "camera", "recordings", most=MAX_NAME_CHARACTERS)
         if self._writer is None:
             return False
         name = camera or file_name(frame.source)

@@ -44,7 +44,7 @@ MAX_TIME_BEHIND_FIRST = 0.1
 """Seconds behind its first container in which an inspection's others come, where the camera says
 all the time that it waits for a trigger."""
 
-MAX_REPLAY = 1 << 30
+MAX_REPLAY_BYTES = 1 << 30
 """Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
 a second."""
 
@@ -103,7 +103,7 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     Raises:
         ConfigurationError: no such camera, it had no session, or it cannot be
                 emulated.
-        RecordingError: its containers are more than :data:`MAX_REPLAY`.
+        RecordingError: its containers are more than :data:`MAX_REPLAY_BYTES`.
     """
     known = recording.camera(camera)
     dialect, transport = _spoken(recording, known)
@@ -288,10 +288,10 @@ def _steps(items: Iterable[Item | RecordedState], dialect: FramedDialect) -> Ite
         if step is None:
             continue
         size += len(step.data)
-        if size > MAX_REPLAY:
+        if size > MAX_REPLAY_BYTES:
             raise RecordingError(
-                f"recording: {size} bytes of containers until {item.at}, expected {MAX_REPLAY} at "
-                "most for a replay"
+                f"recording: {size} bytes of containers until {item.at}, expected "
+                f"{MAX_REPLAY_BYTES} at most for a replay"
             )
         if step.what is _What.CONTAINER and step.number == m.UNNAMED_APPLICATION:
             step = step._replace(number=active)  # a quirk: it does not say whose it is
@@ -337,10 +337,10 @@ def _steps_without_frames(items: Iterable[Item | RecordedState], endian: str) ->
                 steps.append(_ReplayStep(at, _What.CONTAINER, item.application, data=item.raw))
             case _:
                 pass
-        if size > MAX_REPLAY:
+        if size > MAX_REPLAY_BYTES:
             raise RecordingError(
-                f"recording: {size} bytes of containers until {at:.0f}, expected {MAX_REPLAY} at "
-                "most for a replay"
+                f"recording: {size} bytes of containers until {at:.0f}, expected "
+                f"{MAX_REPLAY_BYTES} at most for a replay"
             )
     return _on_one_clock(steps)
 

@@ -12,7 +12,7 @@ import pytest
 from smartcam.emulator import EmulatedInSight, InSightQuirks, ManualClock
 from smartcam.emulator._insight.connection import MAX_SESSIONS
 from smartcam.emulator._line_camera import MAX_INPUT_BYTES
-from smartcam.emulator._line_codec import MAX_LOGGED
+from smartcam.emulator._line_codec import MAX_LOGGED_BYTES
 from smartcam.emulator._links import _TcpLink
 from smartcam.exceptions import ConfigurationError, ResponseTimeoutError
 from tests.emulator.insight import insight_wire as wire
@@ -235,7 +235,7 @@ async def test_log_is_bounded_and_cuts_what_is_long() -> None:
         client.send(b"RI\r\n")
         await client.expect(b"1\r\n8300\r\n424D")
         assert emulator.log.maxlen == 10_000
-        assert len(emulator.log[-1].text) == MAX_LOGGED
+        assert len(emulator.log[-1].text) == MAX_LOGGED_BYTES
         assert (emulator.log[-3].direction, emulator.log[-3].text) == ("in", "RI")
 
 
