@@ -267,7 +267,7 @@ class ZenohSession:
         self._link, self._more, self._what = link, dict(more or {}), what
         self._zenoh = engine()
         self._session: Any = None
-        self._declared: dict[ZenohDeclared, None] = {}  # in their order
+        self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
@@ -279,7 +279,7 @@ class ZenohSession:
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
         self._reopening = False
-        self._look: asyncio.TimerHandle | None = None  # for connections that linger
+        self._look: asyncio.TimerHandle | None = None  # timer for connections that linger
 
     # ------------------------------------------------------------------ life
 

@@ -143,7 +143,8 @@ class Camera(abc.ABC, Generic[ValueT]):
         self.settings: CameraSettings = settings
         self._observers = Observers(observers)
         self._observed = bool(self._observers)
-        self._interpretations: dict[str, Interpretation] = {}  # by their text
+        # interpretations by the text that was given for them
+        self._interpretations: dict[str, Interpretation] = {}
         self._counters = ClientCounters()
         self._listeners = self._make_listeners()
         self._default_spec: object = settings.interpret_as

@@ -44,7 +44,7 @@ class Notifier:
         self.wanted: bool = self._address is not None
         self.watchdog: float | None = _watchdog(given)
         self._socket: socket.socket | None = None
-        self._unsent: list[bytes] = []  # what must not be lost, while the socket is full
+        self._unsent: list[bytes] = []  # messages that must not be lost, while the socket is full
         self._failed = False
         self._status = ""
 

@@ -106,9 +106,10 @@ class Try:
 class Reason(NamedTuple):
     """A reason for which there may be no session. Its texts are filled in by :func:`words`."""
 
-    fits: Callable[[Try], bool]  # whether it is this one, by what an attempt saw
-    text: str  # what is wrong
-    cure: str  # what to do
+    # function that says, by what an attempt saw, whether this is the cause
+    fits: Callable[[Try], bool]
+    text: str  # text of the problem
+    cure: str  # text of the cure
 
 
 _NO_WAY = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN)

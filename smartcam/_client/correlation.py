@@ -157,7 +157,8 @@ class EvidenceByAnswer(TriggerEvidence):
         super().__init__()
         self.reached = self.proven = False
         self._queried = False
-        self._waited: bool | None = None  # as the first status behind the Query's answer says
+        # whether the camera waits for a trigger, by the first status after the Query's answer
+        self._waited: bool | None = None
 
     def on_query_answer(self) -> None:
         """Note that the next status was asked for in front of the trigger, or is as fresh."""
@@ -253,10 +254,12 @@ class Correlation:
         self.doubted: bool = False
         self._complete = False  # every status is told, in order
         self.satisfied: bool = False
-        self._last: TriggerEvidence | None = None  # of the last trigger, until it has its results
+        # evidence of the last trigger, until it has its results
+        self._last: TriggerEvidence | None = None
         self.owed: list[_Owed] = []
-        self._given_up: dict[int, Debt] = {}  # by number; their results are late whenever they come
-        self._last_number: int | None = None  # of the last trigger that had its results
+        # debts by the triggers' numbers; their results are late whenever they come
+        self._given_up: dict[int, Debt] = {}
+        self._last_number: int | None = None  # number of the last trigger that had its results
         self._turn = int(chance * RANGE_OF_FIRST_NUMBER)
         self._given: int | None = None
 

@@ -100,7 +100,7 @@ class _Collector:
     early: list[Chunk] = field(default_factory=list[Chunk])
     version: int | None = None
     statuses: int = 0
-    answers: int = 0  # to Query, whatever they say
+    answers: int = 0  # number of answers to Query, whatever their contents
     application: int | None = None
 
     async def take(self) -> None:

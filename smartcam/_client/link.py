@@ -144,12 +144,14 @@ class Link(asyncio.BufferedProtocol, asyncio.DatagramProtocol):
         self._datagrams = machine.transport is Transport.UDP
         self._aside: socket.socket | None = None  # reads datagrams that have come already
         self._replies = machine.replies
-        self.on_rest: Callable[[bytes], None] | None = None  # what is left of an unfinished frame
+        # function that takes the bytes of an unfinished frame
+        self.on_rest: Callable[[bytes], None] | None = None
         self._chunks: collections.deque[Chunk] = collections.deque()
         self.deliveries = 0  # of bytes that gave events, so far
         self._frames = 0  # that came until the last chunk
         self._most = FIRST_CHUNK  # frames of the next chunk
-        self._busy_since: float | None = None  # with the last chunk, where it was a large one
+        # time since which the link works on the last chunk, if that was a large one
+        self._busy_since: float | None = None
         self._busy_with = 0
         self._doorbell = make_doorbell(self.loop)  # of the task that receives
         self._closed: asyncio.Future[None] = self.loop.create_future()

@@ -52,7 +52,7 @@ class _WholeParameter(NamedTuple):
     default: int
     low: int
     high: int
-    every: int = 1  # it is ``low`` and a multiple of this
+    every: int = 1  # the value is ``low`` plus a multiple of this
 
     def __str__(self) -> str:
         step = {1: "", 2: ", odd" if self.low % 2 else ", even"}
@@ -71,7 +71,7 @@ class _WordParameter(NamedTuple):
     """A parameter that is one of some words; the first is the default."""
 
     words: tuple[str, ...]
-    prefix: str  # of OpenCV's constant
+    prefix: str  # beginning of the names of OpenCV's constants
 
     @property
     def default(self) -> str:

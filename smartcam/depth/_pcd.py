@@ -57,7 +57,7 @@ class _PcdHeader:
     counts: Sequence[int]  # numbers of each
     points: int
     data: str  # ascii, binary, binary_compressed
-    start: int  # where the rows begin
+    start: int  # offset of the first row
 
 
 def read(data: bytes) -> dict[str, NDArray[Any]]:

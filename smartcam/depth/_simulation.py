@@ -71,8 +71,8 @@ class WoodenBlock:
 
     x: float
     y: float
-    angle: float  # of its length, from x towards y
-    z: float = 0.0  # of its lower side
+    angle: float  # direction of the block's length, from x towards y
+    z: float = 0.0  # height of the block's lower side
     colour: str = "wood"
     size: tuple[float, float, float] = BLOCK
 
@@ -85,7 +85,7 @@ class WoodenBlock:
 class TableSight(NamedTuple):
     """The picture and depth that the camera sees from a place."""
 
-    camera: tuple[float, float, float]  # where it is, metres
+    camera: tuple[float, float, float]  # place of the camera, metres
     rgb: NDArray[np.uint8]  # (H, W, 3)
     depth: list[NDArray[np.uint16]]  # (H, W) each, millimetres
 

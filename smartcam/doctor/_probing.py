@@ -94,8 +94,8 @@ class Trial(Try):
 class Way(NamedTuple):
     """One way to speak to an address."""
 
-    address: Address  # with the scheme of the transport
-    transport: Transport  # what carries it
+    address: Address  # address with the scheme of the transport
+    transport: Transport  # transport that carries the protocol
     dialects: tuple[Dialect, ...]  # one, or several that begin a session alike
 
 

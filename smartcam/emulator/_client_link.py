@@ -253,7 +253,8 @@ class FaultyLink:
         self.dead: bool = False  # nothing is read either
         self._outgoing = self._line(m.Sender.CAMERA, self._wake_outgoing, self._carry_out)
         self._incoming = self._line(m.Sender.CLIENT, self._wake_incoming, self._carry_in)
-        self._framer: WireFramer | None = None  # where it is, the client's bytes go through it
+        # framer that the client's bytes go through, if there is one
+        self._framer: WireFramer | None = None
         self._revival = OneTimer(self._owner.clock, self._revive)
 
     def _line(

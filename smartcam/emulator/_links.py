@@ -319,7 +319,7 @@ class UdpListener(Listener, asyncio.DatagramProtocol):
 
     def __init__(self, owner: LinkOwner) -> None:
         super().__init__(owner)
-        self.links: dict[Any, _UdpLink] = {}  # by address
+        self.links: dict[Any, _UdpLink] = {}  # links by address
         self._transport: asyncio.DatagramTransport | None = None
 
     async def serve(self, sock: socket.socket) -> None:

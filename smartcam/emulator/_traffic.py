@@ -127,9 +127,9 @@ class Log(Sequence[LogEntry]):
         self.pushed_out: int = 0
         self._dialect = dialect
         self._entries: deque[LogEntry] = deque()
-        self._unread: deque[LogEntry | _Traced] = deque()  # behind those
-        self._weights: deque[int] = deque()  # of both, in the same order
-        self._size = 0  # their sum, bytes
+        self._unread: deque[LogEntry | _Traced] = deque()  # entries after those
+        self._weights: deque[int] = deque()  # sizes of both, in the same order, bytes
+        self._size = 0  # sum of these, bytes
         self._gone = 0  # entries that there have been before them
 
     def __repr__(self) -> str:

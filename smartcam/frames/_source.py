@@ -119,7 +119,8 @@ class FrameSource(FrameSink):
         self._took = asyncio.Event()  # a reader took a frame, or went
         self._held_up = False  # the driver waits for readers
         self._streaming = False
-        self._over: tuple[FrameSourceError | None] | None = None  # what the driver ended with
+        # error that the driver ended with, in a tuple
+        self._over: tuple[FrameSourceError | None] | None = None
         self._frames = self._lost = self._started = self._ahead = 0
         self._clock: DeviceClock | None = None
         self._newest: Frame | None = None

@@ -102,7 +102,7 @@ class LocalizationsInterpreter(PlainInterpreter):
         self._checks = use.checks
         self._sigmas = use.sigmas
         self._empty = bytes(self.layout.size)
-        self._names: dict[bytes, str] = {}  # of features, by what is on the wire
+        self._names: dict[bytes, str] = {}  # names of features, by their bytes on the wire
 
     def read(self, data: bytes, context: Context) -> list[Localization]:
         """Return the parts in the camera's order.

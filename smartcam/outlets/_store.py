@@ -86,7 +86,7 @@ class ResultStore(Outlet[StoreSettings]):
         self.path = folder / settings.file
         self._thread: ThreadPoolExecutor | None = None
         self._database: sqlite3.Connection | None = None
-        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # of one batch
+        self._columns: dict[tuple[str, int], dict[str, str]] = {}  # columns that one batch uses
         self._expired = 0.0
 
     async def open(self) -> None:

@@ -416,7 +416,7 @@ class LineMachine:
         self._max_length = max_length
         self._reader = dialect.reader(max_length)
         self._store = memoryview(bytearray(MAX_READ_BYTES))
-        self._asked: list[_OpenRequest] = []  # in order; at most one of a kind
+        self._asked: list[_OpenRequest] = []  # open requests in order; at most one of a kind
         self._tickets = itertools.cycle(map(str, dialect.tickets))
         self._unasked = tuple(row for row in dialect.rows if row.request is None)
         trigger = dialect.row(m.Trigger)

@@ -418,12 +418,12 @@ class _Scan:
     """One pass through a file."""
 
     path: Path
-    # what it says about itself; filled during the pass, as the next two
+    # facts about the file; filled during the pass, as the next two
     file_facts: dict[str, str] = field(default_factory=dict[str, str])
-    # what it says about cameras, by their names
+    # facts about cameras, by their names
     camera_facts: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
-    remark: str = ""  # where it stops being readable, and why
-    values: int = 0  # in its messages so far
+    remark: str = ""  # place and reason if the file stops being readable
+    values: int = 0  # number of values in its messages so far
     # data of the last frames, by camera and number
     bodies: LastBodies[tuple[str, int], str] = field(
         default_factory=LastBodies[tuple[str, int], str]

@@ -63,7 +63,7 @@ class RosbridgeNode(NamedNode):
         MissingExtraError: the extra ``ros2`` is not installed.
     """
 
-    parameters: None = None  # which ROS 1 has elsewhere
+    parameters: None = None  # ROS 1 keeps parameters elsewhere
 
     def __init__(
         self,
@@ -84,9 +84,9 @@ class RosbridgeNode(NamedNode):
         self._services: dict[str, RosbridgeService] = {}
         self._subscriptions: list[RosbridgeSubscription] = []
         self._running: asyncio.Task[None] | None = None
-        self._tasks: set[asyncio.Task[None]] = set()  # that live as long as a link
-        self._new: list[RosbridgeService] = []  # that are to be advertised
-        self._leaving: list[RosbridgeService] = []  # that are to be withdrawn
+        self._tasks: set[asyncio.Task[None]] = set()  # tasks that live as long as a link
+        self._new: list[RosbridgeService] = []  # services to be advertised
+        self._leaving: list[RosbridgeService] = []  # services to be withdrawn
         self._changing: asyncio.Task[None] | None = None
         self._asked: dict[str, asyncio.Future[dict[str, Any]]] = {}
         self._hears: dict[str, Callable[[dict[str, Any]], None]] = {

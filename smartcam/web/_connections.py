@@ -66,10 +66,10 @@ class Visitor(asyncio.Protocol):
     _transport: asyncio.Transport
 
     def __init__(self, visitors: Visitors) -> None:
-        self.settled: bool = False  # whether a request that is there in whole is being answered
+        self.settled: bool = False  # whether a request that has come completely is being answered
         self._visitors = visitors
         self._acceptor = visitors.acceptor
-        self._inner: asyncio.Protocol | None = None  # None: nobody hears what comes
+        self._inner: asyncio.Protocol | None = None  # protocol that takes the bytes; None: nobody
         self._head: bytearray | None = None  # while a head is awaited: what came of it
         self._idle = False  # its first byte may take long
         self._rest: StreamReader | None = None  # a body that was refused before it had come

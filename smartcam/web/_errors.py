@@ -21,9 +21,9 @@ class RefusedError(Exception):
     status: int  # the HTTP status code
     came: str
     expected: str
-    # for each wrong field ``field``, ``came`` and ``expected``
+    # ``field``, ``came`` and ``expected`` of each wrong field
     fields: tuple[dict[str, str], ...] = ()
-    headers: Mapping[str, str] = field(default_factory=dict[str, str])  # of the answer
+    headers: Mapping[str, str] = field(default_factory=dict[str, str])  # headers of the answer
 
     def as_json(self, tried: str) -> dict[str, Any]:
         """Return the answer's body; ``tried`` is method and path of the call."""

@@ -67,7 +67,7 @@ class RowState(NamedTuple):
     """The state of a camera."""
 
     connected: bool
-    over: bool  # it was given up
+    over: bool  # whether the camera was given up
     status: Status
     application: int | None
     reason: str  # why it is not connected
@@ -127,7 +127,7 @@ class FleetRow:
         self._units = units
         self._counted = (0, 0)  # missed, dropped
         self._last: Result[Any] | None = None
-        self._layout: Layout | None = None  # of the last result
+        self._layout: Layout | None = None  # layout of the last result
         self._marks: collections.deque[int] = collections.deque([0], RATE_SECONDS + 1)
         self._state: RowState = UNKNOWN
         self._connected = False

@@ -77,10 +77,10 @@ class FleetSocket(PageSocket):
         self._view = view
         self._about = about
         self._sight = RowsInSight()
-        self._moved = asyncio.Event()  # something else is in sight
-        self._looked = -1  # version of the view that was looked at
+        self._moved = asyncio.Event()  # set when other rows are in sight
+        self._looked = -1  # version of the view at the last look
         self._seen: dict[str, int] = {}  # versions of the rows that the page has
-        self._window: tuple[Any, ...] = ()  # that the page has: what is found, and which names
+        self._window: tuple[Any, ...] = ()  # window that the page has: found cameras and names
         self._totals: dict[str, Any] = {}
         self._totals_at = -TOTALS_INTERVAL
         self._bars = 0  # start of the last bar of outcomes that the page has

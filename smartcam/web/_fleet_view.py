@@ -78,7 +78,7 @@ class RowOrder(NamedTuple):
     """Names in an order."""
 
     names: list[str]
-    version: int  # of the view, when it was made
+    version: int  # version of the view at its creation
     at: float
 
 

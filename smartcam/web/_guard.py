@@ -53,7 +53,7 @@ HEADERS: Mapping[str, str] = {
 class Guard:
     """The checks of one site."""
 
-    token: str | None  # what calls must carry; None: nothing, and the site listens on loopback
+    token: str | None  # token that calls must carry; None: none, and the site listens on loopback
 
     def check(self, request: web.Request, *, is_call: bool) -> None:
         """Refuse a request that does not come from the site's own pages.

@@ -56,7 +56,7 @@ class ShownResult(NamedTuple):
     serial: int  # counted from 0
     result: Result[Any] | None
     error: str  # why a container could not be read, "" where it could
-    layout: Layout | None = None  # that of tables, which know no units
+    layout: Layout | None = None  # layout of tables, which have no units themselves
 
     def as_json(self) -> dict[str, Any]:
         """Return the result as the page takes it."""
@@ -109,7 +109,7 @@ class LiveView:
         self.series: collections.deque[dict[str, Any]] = collections.deque(maxlen=SERIES)
         self.picture: Picture | None = None
         self.picture_error: str = ""
-        self.changed_at: float = time.time()  # when it was connected or lost at last
+        self.changed_at: float = time.time()  # time at which it was last connected or lost
         self.changed_seen: bool = False  # False: that was before it was followed
         self.loss: str = ""  # why it is not connected, "" where it is
         self._end: SmartCamError | None = None  # why it will never be again
@@ -117,7 +117,7 @@ class LiveView:
         self._serial = 0
         self._picture_wanted = True
         self._asked = 0  # number of the failure whose picture was asked for
-        self._latencies: list[float] = []  # of this second
+        self._latencies: list[float] = []  # latencies of the current second
         self._tasks: list[asyncio.Task[None]] = []
         self._subscribe(camera)
 

@@ -65,15 +65,15 @@ class CallRequest:
 class _Call(Generic[C]):
     """A row of a table of calls."""
 
-    method: _Method  # of HTTP
-    path: str  # with variable parts in braces
-    about: str  # what it does and answers, for people
+    method: _Method  # HTTP method
+    path: str  # path with variable parts in braces
+    about: str  # purpose and answer, for people
     # does it, given the site and what was asked; returns the answer, or raises RefusedError. An
     # event stream returns a coroutine.
     handler: Action[C]
     query: type[BaseModel] | None = None  # the query's model; None: it takes none
     body: _Model | None = None  # the body's model; None: it takes none
-    optional: bool = False  # whether it may come without its body
+    optional: bool = False  # whether the body may be missing
     sample: str = ""  # a body, for people
 
     async def answer(self, site: C, request: web.Request) -> web.StreamResponse:

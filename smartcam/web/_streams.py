@@ -36,7 +36,7 @@ class News(NamedTuple):
     """One event."""
 
     kind: str  # the event's name
-    data: Any  # what happened; sent as JSON
+    data: Any  # event, sent as JSON
     serial: int | None = None  # sent as the event's id; None for none
 
     def as_text(self) -> str:

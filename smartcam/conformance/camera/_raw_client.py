@@ -52,7 +52,7 @@ class RawClient:
     _tcp: bool
     _timeout: float  # seconds for the connection, and for an answer
     _quiet: float  # seconds of silence that count as no answer
-    _trail: deque[str]  # where everything that passes is written down
+    _trail: deque[str]  # record of everything that passes
     _on_change: Callable[[], None]  # before something goes out that changes the camera's state
 
     def __post_init__(self) -> None:

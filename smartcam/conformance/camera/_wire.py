@@ -36,7 +36,7 @@ class BadBytesError(Exception):
 class Heard(NamedTuple):
     """One frame of the camera."""
 
-    at: float  # when its last byte came, time.monotonic()
+    at: float  # time of arrival of the last byte, time.monotonic()
     message_id: int
     body: bytes  # the bytes behind the header
 

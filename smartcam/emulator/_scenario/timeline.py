@@ -153,8 +153,8 @@ class _CueState:
 
     cue: Cue
     random: Random  # one for each cue, so that none changes the chance of another
-    seen: int = 0  # how often its moment came
-    done: int = 0  # how often its faults were injected
+    seen: int = 0  # number of times that its moment came
+    done: int = 0  # number of times that its faults were injected
 
     @property
     def over(self) -> bool:

@@ -94,9 +94,9 @@ class WireMessage(Transmission):
     """A message on its way, or something inserted."""
 
     what: Frame | bytes  # the frame that its sender meant; bytes where they make no frame
-    original: bytes  # its bytes
-    changeable: bool = True  # whether later faults act on it
-    passed: bytearray = field(default_factory=bytearray)  # what has passed
+    original: bytes  # original bytes of the message
+    changeable: bool = True  # whether later faults act on the message
+    passed: bytearray = field(default_factory=bytearray)  # bytes that have passed
 
     @classmethod
     def of(cls, what: Frame | bytes, data: bytes) -> WireMessage:

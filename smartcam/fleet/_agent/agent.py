@@ -227,15 +227,17 @@ class Agent:
         self._present = collections.defaultdict[str, set[str]](set)
         self._gone = collections.defaultdict[str, dict[str, int]](dict)
         self._of_role: collections.Counter[str] = collections.Counter()  # programs that are here
-        self._questions: collections.Counter[str] = collections.Counter()  # of theirs, under way
+        # running questions, by program
+        self._questions: collections.Counter[str] = collections.Counter()
         self._numbers = 0
         self._tasks: set[asyncio.Task[None]] = set()
         self._declared: list[Handle] = []
         self._shared: dict[str, tuple[Handle, asyncio.Task[None]]] = {}
-        self._numbers_at: dict[str, tuple[int, ...]] = {}  # of cameras that were shared before
+        # numbers of cameras that were shared before
+        self._numbers_at: dict[str, tuple[int, ...]] = {}
         self._plain = Plain(self, keys, bus, calibrations)
         self.leaving: set[Host] = set()  # are being closed
-        self.past: Totals = Totals()  # of cameras shared no more
+        self.past: Totals = Totals()  # counts of cameras that are no longer shared
         self._summaries = Summaries(self, keys, bus)
         self._bundle = AgentBundle(name, self.epoch, keys, bus)
         self.stands_by: bool = standby is not None

@@ -120,7 +120,7 @@ class FleetServer(Server):
         section = self.file.ros2
         self._restore = (section is not None and section.autostart) if restore is None else restore
         self.calibrations: CalibrationDesks | None = None
-        # what is told of cameras in ROS, of those that a reload brings, too
+        # settings of cameras for ROS, also of those that a reload adds
         self._settings: dict[str, CameraSettings] = {}
         self._ros_frames: dict[str, dict[str, Any]] = {}
         self._controls: dict[str, Callable[[], Awaitable[FrameSource]]] = {}

@@ -175,8 +175,8 @@ class Feed(Generic[NumberedT]):
         self._held_bytes, self._most_held = 0, most_held
         self._returns = returns
         self._announced = 0  # the highest number of this epoch that the agent said comes next
-        self._places: dict[int, int] = {}  # of epochs before: the number to come next
-        self._said: dict[int, int] = {}  # of other epochs: the number that was said to come next
+        self._places: dict[int, int] = {}  # next expected number, by earlier epoch
+        self._said: dict[int, int] = {}  # next number that was announced, by other epoch
 
     def begin(self, epoch: int, expected: int, following: int) -> None:
         """Take what has ``expected`` or a later number, of this epoch of the agent.

@@ -189,10 +189,10 @@ class Plain:
         self._declared: list[Handle] = []
         self._program = agent.next_program()
         self._numbers = 0
-        # by camera, and whether only operators may ask for them
+        # running calls by camera, and whether only operators may make them
         self._under_way: collections.Counter[tuple[str, bool]] = collections.Counter()
         self._known = {operates: _KnownAnswers() for operates in (True, False)}
-        self._added: dict[str, PlainRequest] = {}  # by Setup, and by which
+        self._added: dict[str, PlainRequest] = {}  # cameras added by Setup, with their requests
 
     def open(self) -> None:
         """Answer from now on."""

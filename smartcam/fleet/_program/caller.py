@@ -145,7 +145,7 @@ class Caller:
         self.end: LinkError | None = None
         self.linked: bool = False
         self.leases: dict[int, Lease] = {}
-        self._epochs: dict[str, int] = {}  # of agents that were met
+        self._epochs: dict[str, int] = {}  # epochs of agents that were met
         self._on_met, self._on_lost = on_met, on_lost
         self._agents: dict[str, None] = {}
         self._stirred = asyncio.Event()

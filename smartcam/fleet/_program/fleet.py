@@ -146,9 +146,10 @@ class FleetResults(Generic[ValueT]):
         self, subscribe: Callable[[FleetCamera[Any]], Subscription[Result[ValueT]]]
     ) -> None:
         self._subscribe = subscribe
-        # of each camera one; those before it have ended, with a camera that was given up
+        # the subscription of each camera; earlier ones in the list ended with a camera that was
+        # given up
         self._streams: dict[str, list[Subscription[Result[ValueT]]]] = {}
-        # those that have something
+        # subscriptions that have results
         self._line: collections.deque[Subscription[Result[ValueT]]] = collections.deque()
         self._in_line: set[Subscription[Result[ValueT]]] = set()
         self._ready = asyncio.Event()
@@ -276,7 +277,7 @@ class Fleet:
         self._options = dict(options)
         self._cameras: dict[str, FleetCamera[Any]] = {}
         self._present: set[str] = set()  # agents
-        self._agents: dict[str, set[str]] = {}  # of a camera, those that share it
+        self._agents: dict[str, set[str]] = {}  # agents that share each camera
         self._handles: list[Handle] = []
         self._opening: dict[str, asyncio.Task[None]] = {}
         self._events: Subscribers[FleetEvent] = Subscribers()

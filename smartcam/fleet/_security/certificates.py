@@ -173,7 +173,7 @@ def read_identity(folder: Path) -> Identity:
         authorities = x509.load_pem_x509_certificates(bodies[0])
     except ValueError as exc:
         raise ConfigurationError(f"certificates: {folder}: no certificate: {exc}") from exc
-    try:  # whether they belong together
+    try:  # whether certificate and key belong together
         context(folder)
     except (ssl.SSLError, OSError) as exc:
         raise ConfigurationError(

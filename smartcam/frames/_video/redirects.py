@@ -35,7 +35,7 @@ _PORTS: Final = {"http": 80, "https": 443, "rtsp": 554, "rtsps": 322}
 
 class _Answer(NamedTuple):
     status: int
-    headers: Mapping[str, Sequence[str]]  # by their names in small letters
+    headers: Mapping[str, Sequence[str]]  # values by the headers' names in lower case
     peer: str  # the address that it came from
 
 

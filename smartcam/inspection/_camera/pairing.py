@@ -59,7 +59,7 @@ class JudgedResults(Observer):
         self._sent = 0  # containers in it
         self._report: LastReport | None = None
         self._before = 0  # containers that the client had got before it
-        self._under_way: dict[int, _SentContainer] = {}  # by their count in the session
+        self._under_way: dict[int, _SentContainer] = {}  # containers by their count in the session
         self._kept: collections.OrderedDict[tuple[int, datetime], Judged] = (
             collections.OrderedDict()
         )

@@ -147,7 +147,7 @@ class Edge(NamedTuple):
     # (K + 1, K + 1), for noise of one grey level: of the places of the K edges that were fitted
     # together, and of their tilt; K edges share one array
     unit_covariance: Array
-    number: int  # of the edge among these, from 0
+    number: int  # index of the edge among these
     noise: float  # standard deviation of the pixels about the fit, grey levels
     height: float  # grey levels from before to behind it; negative from light to dark
     blur: float  # standard deviation of the lens' blur, pixels

@@ -36,11 +36,11 @@ class Plane(NamedTuple):
     """A plane in which lengths are measured."""
 
     unit: str  # "px" or "mm"
-    # from pixels (N, 2) to points of the plane (N, 2)
+    # function from pixels (N, 2) to points of the plane (N, 2)
     map: Callable[[Array], Array]
     # maps that are off by one standard deviation each, in independent ways
     variants: tuple[Callable[[Array], Array], ...] = ()
-    # for people, what of the map's errors nothing tells
+    # unknown errors of the map, for people
     remark: str = ""
 
     def points(self, pixels: Array) -> Array:

@@ -108,7 +108,8 @@ class VisionSystem:
         self._command, self._picture, self._new_job = command, picture, new_job
         self._names = names
         self._simulated = simulated
-        self._connected: bool | None = None  # None: not known yet
+        # whether the camera is connected; None if not known yet
+        self._connected: bool | None = None
         self._by_client = False  # clients prepare recipes: no other becomes ready by itself
         self._wanted: int | None = None  # the application that a client has prepared
         self._ready_application: int | None = None

@@ -127,7 +127,7 @@ class Framer:
         self.buffer: Buffer = (
             b""  # a chunk as it came, or one large frame: of it cut() tells places
         )
-        self.start: int = 0  # where in it the next frame begins
+        self.start: int = 0  # offset of the next frame
         self._large: memoryview | None = None  # an unfinished large frame, as long as it will be
         self._filled = 0
         self._store = memoryview(b"")  # where a transport writes; large frames stay there

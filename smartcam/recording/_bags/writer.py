@@ -59,7 +59,7 @@ class _BagChannel:
     """A topic as it stands in the file, and how many messages it has."""
 
     id: int
-    metadata: dict[str, str]  # of its topic, for ``metadata.yaml``
+    metadata: dict[str, str]  # metadata of its topic, for ``metadata.yaml``
     count: int = 0
 
 

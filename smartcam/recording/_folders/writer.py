@@ -57,7 +57,7 @@ class _Trouble:
     error: RecordingError
     reason: str  # without the folder
     full: bool  # there was no room
-    again: float  # when it is tried again, on the steady clock
+    again: float  # time of the next try, on the monotonic clock
     tries: int = 0
 
 

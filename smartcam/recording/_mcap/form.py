@@ -140,7 +140,7 @@ class Kind(NamedTuple):
 
     topic: str  # last part of its topic
     schema: str  # name of its schema
-    about: str  # what it is, for the schema
+    about: str  # description for the schema
     properties: Mapping[str, Any]  # the schema's, by field
     required: tuple[str, ...]  # fields that are always there
     to_text: Callable[..., str]  # makes the message of an item, in ASCII

@@ -95,8 +95,8 @@ Record: TypeAlias = Schema | Channel | McapMessage | Metadata
 class RecordReader:
     """Reads a file from its begin to its end, once."""
 
-    _stream: IO[bytes]  # at the file's begin
-    _name: object  # of the file, for errors
+    _stream: IO[bytes]  # stream at the beginning of the file
+    _name: object  # name of the file, for errors
 
     def __post_init__(self) -> None:
         self.place: int = 0  # bytes read so far

@@ -139,7 +139,7 @@ def plan_lines(items: Iterable[Item], codec: LineCodec) -> LinesPlan:
     """
     plan = LinesPlan()
     now, place, size = _AskedLine(0.0, pieces=plan.greeting), 0, 0
-    known: dict[str, _AskedLine] = {}  # by what answers are known by
+    known: dict[str, _AskedLine] = {}  # lines by the key that identifies their answers
     lines: list[_AskedLine] = []
     for number, item in enumerate(items):
         if isinstance(item, Disconnected):

@@ -88,8 +88,8 @@ class _Takes:
 class _Numbers(NamedTuple):
     """The place of the sequence number in a container."""
 
-    field: Field  # of the layout
-    offset: int  # of its first byte
+    field: Field  # field of the layout
+    offset: int  # offset of its first byte
 
     def put(self, data: bytes, number: int, byte_order: ByteOrder) -> bytes:
         """Return a container with another number; one that has none as it is."""
@@ -107,13 +107,13 @@ class _Numbers(NamedTuple):
 class _Track:
     """The parts of a replay that belong to one application."""
 
-    waits: bool  # it waits for triggers
+    waits: bool  # whether the camera waits for triggers
     triggered: _Takes  # takes for triggers
     unasked: _Takes  # takes that come by themselves
     current: Take | None = None  # the take of the inspection under way
-    # its further containers, still to be sent
+    # further containers, still to be sent
     rest: list[bytes] = field(default_factory=list[bytes])
-    # how to give containers the client's numbers; None: they keep their own
+    # numbering of containers by the client's numbers; None: they keep their own
     numbers: _Numbers | None = None
     # is told each container that is given, as it was recorded
     told: Callable[[bytes], None] = lambda _: None
@@ -249,7 +249,7 @@ class ReplayedCamera(EmulatedCamera):
         self._reference = 0.0  # the next unasked take is counted from here
         self._alarm: TimerHandle | None = None
         self._due = False  # an unasked take is to begin as soon as it can
-        self._round: float | None = None  # when the present round of conditions began
+        self._round: float | None = None  # time at which the present round of conditions began
         self._changed = 0  # changes of conditions in it
         self._change_alarm: TimerHandle | None = None
         self._pictures: ReplayedPictures | None = None

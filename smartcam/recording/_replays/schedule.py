@@ -53,8 +53,9 @@ a second."""
 class Take:
     """One inspection."""
 
-    containers: list[bytes]  # what it sent, in order; nothing where the trigger had no result
-    seconds: float  # from its begin to its first container, or to its end where it sent nothing
+    # containers that the camera sent, in order; empty if the trigger had no result
+    containers: list[bytes]
+    seconds: float  # seconds from its beginning to its first container, or to its end without one
     # seconds from the end of the one before, or from the begin of the run, to its begin; only where
     # nobody had triggered it
     gap: float = 0.0
@@ -68,7 +69,7 @@ class TakeList:
     application: int
     triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
     unasked: list[Take] = field(default_factory=list[Take])  # the others
-    waits: bool = True  # it waits for triggers; otherwise it runs free
+    waits: bool = True  # whether it waits for triggers; otherwise it runs free
     load_time: float | None = None  # seconds that a switch to it took; None where none was recorded
 
 
@@ -86,14 +87,14 @@ class ReplayPlan:
     """Everything that a replay needs to know."""
 
     dialect: str
-    quirks: tuple[str, ...]  # its deviations
+    quirks: tuple[str, ...]  # deviations from the dialect
     transport: Literal["tcp", "udp"]
-    applications: Mapping[int, TakeList]  # what each gave, by id; never empty
+    applications: Mapping[int, TakeList]  # takes of each application, by id; never empty
     active: int  # id of the one that gave the first container
     running: bool  # whether the camera ran
     endian: int  # the status message's endian field
-    conditions: Status  # those that were set at first
-    changes: tuple[Change, ...]  # of conditions afterwards, in order
+    conditions: Status  # conditions at first
+    changes: tuple[Change, ...]  # later changes of conditions, in order
     seconds: float  # length of the recording from its first session on
 
 
@@ -202,11 +203,11 @@ class _What(enum.Enum):
 class _ReplayStep(NamedTuple):
     """The meaning of a frame, or of the end of a link, for a replay."""
 
-    at: float  # when, seconds since 1970
+    at: float  # time, seconds since 1970
     what: _What
     number: int = 0  # an application's id, or the endian field
-    bits: Status = Status(0)  # of a status
-    data: bytes = b""  # of a container
+    bits: Status = Status(0)  # bits of a status
+    data: bytes = b""  # bytes of a container
 
 
 _PLAIN = {
@@ -440,22 +441,23 @@ class _ScheduleMaker:
     """Follows a recording, step by step."""
 
     def __init__(self, free: set[int]) -> None:
-        self.lists: dict[int, TakeList] = {}  # what came so far, by application
-        self.began: float | None = None  # when the first session began, seconds; None before
+        self.lists: dict[int, TakeList] = {}  # takes so far, by application
+        # time at which the first session began, seconds; None before
+        self.began: float | None = None
         self.now: float = 0.0  # time of the last step, seconds
         self.first: int | None = None  # application of the first container; None before
         self.ran_at_first: bool = False  # the first status said Running
-        self.endian: int = 0  # of the last status before the first container
-        self.conditions: Status = Status(0)  # those of the first status
-        self.changes: list[Change] = []  # of conditions so far
+        self.endian: int = 0  # byte order of the last status before the first container
+        self.conditions: Status = Status(0)  # conditions of the first status
+        self.changes: list[Change] = []  # changes of conditions so far
         self._free = free  # applications that run free
         self._active: int | None = None
-        self._status: Status | None = None  # in this session
-        self._last: Status | None = None  # of all sessions
+        self._status: Status | None = None  # last status in this session
+        self._last: Status | None = None  # last status of all sessions
         self._triggers: list[float] = []  # without a container so far
         self._drops = 0  # triggers dropped since the last take
         self._waits_from = self._waited_until = 0.0  # when Waiting for Trigger rose, and fell
-        self._open: Take | None = None  # its inspection may send more
+        self._open: Take | None = None  # take whose inspection may send more
         self._opened = 0.0  # when it sent its first container
         self._began_unasked: float | None = None  # an inspection that nobody had triggered
         self._reference = 0.0  # the next unasked one is counted from here
