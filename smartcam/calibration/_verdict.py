@@ -144,7 +144,7 @@ def judge(
         return Judgement(CalibrationVerdict("poor", text), option="more")
     if Code.SIDE_UNKNOWN in texts:
         text = f"Not known how good: say where the tool points. If y is not mirrored, {promise}"
-        return Judgement(CalibrationVerdict("unknown", text))
+        return Judgement(CalibrationVerdict("unknown", text), option="side")
     text = f"Good for {good_for:g} mm{where}: 95 of 100 new points lie within it; {allowed.text}"
     return Judgement(CalibrationVerdict("good", text), good_for)
 

@@ -56,6 +56,7 @@ class DeviceClock:
     def __init__(self) -> None:
         self._lowest: collections.deque[tuple[float, float]] = collections.deque(maxlen=WINDOW)
         self._drift: float | None = None
+        self._edge = (0.0, 0.0)  # the one of them that the lower edge goes through
         self._last: float | None = None
         self._piece_began = 0.0
         self._held: float | None = None  # the offset at the last frame
@@ -110,6 +111,7 @@ class DeviceClock:
         else:
             return
         self._drift = self._slope()
+        self._edge = _lowest(list(self._lowest), self._drift or 0.0)
 
     def _slope(self) -> float | None:
         """Return the slope of the lower edge; None if too little is known."""
@@ -126,10 +128,8 @@ class DeviceClock:
         return slope if abs(slope) <= MAX_DRIFT else None
 
     def _offset(self, device: float) -> float:
-        slope = self._drift
-        if not slope:
-            return min(offset for _, offset in self._lowest)
-        return min(offset + slope * (device - at) for at, offset in self._lowest)
+        at, offset = self._edge
+        return offset + (self._drift or 0.0) * (device - at)
 
 
 def _slope(first: tuple[float, float], second: tuple[float, float]) -> float:

@@ -101,6 +101,7 @@ class FrameDriver(ABC):
     Attributes:
         times_frames: whether ``captured`` of its frames is on the host's clock even if they have a
             ``device_time``; else the source computes it.
+        lists_features: whether its device tells which features it has, if it has any.
         form: format of the stream after a feature changed it; None: as :meth:`open` returned it.
         waits_for: condition that the device waits for before each picture, for errors, such as
             ``TriggerSource is Line1``; ``""``: it streams by itself. A waiting device is never
@@ -108,6 +109,7 @@ class FrameDriver(ABC):
     """
 
     times_frames: ClassVar[bool] = False
+    lists_features: ClassVar[bool] = True
     form: StreamFormat | None = None
     waits_for: str = ""
 
@@ -132,8 +134,8 @@ class FrameDriver(ABC):
             UnsupportedError: devices of this kind have none.
         """
         raise UnsupportedError(
-            f"{self.name}: a source of this kind has no features to read or set; those of gige: "
-            "and v4l2: have them"
+            f"{self.name}: a source of this kind has no features to read or set; those of gige:, "
+            "v4l2: and rtsp: have them"
         )
 
     async def watch_events(

@@ -9,6 +9,8 @@ import time
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from smartcam.frames._pixels.apart import JoinedOnUse
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
@@ -130,7 +132,7 @@ class Frame:
             FrameFormatError: the format has no brightness, or its bytes are wrong.
             MissingExtraError: the codec of a compressed format is not installed.
         """
-        return self.format.grey(self.data, self.width, self.height, self.stride)
+        return self.format.grey(_data.held(self), self.width, self.height, self.stride)
 
     def rgb(self) -> NDArray[Any]:
         """Return the colours, (H, W, 3), red first; Bayer patterns are demosaiced.
@@ -146,9 +148,19 @@ class Frame:
         return self.format.rgb(self.data, self.width, self.height, self.stride)
 
 
+_data: Final = JoinedOnUse(vars(Frame)["data"])
+setattr(Frame, "data", _data)  # noqa: B010 - checkers know the attribute as it is read
 _NAMES: Final = tuple(one.name for one in fields(Frame))
-_values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_NAMES)
-_setters: Final = tuple(getattr(Frame, name).__set__ for name in _NAMES)
+_OTHERS: Final = tuple(name for name in _NAMES if name != "data")
+_values_of: Final[Callable[[Frame], tuple[object, ...]]] = operator.attrgetter(*_OTHERS)
+_setters: Final = tuple(getattr(Frame, name).__set__ for name in _OTHERS)
+
+
+def amend(frame: Frame, **changes: object) -> Frame:
+    """Return a frame that nobody else has yet, with some attributes changed in it."""
+    for name, value in changes.items():
+        object.__setattr__(frame, name, value)
+    return frame
 
 
 def changed(frame: Frame, **changes: object) -> Frame:
@@ -161,8 +173,7 @@ def changed(frame: Frame, **changes: object) -> Frame:
     if type(frame) is not Frame:
         return dataclasses.replace(frame, **cast("Any", changes))
     made = object.__new__(Frame)
+    _data.__set__(made, _data.held(frame))
     for put, value in zip(_setters, _values_of(frame), strict=True):
         put(made, value)
-    for name, value in changes.items():
-        object.__setattr__(made, name, value)
-    return made
+    return amend(made, **changes)

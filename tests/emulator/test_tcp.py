@@ -12,12 +12,14 @@ from typing import Any, cast
 import pytest
 
 from smartcam.emulator import EmulatedCamera, ManualClock
-from smartcam.emulator._client_link import MAX_INPUT_BYTES
-from smartcam.emulator._links import FIRST_READ_BYTES, MAX_READ_BYTES
 from smartcam.protocols import messages as m
 from tests.emulator import camera_wire as wire
 from tests.emulator.camera_wire import TcpClient
 from tests.handmade import until
+
+FIRST_READ_BYTES = 1 << 10
+MAX_INPUT = 64 << 10
+MAX_READ_BYTES = 64 << 10
 
 
 @pytest.fixture
@@ -400,10 +402,10 @@ async def test_tcp_client_without_a_session_holds_one_frame_at_most(
     emulator: EmulatedCamera, client: TcpClient
 ) -> None:
     listener: Any = emulator._listener
-    bomb = wire.MAGIC + (MAX_INPUT_BYTES + 1).to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
-    half = wire.MAGIC + MAX_INPUT_BYTES.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
-    half += bytes(MAX_INPUT_BYTES - 1)
-    client.send(bomb, bytes(3 * MAX_INPUT_BYTES), half)
+    bomb = wire.MAGIC + (MAX_INPUT + 1).to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
+    half = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
+    half += bytes(MAX_INPUT - 1)
+    client.send(bomb, bytes(3 * MAX_INPUT), half)
     await until(lambda: len(listener.all_links) == 1)
     (link,) = listener.all_links
     await until(lambda: link.machine.buffered == len(half))
@@ -425,9 +427,9 @@ async def test_tcp_idle_connection_has_a_small_buffer_also_after_a_long_input(
 ) -> None:
     (link,) = cast("Any", emulator._listener).all_links
     sizes = {len(link._room)}
-    data = wire.MAGIC + MAX_INPUT_BYTES.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
+    data = wire.MAGIC + MAX_INPUT.to_bytes(4, "little") + bytes([0x21, 0, 0, 0])
     for count in range(1, 4):
-        session.send(data + bytes(MAX_INPUT_BYTES))
+        session.send(data + bytes(MAX_INPUT))
         await emulator.wait_received(0x21, count=count)
         sizes.add(len(link._room))
         await session.expect_nothing_but(wire.GET_CLOCK, wire.CLOCK_0)

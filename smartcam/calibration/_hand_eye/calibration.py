@@ -25,6 +25,7 @@ from smartcam.calibration._hand_eye.closed_forms import (
     LINEAR,
     MIN_POSES,
     check_motion,
+    of_one_place,
     scale_of,
     second_turns,
 )
@@ -568,8 +569,11 @@ def _covariance(chosen: Candidate) -> Array:
         return np.full((12, 12), np.nan)
     cameras, targets = solution.camera.before(others.camera), solution.target.before(others.target)
     steps = np.concatenate([cameras, targets], axis=1)
-    if chosen.method in LINEAR:  # solved without several poses at a time, not without each
+    places = of_one_place(chosen.problem.robot.poses)
+    if chosen.method in LINEAR:  # solved without a part of the poses, not without each
         steps = steps[:MAX_FOLDS]
+    elif len(first := np.unique(places)) > 1:  # without all of a place: to first order, the sum
+        steps = np.array([steps[places == one].sum(axis=0) for one in first])
     scatter = jackknife(steps)
     lens, seen = chosen.problem.lens, chosen.problem.seen
     if lens is None or not isinstance(seen, PixelObservations) or any(seen.free):
@@ -605,10 +609,12 @@ def _remarks(problem: Problem, result: HandEyeCalibration) -> Iterator[Remark]:
             "that by the robot's motions: measure the print; poses and errors are those of a "
             "target of that size"
         )
-    if problem.count < MIN_ADVISED_POSES:
+    places = len(np.unique(of_one_place(problem.robot.poses)))
+    if places < MIN_ADVISED_POSES:
+        alike = f" that are different, of {problem.count}" if places < problem.count else ""
         yield Code.TOO_FEW.remark(
             f"expected {MIN_ADVISED_POSES} poses or more for an error that can be relied on, got "
-            f"{problem.count}"
+            f"{places}{alike}"
         )
     # a remark that one pose more or less would change helps nobody
     turn = float(second_turns(problem.robot).max())

@@ -14,6 +14,8 @@ from smartcam.geometry._inside import Rigid, log_rotation
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import NDArray
+
     from smartcam.calibration._hand_eye.equations import RobotPoses
     from smartcam.geometry._inside import Array
 
@@ -22,6 +24,9 @@ MIN_POSES = 3
 
 SAME_TURN_RADIANS = math.radians(0.5)
 """Poses that are turned by less than this against each other count as one."""
+
+SAME_PLACE_M = 0.001
+"""Metres: poses that are less apart and turned by less than that are of one place."""
 
 MAX_POSES_PAIRED = 40
 """With at most this many poses, each pair of them is used: the time grows with the square of their
@@ -104,6 +109,22 @@ def check_motion(robot: RobotPoses) -> None:
             MIN_TURN_RADIANS,
             second,
         )
+
+
+def of_one_place(poses: Rigid) -> NDArray[np.intp]:
+    """Return for each pose (V,) the number of the first one that is about the same.
+
+    Errors of a robot are the same at each visit of a place, so its views tell no more than one.
+    """
+    numbers = np.arange(poses.size)
+    for index in numbers[1:]:
+        turned = log_rotation(poses.rotation[:index].swapaxes(1, 2) @ poses.rotation[index])
+        moved = poses.translation[:index] - poses.translation[index]
+        near = np.linalg.norm(turned, axis=1) < SAME_TURN_RADIANS
+        near &= np.linalg.norm(moved, axis=1) < SAME_PLACE_M
+        if near.any():
+            numbers[index] = numbers[int(np.argmax(near))]
+    return numbers
 
 
 def _some_turns(robot: RobotPoses) -> Array:

@@ -37,6 +37,7 @@ from smartcam.calibration._plane.diagnostics import (
 from smartcam.calibration._plane.fitting import MODELS, Fit, ModelName, Normalization
 from smartcam.calibration._plane.mapping import PlaneMap
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, Candidates, rms, squares
+from smartcam.calibration._plane.order import better_order
 from smartcam.calibration._plane.pose_sigmas import robot_sigmas
 from smartcam.calibration._plane.robust import agreeing
 from smartcam.calibration._plane.validation import (
@@ -550,9 +551,10 @@ def fit_plane(
 
     Raises:
         CalibrationError: ``code`` says why there is no calibration: SHAPE, NOT_FINITE, TOO_FEW,
-            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, SCALE_MISMATCH where ``rigid``
-            was asked for, or with ``robust`` OUTLIER: no map agrees with more than half of the
-            points; OUT_OF_FIELD: a point that was left out is behind the plane's horizon.
+            COINCIDENT, COLLINEAR, SHORT_LEVER, NOT_PLANAR, MIRRORED, UNIT_UNKNOWN: a field of more
+            than 20 m, SCALE_MISMATCH where ``rigid`` was asked for, or with ``robust`` OUTLIER: no
+            map agrees with more than half of the points; OUT_OF_FIELD: a point that was
+            left out is behind the plane's horizon.
         MissingExtraError: SciPy is not installed.
         ValueError: ``model`` is unknown.
     """
@@ -574,6 +576,11 @@ def fit_plane(
     if robust:
         kept = np.flatnonzero(agreeing(marks, touched, once.weights, touch_sigma))
     check_samples(marks[kept], touched[kept], least, touch_sigma)
+    most = MAX_SIGMA.of(extent(touched[kept])) if touch_sigma is None else touch_sigma
+    # of all points: those in a wrong order agree with one another as well as those in the right one
+    order = better_order(marks, touched, most)
+    if order is not None and set(order.moved).isdisjoint(kept):
+        order = None
     side = None if tool_z is None else mean_axis(tool_z, len(camera))
     place, pairs = normalize(marks[kept], touched[kept], once.weights[kept])
     sigma = None if touch_sigma is None else touch_sigma / place.robot_size
@@ -586,7 +593,6 @@ def fit_plane(
     held_out = candidates.held_out(fitted)
     matrix = place.outward(fitted.matrix)
     plane = PlaneMap(matrix, place.camera)
-    most = MAX_SIGMA.of(extent(touched[kept])) if touch_sigma is None else touch_sigma
     evidence = Evidence(
         pairs=pairs,
         fitted=fitted,
@@ -636,7 +642,8 @@ def fit_plane(
         allowed_error=allowed_error,
         warnings=findings(evidence),
     )
-    remarks = [_left_out(found, index, parts[index]) for index in found.outliers]
+    remarks = [] if order is None else [order.remark(1 + once.first)]
+    remarks += [_left_out(found, index, parts[index]) for index in found.outliers]
     apart = np.linalg.norm(beside, axis=1)
     if apart.max() > MAX_TOUCH_SIGMAS * most:
         text = f"point {1 + int(apart.argmax())} was touched {1e3 * float(apart.max()):.3g} mm from"

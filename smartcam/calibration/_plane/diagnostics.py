@@ -13,7 +13,6 @@ import numpy as np
 
 from smartcam.calibration._plane.fitting import fit
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO, squares, touch_noise
-from smartcam.calibration._plane.order import better_order
 from smartcam.calibration._statistics import Noise
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code, Remark
@@ -94,7 +93,7 @@ class Evidence(NamedTuple):
 
 def findings(evidence: Evidence) -> tuple[Remark, ...]:
     """Return the warnings, the most serious first."""
-    tests = (_order, _planarity, _fit, _wrong_instead, _model, _scale, _held_out, _touches, _side)
+    tests = (_planarity, _fit, _wrong_instead, _model, _scale, _held_out, _touches, _side)
     return tuple(remark for test in tests for remark in test(evidence))
 
 
@@ -106,12 +105,6 @@ def sigma_of(squared: float, freedom: int, typical: float) -> float:
     """
     missing = max(0, MIN_DEGREES_OF_FREEDOM - freedom)
     return math.sqrt((squared + missing * typical**2) / (freedom + missing))
-
-
-def _order(evidence: Evidence) -> Iterator[Remark]:
-    found = better_order(evidence.pairs.camera, evidence.pairs.robot, evidence.most)
-    if found is not None:
-        yield found.remark(evidence.numbers, 1e3 * evidence.place.robot_size)
 
 
 def check_side(normal: Array, tool_z: Array) -> float:

@@ -50,8 +50,8 @@ class Reordered(NamedTuple):
 
     Attributes:
         order: (N,), for each mark the index of the touch that belongs to it.
-        before: sigma of a touch, estimated with the order as given, in the unit of the touches.
-        after: sigma of a touch, estimated with the better order, in the unit of the touches.
+        before: sigma of a touch, estimated with the order as given, metres.
+        after: sigma of a touch, estimated with the better order, metres.
         sure: True if every other order that fits as well moves far more touches: marks in a regular
             grid look alike from several sides.
     """
@@ -66,11 +66,10 @@ class Reordered(NamedTuple):
         """Indices of the marks that get another touch."""
         return tuple(np.flatnonzero(self.order != np.arange(len(self.order))).tolist())
 
-    def remark(self, numbers: NDArray[np.intp], mm: float = 1e3) -> Remark:
+    def remark(self, numbers: NDArray[np.intp]) -> Remark:
         """Return a remark that reports the better order.
 
-        ``numbers`` (N,): numbers of the points in messages. ``mm``: millimetres per unit of the
-        touches.
+        ``numbers`` (N,): numbers of the points in messages.
         """
         moved = [int(numbers[i]) for i in self.moved]
         which = f"{', '.join(map(str, moved[:-1]))} and {moved[-1]}"
@@ -78,15 +77,15 @@ class Reordered(NamedTuple):
         several = "" if self.sure else "; more than one order does as well: touch them anew"
         return Code.WRONG_ORDER.remark(
             f"the touches of points {which} look {how}: as given they speak of a touch with a "
-            f"sigma of {mm * self.before:.3g} mm, put right of {mm * self.after:.3g} mm{several}"
+            f"sigma of {1e3 * self.before:.3g} mm, put right of {1e3 * self.after:.3g} mm{several}"
         )
 
 
 def better_order(camera: Array, robot: Array, sigma: float) -> Reordered | None:
     """Return an order of touches that explains them far better than the given one, if there is one.
 
-    ``camera`` (N, 2), ``robot`` (N, 3), in the order as given. ``sigma``: largest plausible
-    standard deviation of a touch's coordinate, in the robot's unit.
+    ``camera`` (N, 2), ``robot`` (N, 3), metres, in the order as given. ``sigma``: largest
+    plausible standard deviation of a touch's coordinate, metres.
     """
     count = len(camera)
     if not 3 < count <= MAX_POINTS_TO_ORDER:

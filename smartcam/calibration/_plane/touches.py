@@ -24,7 +24,7 @@ from smartcam.calibration._plane.diagnostics import (
 )
 from smartcam.calibration._plane.fitting import Normalization, rigid_tangent
 from smartcam.calibration._plane.model_selection import ROUNDING_RATIO
-from smartcam.calibration._plane.validation import check_lever, check_positive
+from smartcam.calibration._plane.validation import check_field, check_lever, check_positive
 from smartcam.calibration._statistics import Noise
 from smartcam.geometry import Code, Remark
 from smartcam.geometry._inside import as_points, frame_from_axes, rotate_ccw
@@ -102,7 +102,8 @@ def fit_touches(
 
     Raises:
         CalibrationError: SHAPE, NOT_FINITE, TOO_FEW, COINCIDENT: A or B lies on the origin;
-            COLLINEAR: the rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED.
+            COLLINEAR: the rays are less than 10 degrees apart; SHORT_LEVER; MIRRORED; UNIT_UNKNOWN:
+            they are farther apart than 20 m.
 
     Source: the thesis' procedure, sections 3.2.3 and 3.2.4, with its mathematics corrected.
     """
@@ -118,6 +119,7 @@ def fit_touches(
         _touches(touches, name) for name, touches in (("the origin", o), ("ray A", a), ("ray B", b))
     ]
     touched = np.concatenate(groups)
+    check_field(touched)
     ray = np.repeat([0, 1, 2], [len(group) for group in groups])
     levers = [float(np.linalg.norm(one.mean(0) - groups[0].mean(0))) for one in groups[1:]]
     sheet = _fit(touched, ray)

@@ -10,6 +10,7 @@ import numpy as np
 
 from smartcam._arguments import plain, shown
 from smartcam.calibration._plane.fitting import Normalization, Pairs
+from smartcam.calibration._units import MAX_UNASKED_M
 from smartcam.geometry import Code
 from smartcam.geometry._inside import as_points
 
@@ -128,11 +129,12 @@ def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | 
     """Raise if points do not determine a plane and a map onto it.
 
     ``camera`` (N, 2); ``robot`` (N, 3), metres; the model needs ``least`` points; ``touch_sigma``
-    is that of one coordinate, metres, or None if it is not known. Raises TOO_FEW, COINCIDENT,
-    COLLINEAR, NOT_PLANAR or SHORT_LEVER.
+    is that of one coordinate, metres, or None if it is not known. Raises TOO_FEW, UNIT_UNKNOWN,
+    COINCIDENT, COLLINEAR, NOT_PLANAR or SHORT_LEVER.
     """
     if len(camera) < least:
         raise Code.TOO_FEW.unexpected(f"expected at least {least} points", least, len(camera))
+    check_field(robot)
     for points, what in ((camera, "camera points"), (robot, "robot points")):
         _check_distinct(points, what, least)
         _check_width(points, what)
@@ -146,6 +148,17 @@ def check_samples(camera: Array, robot: Array, least: int, touch_sigma: float | 
         )
     if touch_sigma is not None:
         check_lever(lever(robot), touch_sigma)
+
+
+def check_field(robot: Array) -> None:
+    """Raise (UNIT_UNKNOWN) where touched points (N, 3) are farther apart than in any cell."""
+    if (found := extent(robot)) > MAX_UNASKED_M:
+        raise Code.UNIT_UNKNOWN.refusal(
+            f"robot points: expected metres, and a field of {MAX_UNASKED_M:g} m at most, got one "
+            f"of {found:.4g} m: are they millimetres? Multiply them by 0.001",
+            MAX_UNASKED_M,
+            found,
+        )
 
 
 def lever(robot: Array) -> float:

@@ -10,6 +10,7 @@ Source: thesis 3.2.2 to 3.2.4 (published) for the rays.
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -24,11 +25,19 @@ from smartcam.calibration._plane.order import Reordered, better_order
 from smartcam.calibration._plane.robust import MIN_POINTS
 from smartcam.calibration._plane.touches import fit_touches
 from smartcam.calibration._plane.validation import extent
-from smartcam.calibration._verdict import Judgement, refused
+from smartcam.calibration._verdict import CURES, Judgement, refused
 from smartcam.calibration.wizards._sequence import ask
 from smartcam.calibration.wizards._steps import Option, Step, Text, pick
 from smartcam.calibration.wizards._touch_previews import compared, plain
-from smartcam.calibration.wizards._touches import ALLOWED, SIDE, SIGMA, UNIT, Touch, Touches
+from smartcam.calibration.wizards._touches import (
+    ALLOWED,
+    SIDE,
+    SIDES,
+    SIGMA,
+    UNIT,
+    Touch,
+    Touches,
+)
 from smartcam.calibration.wizards._usage import usage
 from smartcam.exceptions import CalibrationError
 from smartcam.geometry import Code
@@ -43,6 +52,7 @@ if TYPE_CHECKING:
     from smartcam.calibration._plane.calibration import PlaneCalibration
     from smartcam.calibration.wizards._marks import Mark
     from smartcam.calibration.wizards._steps import Answers, Input
+    from smartcam.geometry._inside import Array
 
 MAX_POINTS = 200
 """A calibration has at most this many touches."""
@@ -210,8 +220,16 @@ class PointSource(Touches, ABC):
                         replace(one, robot=self.touches[i].robot, tool_z=self.touches[i].tool_z)
                         for one, i in zip(self.touches, order.order, strict=True)
                     ]
+                case "side":
+                    await self._ask_side()
                 case _:
                     robust = choice["next"] == "robust"
+
+    async def _ask_side(self) -> None:
+        """Ask where the tool pointed at all touches."""
+        step = Step(id="side", title="Where the tool points", inputs=(SIDE,))
+        self.side = (await ask(step))["side"]
+        self.touches = [replace(one, tool_z=SIDES[self.side]) for one in self.touches]
 
     def _try_fit(
         self, *, robust: bool
@@ -245,7 +263,19 @@ class PointSource(Touches, ABC):
             with contextlib.suppress(CalibrationError):
                 for index in self.fit(robust=True).outliers:
                     return refused(Code.OUTLIER, f"point {1 + index}")
+        elif len(fitting := [i for i in range(len(self.touches)) if self._fits_without(i)]) == 1:
+            return refused(Code.OUTLIER, f"point {1 + fitting[0]}")
         return refused(error.code or "", str(error))
+
+    def _fits_without(self, index: int) -> bool:
+        """Return True if the touches fit without one of them, and one more is left to show it."""
+        rest = copy.copy(self)
+        rest.touches = [*self.touches[:index], *self.touches[index + 1 :]]
+        try:
+            codes = {one.code for one in rest.fit(robust=False).warnings}
+        except CalibrationError:
+            return False
+        return len(rest.touches) > MIN_TOUCHES and codes.isdisjoint(CURES)
 
     def _review(
         self,
@@ -270,6 +300,8 @@ class PointSource(Touches, ABC):
         if order is not None and order.sure:
             moved = ", ".join(str(1 + index) for index in order.moved)
             options["reorder"] = f"exchange the touches of the points {moved}, as fits best"
+        if judgement.option == "side" and self.typed:
+            options["side"] = "say where the tool points"
         doubtful = plane is None or any(one.code in _SIGNS_OF_OUTLIERS for one in plane.warnings)
         if robust:
             options["all"] = "count all points, also those that do not agree with the others"
@@ -414,8 +446,13 @@ async def ask_to_save(
     return {"name": name, "file": file.name, "path": str(file), **outcome.figures}
 
 
-def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
-    """Return a plane's calibration with its figures, in mm, and its notes."""
+def calibrated_plane(
+    calibration: PlaneCalibration, what: str = "the camera's x axis", along: Array | None = None
+) -> Calibrated:
+    """Return a plane's calibration with its figures, in mm, and its notes.
+
+    ``what``: what lies ``along`` (3,) some direction of the robot; None: as the camera's x axis.
+    """
     counted = calibration.weights > 0.0
     residual = 1e3 * math.sqrt(float((calibration.residuals[counted] ** 2).sum(axis=1).mean()))
     held_out, predicted = calibration.held_out_error, None
@@ -435,9 +472,9 @@ def calibrated_plane(calibration: PlaneCalibration) -> Calibrated:
         )
     if predicted is not None:
         notes.append(f"predicted error {predicted:.3f} mm rms at the points")
-    x, y, z = calibration.rotation[:, 0]
+    x, y, z = calibration.rotation[:, 0] if along is None else along
     notes.append(
-        f"the camera's x axis lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
+        f"{what} lies along ({x:.2f}, {y:.2f}, {z:.2f}) of the robot: see that it "
         "does, for points in a regular grid fit as well when touched from another corner on"
     )
     notes += [f"{one.code}: {one.text}" for one in calibration.warnings]

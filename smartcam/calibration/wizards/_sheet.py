@@ -281,7 +281,10 @@ class _SheetSource(PointSource):
             lens_covariance=self._lens_covariance,
             camera_frame=frame,
         )
-        _, figures, lines, _ = calibrated_plane(plane)
+        middle = self._view.points.mean(axis=0)
+        ends = found.transform(middle + np.array([[0.0, 0.0], [1.0, 0.0]]))
+        right = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        _, figures, lines, _ = calibrated_plane(plane, "what is to the right in the picture", right)
         seen, predicted = len(self._view.ids), None
         notes = [*lines, f"{seen} points seen, {found.rms:.2g} px beside their plane"]
         if plane.touch_sigma is not None:

@@ -98,6 +98,7 @@ class Touches:
             ``unit`` and ``side``.
         marks: marks of the last picture.
         camera_unit: unit of the camera's positions.
+        side: one of :data:`SIDES`, where the tool points, of robots whose pose is typed.
     """
 
     about: StepAnswer
@@ -107,6 +108,12 @@ class Touches:
     def __post_init__(self) -> None:
         self.touches: list[Touch] = []
         self.marks: Sequence[Mark] = ()
+        self.side = str(self.about.get("side", "unknown"))
+
+    @property
+    def typed(self) -> bool:
+        """True if the user types the robot's pose."""
+        return self._read_robot is None
 
     @property
     def places(self) -> list[Vector]:
@@ -181,7 +188,7 @@ class Touches:
         text = f"{step.description} Then take its position from the robot, in its base."
         answer = await ask(replace(step, description=text, inputs=(*step.inputs, *place)))
         x, y, z = (answer[axis] * UNITS[unit] for axis in "xyz")
-        return Touch(mark_of(answer), (x, y, z), SIDES[self.about.get("side", "unknown")], what)
+        return Touch(mark_of(answer), (x, y, z), SIDES[self.side], what)
 
 
 async def _read(read_robot: ReadRobot, _answers: Answers) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from smartcam.conformance.camera._results import Differs, NotObserved
+from smartcam.conformance.camera._verdicts import Differs, NotObserved
 from smartcam.conformance.camera._wire import BadBytesError, Heard, RawDialect
 from smartcam.exceptions import hex_excerpt
 from smartcam.protocols import messages as m

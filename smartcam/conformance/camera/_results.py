@@ -23,26 +23,6 @@ if TYPE_CHECKING:
     from smartcam.conformance.camera._session_under_test import CameraUnderTest
 
 
-@dataclass(eq=False)
-class Differs(Exception):  # noqa: N818 - it is a verdict on the camera
-    """The camera does something else than the documents say."""
-
-    expected: str  # behaviour by the documents
-    came: str  # behaviour that was seen instead
-
-    def __str__(self) -> str:
-        """Return both."""
-        return f"expected: {self.expected}; came: {self.came}"
-
-
-class Undescribed(Differs):
-    """A question was answered by something that no setting of its quirk describes."""
-
-
-class NotObserved(Exception):  # noqa: N818 - it is a verdict on the experiment
-    """The camera could not be seen doing it; the text says why, as what follows "because"."""
-
-
 class CheckOutcome(enum.Enum):
     """The outcome of a check or a question."""
 
@@ -58,17 +38,16 @@ class CheckOutcome(enum.Enum):
 class Item:
     """A check or a question."""
 
-    name: str  # name in reports and for ``-k``
-    about: str  # subject of the check, one sentence
-    # source in the documents with its grade, ``"SC-A28, published"``, by dialect; ``""`` is for the
-    # others
+    name: str  # in reports and for ``-k``
+    about: str  # what is looked at, one sentence
+    # where it stands and its grade, ``"SC-A28, published"``, by dialect; ``""`` is for the others
     sources: Mapping[str, str]
     # does it. A check returns nothing or a remark, a question the value.
     run: Callable[[CameraUnderTest], Any]
-    needs: Allow = Allow.NOTHING  # effects on the camera that it needs
-    dialects: tuple[str, ...] = EVERY_DIALECT  # dialects in which the check makes sense
-    transports: tuple[str, ...] = ("tcp", "udp")  # transports over which the check makes sense
-    documents: tuple[str, ...] = ()  # contradictions of ``docs/unknowns.md`` that the check decides
+    needs: Allow = Allow.NOTHING  # what it does to the camera
+    dialects: tuple[str, ...] = EVERY_DIALECT  # those in which it makes sense
+    transports: tuple[str, ...] = ("tcp", "udp")  # those over which it makes sense
+    documents: tuple[str, ...] = ()  # which contradictions of ``docs/unknowns.md`` it decides
 
     def source(self, dialect: str) -> tuple[str, str]:
         """Return the source for a dialect, and the grade."""
@@ -139,14 +118,14 @@ class CameraFinding:
 
     item: Item
     outcome: CheckOutcome
-    source: str  # source in the documents
-    grade: str  # grade of the source
+    source: str  # where it stands
+    grade: str  # of the source
     value: Any = None  # the answer to a question; None for a check
     text: str = ""  # a remark, or why nothing was observed
-    expected: str = ""  # expected behaviour, if it differs
-    came: str = ""  # behaviour that came, if it differs
-    wire: tuple[str, ...] = ()  # messages on the wire, if it differs
-    seconds: float = 0.0  # duration, seconds
+    expected: str = ""  # where it differs, what was expected
+    came: str = ""  # where it differs, what came
+    wire: tuple[str, ...] = ()  # what went over the wire, where it differs
+    seconds: float = 0.0  # how long it took
 
     @property
     def failed(self) -> bool:

@@ -257,7 +257,8 @@ class H264Decoder:
 
     def _made(self, picture: Any) -> Frame:
         frame = self._held.pop(picture.pts)
-        pixels = from_video(picture.reformat(format=self._to) if self._to else picture)
+        picture = picture.reformat(format=self._to) if self._to else picture
+        pixels = from_video(picture, apart=True)
         if (pixels.width, pixels.height) != (frame.width, frame.height):
             raise self._damaged(frame, f"a picture of {pixels.width}x{pixels.height}")
         return changed(frame, data=pixels.data, format=pixels.format, stride=pixels.stride)

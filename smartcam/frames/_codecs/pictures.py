@@ -184,7 +184,7 @@ def _from_png(frame: Frame, name: str) -> Frame:
 
 
 def _from_jpegxl(frame: Frame, name: str) -> Frame:
-    return _lossless_back(frame, name, _jpegxl_size(frame), "jpegxl_decode")
+    return _lossless_back(frame, name, jpegxl_size(frame), "jpegxl_decode")
 
 
 def _lossless_back(frame: Frame, name: str, size: tuple[int, int], decoder: str) -> Frame:
@@ -225,8 +225,12 @@ _USUAL: Final = {
 """Formats by the number of samples per pixel, and the bytes of a sample."""
 
 
-def _jpegxl_size(frame: Frame) -> tuple[int, int]:
-    """Return the width and height that a JPEG XL begins with (ISO/IEC 18181-1, SizeHeader)."""
+def jpegxl_size(frame: Frame) -> tuple[int, int]:
+    """Return the width and height that a JPEG XL begins with (ISO/IEC 18181-1, SizeHeader).
+
+    Raises:
+        FrameFormatError: the bytes do not begin as a JPEG XL.
+    """
     stream = _jpegxl_stream(bytes(frame.data[:4096]))
     if stream[:2] != b"\xff\x0a":
         raise _unfit(frame, "a JPEG XL", f"bytes that begin with {stream[:8].hex(' ')}")

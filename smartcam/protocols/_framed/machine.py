@@ -8,7 +8,7 @@ dropped and counted.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 from smartcam.exceptions import (
     FrameError,
@@ -160,7 +160,13 @@ class Machine:
         kin: dialects that begin a session alike, of which it may be each, ``dialect`` first. Those
             that the answer to Connect does not fit are left out when it comes; where several are
             left, :meth:`adopt` decides.
+
+    Attributes:
+        transitions: the next state by state, sender and type of message; what is not in it is
+            illegal.
     """
+
+    transitions: ClassVar[Mapping[tuple[State, m.Sender, type[Message]], State]] = TRANSITIONS
 
     def __init__(
         self,

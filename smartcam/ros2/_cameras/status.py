@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
     from smartcam.camera import Camera
-    from smartcam.ros2._cameras.node import CameraNodeOptions
+    from smartcam.ros2._cameras.options import CameraNodeOptions
 
 logger: logging.Logger = logging.getLogger("smartcam.ros2")
 

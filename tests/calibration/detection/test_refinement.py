@@ -11,7 +11,7 @@ from smartcam.calibration._detection.corners import UNREFINED_SIGMA_PX, refine_c
 from smartcam.calibration._detection.dots import UNREFINED_SIGMA_PX as UNREFINED_DOT
 from smartcam.calibration._detection.dots import GridMap, refine_dots
 from smartcam.calibration._detection.image import grey_image
-from smartcam.calibration._homography import apply_homography, fit_homography
+from tests.calibration.inside import apply_homography, fit_homography
 from tests.calibration.scenes import BENT, STRAIGHT, drawn, facing, refused
 
 BOARD = Checkerboard(columns=9, rows=6, square=0.025)

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from smartcam.calibration._files import store
-from smartcam.calibration._files.store import keep_backup, read, read_document, replace_file, write
 from smartcam.exceptions import CalibrationError
+from tests.calibration.inside import keep_backup, read, read_document, replace_file, write
 
 
 def files(folder: Path) -> list[str]:

@@ -28,6 +28,7 @@ from smartcam.calibration.formats._file_format import MAX_TEXT_BYTES
 from smartcam.calibration.formats._plain import load_json, load_yaml
 from smartcam.exceptions import CalibrationError, MissingExtraError
 from tests.geometry.rigid import FEW, refused
+from tests.layout.bombs import laughs, merges
 
 PARSED = ["ros2", "ros_industrial", "easy_handeye", "easy_handeye2", "opencv"]
 """One format of a transform for each reader; the others share theirs."""
@@ -324,3 +325,10 @@ def test_yaml_without_pyyaml_says_what_to_install(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(sys.modules, "yaml", None)
     with pytest.raises(MissingExtraError, match=r'pip install "smartcam\[yaml\]"'):
         load_yaml("a: 1")
+
+
+def test_calibration_formats_bombs_are_refused() -> None:
+    for text in (laughs(30), merges(40)):
+        with pytest.raises(CalibrationError) as told:
+            load_yaml(text)
+        assert told.value.code == "MALFORMED"

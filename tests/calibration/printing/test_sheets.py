@@ -26,9 +26,10 @@ from smartcam.calibration import (
 from smartcam.calibration._inside import Target, on_paper
 from smartcam.calibration._printing.page import Disc, Label, Polygon
 from smartcam.calibration._printing.page_layout import BORDER_MM
-from smartcam.calibration._printing.sheets import Rays, page_size
+from smartcam.calibration._printing.sheets import page_size
 from smartcam.exceptions import CalibrationError
 from tests import ROOT
+from tests.calibration.inside import Rays
 
 GOLDEN = ROOT / "docs" / "sheet.svg"
 

@@ -1,6 +1,7 @@
 """The judge of locating: errors against predicted ones, against the bound, and false finds.
 
-``python -m tests.proofs.locate [--scenes N] [--kind TEXT] [--photographs FOLDER] [--others]``
+``python -m tests.inspection.proofs.locate [--scenes N] [--kind TEXT] [--photographs FOLDER]
+[--others]``
 
 Draws parts at exact poses in scenes of 29 kinds, five pictures of each drawing, locates them by a
 model that was taught from another picture, and compares. No estimate without a bias can be better
@@ -28,9 +29,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from smartcam.inspection import Picture
+from smartcam.inspection import PartModel, Picture
 from smartcam.inspection._locate.find import PartSearch, locate
-from smartcam.inspection._locate.model import PartModel
 from smartcam.inspection._locate.segments import pixels_in
 from tests.inspection.drawn_parts import (
     PARTS,
@@ -46,7 +46,7 @@ from tests.inspection.drawn_parts import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from smartcam.inspection._locate.find import LocatedPart
+    from smartcam.inspection import LocatedPart
 
 __all__ = ["PartSearch", "locate"]
 
@@ -417,7 +417,7 @@ def main() -> int:
         _say("\n".join(found))
         good &= not found and count > 0
     if given.others:
-        from tests.proofs import locating_of_others
+        from tests.inspection.proofs import locating_of_others
 
         _say("| way | found | missed | false | median px | median degrees | ms |")
         _say("\n".join(["| --- " * 7 + "|", *locating_of_others.compare(given.scenes, given.seed)]))
