@@ -32,7 +32,7 @@ def read_no_more_than_needed(transport: asyncio.BaseTransport) -> None:
 def second_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
     """Return a socket by which to read the datagrams that have come already; its maker closes it.
 
-    asyncio reads one datagram in a turn of its loop. None where the loop reads several by itself
+    asyncio reads one datagram in a turn of its loop. None if the loop reads several by itself
     (uvloop), and where reading aside is not safe (Windows' proactor).
     """
     known = transport.get_extra_info("socket")

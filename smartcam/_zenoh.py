@@ -599,7 +599,7 @@ class _LoopBell:
 
     @classmethod
     def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _LoopBell | None:
-        """Return a bell; None where the system or the loop has nothing for it."""
+        """Return a bell; None if the system or the loop has nothing for it."""
         if sys.platform != "linux":
             return None
         with contextlib.suppress(NotImplementedError, OSError):

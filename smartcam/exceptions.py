@@ -468,7 +468,7 @@ class InterpretationError(SmartCamError, ValueError):
     """A result container does not fit what the user said about it; the link stays up.
 
     Attributes:
-        field: name of the field, or "" where the whole container is meant.
+        field: name of the field, or "" if the whole container is meant.
         offset: byte offset in the container's data.
         expected: what was expected there.
         got: what came.

@@ -358,7 +358,7 @@ class Subscribers(Generic[T]):
     def __init__(self) -> None:
         # age of the items offered now; later subscribers do not get them
         self.horizon: float = math.inf
-        # empty where nobody is subscribed: looked at for every message
+        # empty if nobody is subscribed: looked at for every message
         self.references: dict[weakref.ref[Queue[T]], None] = {}
         # copy to iterate over while some leave; None if it must be made again
         self._in_order: list[weakref.ref[Queue[T]]] | None = None

@@ -144,7 +144,7 @@ def _address(given: str) -> str | None:
 
 
 def _watchdog(given: Mapping[str, str]) -> float | None:
-    """Return the seconds of systemd's watchdog, None where it is not for this process."""
+    """Return the seconds of systemd's watchdog, None if it is not for this process."""
     text, process = given.get("WATCHDOG_USEC", ""), given.get("WATCHDOG_PID", "")
     if not text or (process and process != str(os.getpid())):
         return None

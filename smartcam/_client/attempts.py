@@ -46,7 +46,7 @@ class Try:
         outcome: text that says how the attempt ended.
         received: number of bytes received.
         hung_up: True if the other side ended the link without a byte.
-        error: reason why there is no session, None where there is one.
+        error: reason why there is no session, None if there is one.
         on_step: function that is called with each new step.
     """
 

@@ -186,7 +186,7 @@ class SentTrigger:
 
     Attributes:
         wanted: how many results it is to have.
-        number: sequence number set for it, None where its layout has none.
+        number: sequence number set for it, None if its layout has none.
         evidence: what the camera has said of it.
         came: how many of its results came.
         early: containers that came before the camera showed that it had taken it.
@@ -372,7 +372,7 @@ class Correlation:
         """Note where an inspection begins: Waiting for Trigger drops while running.
 
         Args:
-            previous: the status before, None where there was none in this session.
+            previous: the status before, None if there was none in this session.
             status: the new one.
 
         Returns:
@@ -405,8 +405,8 @@ class Correlation:
         """Return the trigger that a container of the right application belongs to.
 
         Args:
-            number: sequence number of the container, None where the container has none or no
-                trigger of ours waits.
+            number: sequence number of the container, None if the container has none or no trigger
+                of ours waits.
         """
         pending = self.pending
         if pending is not None and not pending.ended:

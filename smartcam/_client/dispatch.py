@@ -84,7 +84,7 @@ class Dispatch:
 
     @property
     def layout(self) -> Layout | None:
-        """Layout that results are read with; None where there is none, or several."""
+        """Layout that results are read with; None if there is none, or several."""
         return self._results.interpretation.layout
 
     def begin_session(self, dialect: Dialect, *, ordered: bool) -> None:

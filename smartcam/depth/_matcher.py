@@ -145,8 +145,8 @@ class StereoMatcher:
             and ``P2`` of 0 are 8 and 32 times ``block_size`` squared.
 
     Raises:
-        ConfigurationError: no such algorithm, parameter or value; the text lists what there is.
-            ``wls`` without ``cv2.ximgproc``, which is in OpenCV's contrib packages only.
+        ConfigurationError: there is no such algorithm, parameter or value; the text lists what
+            there is. ``wls`` without ``cv2.ximgproc``, which is in OpenCV's contrib packages only.
         MissingExtraError: OpenCV (extra ``depth``) is not installed.
     """
 

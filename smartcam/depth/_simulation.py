@@ -145,7 +145,7 @@ class TowerTable:
     def pick(self, x: float, y: float, angle: float) -> Grip:
         """Close the gripper at a pose on the table; a block within :data:`GRIP` is taken.
 
-        Returns how far the next black block was from there; ``held`` is None where it is missed.
+        Returns how far the next black block was from there; ``held`` is None if it is missed.
         """
         wanted = WoodenBlock(x, y, angle)
         loose = [one for one in self.blocks if one.z == 0 and one.colour == "black"]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MAX_KEPT = 1000
-"""Statuses and arrival times kept: at 300 results a second those of the default 3 seconds."""
+"""Statuses and arrival times kept: at 300 results per second those of the default 3 seconds."""
 
 MAX_CONTAINERS = 32
 """Result containers kept, to be compared with the layout: 2 MB of the largest."""
@@ -53,7 +53,7 @@ class DoctorOptions:
 
     Attributes:
         application: id that is expected to be active, None for any.
-        interpreter: interpretation of the results; None where none was given.
+        interpreter: interpretation of the results; None if none was given.
         y_down: whether the camera's y axis points down.
         trigger: whether triggers may be sent, and ``application`` loaded for them.
         timeout: seconds for each step, None for the defaults.
@@ -145,7 +145,7 @@ class Reading(NamedTuple):
 
     data: bytes
     byte_order: ByteOrder  # byte order of their numbers
-    error: InterpretationError | None  # why they do not fit, None where they do
+    error: InterpretationError | None  # why they do not fit, None if they do
 
 
 class Keeper(Interpreter):

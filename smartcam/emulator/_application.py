@@ -102,7 +102,7 @@ class Application(EmulatorData):
 
     @property
     def period(self) -> int | None:
-        """After how many runs its containers come again; None where each run makes its own."""
+        """After how many runs its containers come again; None if each run makes its own."""
         layout = self.result_layout
         if layout is None or layout.sequence_field is not None or self.generator is not None:
             return None

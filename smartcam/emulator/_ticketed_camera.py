@@ -31,7 +31,7 @@ class TicketedClient(LineClient):
 
     Attributes:
         dialect: how the client is spoken to.
-        ticket: ticket of the request under way, "" where it has none.
+        ticket: ticket of the request under way, "" if it has none.
         number: number of its session, from 1.
     """
 

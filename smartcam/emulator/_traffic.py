@@ -55,9 +55,9 @@ class LogEntry(NamedTuple):
         error: why the bytes were ignored, None for a frame. A whole frame that is ignored has two
             entries: the frame, then the reason.
         fault: kinds of the faults that acted on it, in order; ``connection ended`` or ``not sent``
-            behind them where it was lost for that reason. None where none did. The entry of a
-            message is made when it has passed, or is lost. What the camera sends is told as it
-            meant it, what it hears as it heard it.
+            behind them where it was lost for that reason. None if none did. The entry of a message
+            is made when it has passed, or is lost. What the camera sends is told as it meant it,
+            what it hears as it heard it.
         wire: the bytes that really passed, header included, as hex; empty for nothing. None: those
             of the frame.
     """

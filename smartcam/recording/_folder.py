@@ -50,7 +50,7 @@ class FileName(NamedTuple):
 
     @classmethod
     def parse(cls, name: str) -> FileName | None:
-        """Return the parts of a name; None where no recorder gives such a name."""
+        """Return the parts of a name; None if no recorder gives such a name."""
         found = _NAME.fullmatch(name)
         if found is None:
             return None
@@ -136,7 +136,7 @@ class RecordingFolder:
 
         Raises:
             ConfigurationError: another recorder writes in it.
-            OSError: the folder cannot be made, or read.
+            OSError: the folder cannot be created, or read.
         """
         self.leave()
         if not self._made:

@@ -81,7 +81,8 @@ def write_pcap(
         How many packets were written.
 
     Raises:
-        ConfigurationError: no such camera, or the file is there already or cannot be made.
+        ConfigurationError: there is no such camera, or the file is there already or cannot be
+            created.
         UnsupportedError: a camera is a fleet's, whose frames are its agent's.
         RecordingError: the file cannot be written to its end: the disk is full, or a frame fits
             into no packet.

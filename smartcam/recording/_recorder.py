@@ -175,7 +175,7 @@ class Recorder(Observer):
 
         Raises:
             ConfigurationError: the file is there already, another recorder writes it, or it cannot
-                be made.
+                be created.
             MissingExtraError: the mcap library is not installed.
         """
         if self._thread is not None:
@@ -260,7 +260,7 @@ class Recorder(Observer):
 
     @property
     def error(self) -> RecordingError | None:
-        """Error that ended the recording before it was closed; None where there was none."""
+        """Error that ended the recording before it was closed; None if there was none."""
         return self._failure.result() if self._failure.done() else None
 
     async def wait_failed(self) -> RecordingError:

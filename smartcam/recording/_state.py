@@ -30,8 +30,8 @@ class RecordedState(NamedTuple):
     Attributes:
         camera: name of the camera.
         connected: whether there was a session.
-        application: id of the active application; None where it was not known.
-        status: status of the camera; None where it was not known.
+        application: id of the active application; None if it was not known.
+        status: status of the camera; None if it was not known.
         endian: byte order that the last status told.
         at: time of the state, UTC; None until the state is written.
     """

@@ -108,7 +108,7 @@ class RosbridgeNode(NamedNode):
 
     @property
     def failure(self) -> str:
-        """Reason for which the bridge is not there; "" where it is, or has not been tried."""
+        """Reason for which the bridge is not there; "" if it is, or has not been tried."""
         return self._link.failure
 
     async def wait_connected(self, timeout: float | None = None) -> None:
@@ -355,7 +355,7 @@ class RosbridgeNode(NamedNode):
             service.advertise()
 
     async def ask(self, service: str, arguments: dict[str, Any]) -> dict[str, Any] | None:
-        """Call a service of ROS 1: what the bridge says then, None where it says nothing in time.
+        """Call a service of ROS 1: what the bridge says then, None if it says nothing in time.
 
         All that it said before was heard by then.
         """

@@ -174,6 +174,6 @@ class Visitor(asyncio.Protocol):
 
 
 def visitor_of(request: web.BaseRequest) -> Visitor | None:
-    """Return the connection that a request came on; None where it is gone."""
+    """Return the connection that a request came on; None if it is gone."""
     protocol = None if request.transport is None else request.transport.get_protocol()
     return protocol if isinstance(protocol, Visitor) else None

@@ -99,7 +99,7 @@ class FleetRow:
         stirred: True if the camera may have changed since the last look.
         error_at: time of the last error, on the loop's clock.
         history: outcomes and failures of the last hours.
-        changed_at: time at which the camera was connected or lost at last, seconds since 1970.
+        changed_at: time at which the camera was last connected or lost, seconds since 1970.
         changed_seen: False if that happened before the camera was followed; the time is then that
             of the first look.
         picture_at: time of the last try to get the picture of a failure, on the loop's clock.

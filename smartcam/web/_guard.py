@@ -98,7 +98,7 @@ def check_host(given: str, names: Collection[str] | None = None) -> None:
 
     Args:
         given: what the request has in its head.
-        names: names of this machine, in small letters, that are allowed beside loopback and any
+        names: names of this machine, in lower case, that are allowed beside loopback and any
             address; None: only names and addresses of loopback are.
 
     Raises:

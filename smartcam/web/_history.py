@@ -49,7 +49,7 @@ class Failure:
         serial: number of the failure, from 1.
         at: time of the first one, seconds since 1970.
         until: time of the last one.
-        number: number of the first result; None where there is no result.
+        number: number of the first result; None if there is no result.
         what: what failed, in words.
         count: how many there were.
     """
@@ -67,8 +67,8 @@ class ShiftHistory:
 
     Attributes:
         version: number of changes.
-        failed_since: when the first failure after the last pass came, seconds since 1970; None
-            where the last one that tells has passed.
+        failed_since: when the first failure after the last pass came, seconds since 1970; None if
+            the last one that tells has passed.
         in_a_row: number of results that failed since then.
         totals: results of the shift by their outcomes, in the order of :data:`KINDS`.
     """
@@ -176,7 +176,7 @@ class ShiftHistory:
         return self._newest
 
     def picture(self, serial: int) -> bytes | None:
-        """Return the picture of a failure, None where none is kept."""
+        """Return the picture of a failure, None if none is kept."""
         return self._pictures.get(serial)
 
     # ------------------------------------------------------------------ for the page

@@ -55,7 +55,7 @@ class ShownResult(NamedTuple):
 
     serial: int  # counted from 0
     result: Result[Any] | None
-    error: str  # why a container could not be read, "" where it could
+    error: str  # why a container could not be read, "" if it could
     layout: Layout | None = None  # layout of tables, which have no units themselves
 
     def as_json(self) -> dict[str, Any]:
@@ -111,7 +111,7 @@ class LiveView:
         self.picture_error: str = ""
         self.changed_at: float = time.time()  # time at which it was last connected or lost
         self.changed_seen: bool = False  # False: that was before it was followed
-        self.loss: str = ""  # why it is not connected, "" where it is
+        self.loss: str = ""  # why it is not connected, "" if it is
         self._end: SmartCamError | None = None  # why it will never be again
         self._is_watched = is_watched
         self._serial = 0
@@ -296,7 +296,7 @@ class LiveView:
 
 
 def layout_of(camera: Camera[Any], result: Result[Any]) -> Layout | None:
-    """Return the layout by which a camera's result was read; None where it has none."""
+    """Return the layout by which a camera's result was read; None if it has none."""
     interpreter = own_interpreter(camera, result.application)
     return None if interpreter is None else interpreter.layout
 

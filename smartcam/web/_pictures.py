@@ -89,7 +89,7 @@ class SitePictures:
         self._threads: ThreadPoolExecutor | None = None
 
     def start(self) -> None:
-        """Have what makes pictures; does nothing if it is there."""
+        """Have what makes pictures; does nothing if it exists."""
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="smartcam.web.jpeg")
             self._presses = [Press(self._threads, self._quality) for _ in self.sources]

@@ -57,8 +57,8 @@ class CallRequest:
 
     request: web.Request  # the request; its body was read
     path: Mapping[str, str]  # the variable parts of the path
-    query: Any  # the call's query, checked; None where it takes none
-    body: Any  # the call's body, checked; None where it takes none
+    query: Any  # the call's query, checked; None if it takes none
+    body: Any  # the call's body, checked; None if it takes none
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -202,7 +202,7 @@ def _field_names(dialect: WireCodec) -> Mapping[type[m.Message], tuple[str, ...]
 
 
 def _values(message: m.Message, emulator: WireCamera, *, whole: bool) -> Any:
-    """Return a result's values as its application's layout has them, None where there is none."""
+    """Return a result's values as its application's layout has them, None if there is none."""
     if not isinstance(message, m.ResultContainer):
         return None
     if message.cells is not None:

@@ -93,8 +93,8 @@ class ConformanceOptions:
         switch_timeout: longest time for loading an application.
         reboot_timeout: longest time for a restart.
         sequence_offset: where in the application's results the int32 stands that is the sequence
-            number, counted behind the application's id; None where it is not in them.
-        input_data: bytes that the application takes as input data, None where it takes none.
+            number, counted behind the application's id; None if it is not in them.
+        input_data: bytes that the application takes as input data, None if it takes none.
 
     Raises:
         ConfigurationError: a number cannot work.

@@ -57,7 +57,7 @@ class RawClient:
 
     def __post_init__(self) -> None:
         self.heard: list[Heard] = []  # every frame that came, in order
-        self.status: int | None = None  # the last status word, None where none came
+        self.status: int | None = None  # the last status word, None if none came
         self.ended: bool = False  # the camera has ended the link
         self._began = time.monotonic()
         self._buffer = b""
@@ -140,7 +140,7 @@ class RawClient:
     # ------------------------------------------------------------------ in
 
     def next(self, within: float) -> Heard | None:
-        """Return the next frame, None where none comes ``within`` so many seconds.
+        """Return the next frame, None if none comes ``within`` so many seconds.
 
         Raises:
             EndedError: the camera ends the link.

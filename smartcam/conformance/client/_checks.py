@@ -36,7 +36,7 @@ class ClientCheck:
 
     name: str  # name in reports and for ``-k``
     scene: Scene  # the camera and the task
-    rule: Callable[[ClientRun], str | None]  # returns what was wrong, None where nothing was
+    rule: Callable[[ClientRun], str | None]  # returns what was wrong, None if nothing was
     expects: str  # behaviour that the camera's documents require of a client
     source: str  # source in the documents, with its grade
     grade: Grade = Grade.MUST  # severity

@@ -55,7 +55,7 @@ class ClientFinding(NamedTuple):
 
 
 def judge(check: ClientCheck, run: ClientRun) -> ClientFinding | None:
-    """Judge a run of a check's scene; return the finding, None where all is well."""
+    """Judge a run of a check's scene; return the finding, None if all is well."""
     wrong = check.rule(run)
     if wrong is None:
         return None

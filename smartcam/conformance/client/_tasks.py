@@ -88,7 +88,7 @@ class Outcome(NamedTuple):
 
     Attributes:
         results: data of the results that the client gave, in order.
-        error: the client's words on its failure; None where the client reports success.
+        error: the client's words on its failure; None if the client reports success.
         ended: whether the client came to an end in time.
         supported: whether the client can do such a task at all.
         seconds: duration of the task.

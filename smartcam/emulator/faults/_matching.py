@@ -164,7 +164,7 @@ def misfit(
     applications: Container[int],
     kinds: Container[str] = FAULTS,
 ) -> tuple[str, str] | None:
-    """Return the field of a fault that a camera cannot do and why, None where it can do all."""
+    """Return the field of a fault that a camera cannot do and why, None if it can do all."""
     if fault.kind not in kinds:
         able = ", ".join(kind for kind in FAULTS if kind in kinds)
         return "kind", f"dialect {dialect.label}: its camera has no such fault; it has {able}"

@@ -169,7 +169,7 @@ class Guest:
         self.under_way[command] += 1
 
     def end(self, command: bool, call: int) -> asyncio.Task[None] | None:
-        """Count a call as under way no more; return its task, None where it was counted before."""
+        """Count a call as under way no more; return its task, None if it was counted before."""
         task = self.tasks.pop((command, call), None)
         if task is not None:
             self.under_way[command] -= 1
@@ -190,7 +190,7 @@ class Agent:
         observers: observers of all sessions.
         standby: settings of standing by for cameras that others have; None: the agent does not.
         on_retired: callback for the end of all cameras, since another agent has the name.
-        calibrations: calibrations of the cameras; None where there is no folder for them.
+        calibrations: calibrations of the cameras; None if there is no folder for them.
 
     Attributes:
         retired_by: why the agent has no cameras any more.
@@ -377,7 +377,7 @@ class Agent:
         await self._claims.want(name, settings)
 
     async def refuse_taken(self, name: str, settings: CameraSettings) -> None:
-        """Raise where the fleet has a camera under another name already.
+        """Raise if the fleet has a camera under another name already.
 
         Raises:
             ConfigurationError: the fleet has it; says which camera and whose that is.
@@ -634,7 +634,7 @@ class Agent:
         command: bool,
         reservation: int | None,
     ) -> float | None:
-        """Return the seconds that a call may take; None where it is not done, or not again."""
+        """Return the seconds that a call may take; None if it is not done, or not again."""
         if guest is None or epoch != self.epoch:
             kind = ConnectionLostError if reservation is None else ReservationLostError
             stranger = kind(
@@ -665,7 +665,7 @@ class Agent:
     def _refusal(
         self, host: Host, guest: Guest, said: str, left: float, command: bool
     ) -> SmartCamError | None:
-        """Return why a call is not done, None where it is."""
+        """Return why a call is not done, None if it is."""
         if said not in ACTIONS or (said in COMMANDS) != command:
             return UnsupportedError(f"{host.name}: the agent {self.name} cannot {said!r:.40}")
         if left < 0:

@@ -96,7 +96,7 @@ class Host:
         outcomes: runs of triggers under way, by owner; only for owners that have put a list there.
         topics: topics of the camera in JSON, for other programs.
         frames: frames of the camera.
-        failure: why there is no session yet, None where there is or was one.
+        failure: why there is no session yet, None if there is or was one.
         triggers: numbers of programs' triggers, by how they ended (a word of ``OUTCOMES``).
     """
 

@@ -30,7 +30,7 @@ class Numbered(Protocol):
 
     @property
     def next(self) -> int:
-        """The number behind the last one."""
+        """The number after the last one."""
         ...
 
     @property
@@ -142,8 +142,8 @@ class Feed(Generic[NumberedT]):
 
     Args:
         take: gets each thing once, in order of the numbers.
-        miss: function that is told how many could not be had any more, and what came next; None
-            where nothing did.
+        miss: function that is told how many could not be had any more, and what came next; None if
+            nothing did.
         lacks: function that is called where something is missing; then who made the feed is to ask
             the agent for what follows ``expected``, and to :meth:`fill` it in.
         most_held: bytes that wait for what is missing before them; what comes beyond is dropped,

@@ -83,8 +83,8 @@ class _Order(NamedTuple):
         camera: name of the camera whose service is asked for.
         name: name of the service.
         service: the service.
-        fields: fields of the request; None where they cannot be read.
-        error: what is wrong with the request; None where nothing is.
+        fields: fields of the request; None if they cannot be read.
+        error: what is wrong with the request; None if nothing is.
         waited: seconds that the request may have waited before the agent heard it.
     """
 
@@ -173,7 +173,7 @@ class Plain:
         agent: the agent.
         keys: keys of the fleet.
         bus: the agent's end of the bus.
-        calibrations: calibrations of the agent's cameras; None where there is no folder for them.
+        calibrations: calibrations of the agent's cameras; None if there is no folder for them.
 
     Attributes:
         topics: topics of the agent's cameras in JSON.

@@ -413,7 +413,7 @@ class Caller:
                 self.lease(number)
 
     def _fence(self, do: str) -> int | None:
-        """Return the reservation in whose block a call is, the oldest; None where there is none.
+        """Return the reservation in whose block a call is, the oldest; None if there is none.
 
         Raises:
             ReservationLostError: one of the reservations is lost; nothing was sent.
@@ -646,7 +646,7 @@ class Caller:
             )
 
     def _perhaps(self, do: str) -> str:
-        """Return a text on another reason for silence; empty where there is none."""
+        """Return a text on another reason for silence; empty if there is none."""
         identity = self.program.bus.identity
         if identity is None:
             return ""

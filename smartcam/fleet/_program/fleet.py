@@ -250,7 +250,7 @@ class Fleet:
 
     Args:
         bus: end of the bus, for this fleet alone.
-        address: address of the fleet; None where it is in this process.
+        address: address of the fleet; None if it is in this process.
         fleet: name of the fleet; None for the only one that is there.
         around: context that is entered while the fleet is open.
         timeout: seconds in which the fleet has to be reached.

@@ -165,7 +165,7 @@ def _connected(
 def _authorization(
     url: SplitResult, plain: SplitResult, method: str, challenges: Sequence[str]
 ) -> str:
-    """Return the header that answers a challenge; "" where there is none that we know."""
+    """Return the header that answers a challenge; "" if there is none that we know."""
     user, password = unquote(url.username or ""), unquote(url.password or "")
     for challenge in challenges:
         scheme, _, said = challenge.partition(" ")

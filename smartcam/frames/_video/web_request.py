@@ -41,7 +41,7 @@ _HEAD_ENDS: Final = re.compile(rb"\n\r{0,8}\n")
 
 
 class WebAnswer(NamedTuple):
-    """An answer whose body goes on; the names of its headers are in small letters."""
+    """An answer whose body goes on; the names of its headers are in lower case."""
 
     status: int
     reason: str

@@ -53,7 +53,7 @@ class Judged(NamedTuple):
     Attributes:
         number: sequence number of the run.
         frame: the frame that was judged.
-        inspection: what the program says about it; None where it failed.
+        inspection: what the program says about it; None if it failed.
         application: id of the program.
     """
 
@@ -97,7 +97,7 @@ class Eyes(Inspector):
         judged: the last picture that was judged; None before the first.
         viewers: are shown each picture that was judged.
         format: format of the source's frames; None before it was opened.
-        trouble: why there are no frames; "" where there are.
+        trouble: why there are no frames; "" if there are.
     """
 
     def __init__(

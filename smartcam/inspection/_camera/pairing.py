@@ -97,5 +97,5 @@ class JudgedResults(Observer):
         self._found(result, sent.judged)
 
     def judged_of(self, result: Result) -> Judged | None:
-        """Return the picture of one of the last results; None where it is not known any more."""
+        """Return the picture of one of the last results; None if it is not known any more."""
         return self._kept.get((result.number, result.received_at))

@@ -437,7 +437,7 @@ def _ordered(segments: Segments) -> Segments:
 
 
 def _check_directions(segments: Segments) -> None:
-    """Raise where the edges' directions leave a place open."""
+    """Raise if the edges' directions leave a place open."""
     weights = segments.halves / segments.halves.sum()
     square = (segments.normals * weights[:, None]).T @ segments.normals
     if float(np.linalg.eigvalsh(square)[0]) < MIN_ACROSS:

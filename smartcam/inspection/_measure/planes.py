@@ -144,7 +144,7 @@ def _with_variants(calibration: Any, plane: Any, variants: list[Any], *, robot: 
 
 
 def _remark(calibration: Any, plane: Any) -> str:
-    """Return the errors that sigma is without; "" where all are known."""
+    """Return the errors that sigma is without; "" if all are known."""
     unknown = ["the touches' error"] if plane.touch_sigma is None else []
     if calibration.kind == "sheet" and calibration.lens_covariance is None:
         unknown.append("the lens' error" if calibration.camera else "the lens' distortion")

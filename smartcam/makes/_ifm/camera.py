@@ -351,5 +351,5 @@ class EmulatedIfm(EvaluatingCamera, TicketedCamera):
 
 
 def _counted(text: str) -> str:
-    """Return a text behind its length."""
+    """Return a text after its length."""
     return f"{len(text):09}{text}"

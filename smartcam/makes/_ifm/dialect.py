@@ -230,7 +230,7 @@ class PcicDialect(TicketedDialect):
         """Return the dialect with what a URL says.
 
         Raises:
-            ConfigurationError: no such trigger or container.
+            ConfigurationError: there is no such trigger or container.
         """
         kind = check_choice(parameters.get("trigger", "sync"), "trigger", ("sync", "async"))
         container = parameters.get("input", str(self.container))

@@ -92,7 +92,7 @@ def _reply(line: str) -> LineReply:
 
 
 def _split(line: str) -> tuple[str, str]:
-    """Return the command that a line answers, "" where it is what was read."""
+    """Return the command that a line answers, "" if it is what was read."""
     first, _, rest = line.partition(",")
     return (asked_word(line, {}) if first in {"OK", "ER"} and rest else ""), line
 

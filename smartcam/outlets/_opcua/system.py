@@ -86,7 +86,7 @@ class VisionSystem:
         picture: returns the file of a result's picture.
         new_job: returns an id for a job.
         names: returns the names of the camera's own applications, with their numbers.
-        simulated: True for an emulated camera, False for a real one, None where that is not known.
+        simulated: True for an emulated camera, False for a real one, None if that is not known.
     """
 
     def __init__(
@@ -217,7 +217,7 @@ class VisionSystem:
 
         Args:
             external: one of :attr:`recipes`, or the number as a text.
-            internal: number as a text; "" where only the name is given.
+            internal: number as a text; "" if only the name is given.
 
         Raises:
             UnknownRecipeError: there is no such recipe, or both ids are of different ones.
@@ -502,7 +502,7 @@ class VisionSystem:
             job.seen.set()
 
     def _job_of(self, said: Mapping[str, Any], at: datetime) -> VisionJob | None:
-        """Return the job of a result; None where it is not sure."""
+        """Return the job of a result; None if it is not sure."""
         trigger = _time(said.get("triggered_at"))
         if trigger is not None:
             found = self._by_trigger.pop(trigger, None)

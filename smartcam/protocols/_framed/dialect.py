@@ -139,7 +139,7 @@ class Codec:
         type: class of the message.
         message_id: id of the message on the wire.
         size: bytes of the fields of fixed size together.
-        has_data: True if the bytes behind these fields are a field, too.
+        has_data: True if the bytes after these fields are a field, too.
         names: names of all fields.
     """
 
@@ -210,7 +210,7 @@ class Codec:
         return body + getattr(message, self._data) if self._data is not None else body
 
     def decode(self, buffer: Buffer, begin: int, end: int) -> Message:
-        """Return the message whose body is at a place; bytes behind it are ignored.
+        """Return the message whose body is at a place; bytes after it are ignored.
 
         An answer that is nothing but a refusing code is taken as such: the rest is 0. Raises
         MessageError: the body is shorter than its message.
@@ -522,7 +522,7 @@ class FramedDialect(Dialect):
         return UnknownMessage(message_id=frame.message_id, payload=frame.payload)
 
     def body(self, answer: Message) -> bytes:
-        """Return an answer's bytes behind the header."""
+        """Return an answer's bytes after the header."""
         return self.to_frame(answer).payload
 
     def message_type(self, sender: Sender, message_id: int) -> type[Message]:

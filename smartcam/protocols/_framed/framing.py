@@ -297,7 +297,7 @@ class Framer:
     def unfinished(self) -> tuple[int, int] | None:
         """Return message id and size, header included, of a frame of which only a part is there.
 
-        None where not even the header is there. To be asked when :meth:`cut` has returned None.
+        None if not even the header is there. To be asked when :meth:`cut` has returned None.
         """
         buffer, start = (self.buffer, self.start) if self._large is None else (self._large, 0)
         if self.buffered < self._header.size:
@@ -333,7 +333,7 @@ class Framer:
         return Frame(message_id, self.take(begin, end))
 
     def resync(self) -> int:
-        """Skip to the next magic number behind the present place; return the bytes skipped.
+        """Skip to the next magic number after the present place; return the bytes skipped.
 
         Without one in the buffer, only the bytes that may begin one are kept. A dialect without a
         magic number has no such place: everything is dropped.

@@ -121,7 +121,7 @@ class InSightDialect(Dialect):
 
     @property
     def remark(self) -> str:
-        """Text which says that a result is empty where no cells are asked for."""
+        """Text which says that a result is empty if no cells are asked for."""
         if self.cells:
             return ""
         return "no cells are asked for, so results are empty; ?cells=B2,C2 in the URL names some"

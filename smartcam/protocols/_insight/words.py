@@ -119,7 +119,7 @@ class CommandRow(NamedTuple):
     Attributes:
         mnemonic: the command's two letters, in upper or lower case (manual, published).
         title: name of the command in the manual.
-        arguments: text behind the letters, without a space unless one is shown.
+        arguments: text after the letters, without a space unless one is shown.
         form: form of the answer.
         mode: mode in which the command is possible; in the other mode the answer is -2.
         codes: meaning of the status codes other than 1 and 0.
@@ -385,7 +385,7 @@ def parse_tag(text: str) -> str:
 def job_id(file: str) -> int | None:
     """Return the id of a job: the number that its file name begins with (manual, published).
 
-    None where it begins with no number, or one above 999.
+    None if it begins with no number, or one above 999.
     """
     match = _JOB_NUMBER.match(file)
     return None if match is None else int(match[1])

@@ -300,7 +300,7 @@ def topic_of_camera(name: str) -> str:
 
 
 def parts_from_json(value: object) -> list[Localization] | None:
-    """Return the localizations that recorded JSON holds; None where it holds anything else."""
+    """Return the localizations that recorded JSON holds; None if it holds anything else."""
     if not isinstance(value, list):
         return None
     said: list[Any] = value

@@ -98,7 +98,7 @@ class FleetRecorder(Server):
     async def start(self) -> None:
         """Begin to write the folder.
 
-        A folder that cannot be made, or written, is no error: it is tried again.
+        A folder that cannot be created, or written, is no error: it is tried again.
 
         Raises:
             ConfigurationError: another recorder writes the folder, or the server was started.
@@ -163,7 +163,7 @@ class FleetRecorder(Server):
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None where all is well."""
+        """Error for which nothing is written at the time; None if all is well."""
         return None if self._writer is None else self._writer.trouble
 
     def _tell(self, trouble: RecordingError | None) -> None:

@@ -90,7 +90,7 @@ class RecordedError(NamedTuple):
         at: time at which the recorder was told, UTC.
         error: name of the exception's class.
         text: text of the error.
-        triggered_at: time of the call of ``trigger()``, UTC; None where no trigger ended so.
+        triggered_at: time of the call of ``trigger()``, UTC; None if no trigger ended so.
         since: time of the first record that was not written, UTC, where ``error`` is
             ``RecordingGap``; ``at`` is that of the last one. None for other errors.
         records: number of records in a gap that were not written. None for other errors.
@@ -114,7 +114,7 @@ class RecordedPicture(NamedTuple):
         frame: the :class:`~smartcam.frames.Frame`.
         left_out: pictures before it that were not written, since too much waited for the disk.
         result_number: :attr:`~smartcam.Result.number` of the result that was made of the picture;
-            None where the recorder was not told.
+            None if the recorder was not told.
         result_received_at: when that result came, UTC: each client begins its numbers anew.
     """
 
@@ -228,7 +228,7 @@ def message_fields(data: bytes) -> dict[str, Any]:
 
 
 def body_of(entry: TraceEntry) -> str:
-    """Return the data that a frame of the camera has, as hex; "" where it has none."""
+    """Return the data that a frame of the camera has, as hex; "" if it has none."""
     data = entry.fields.get("data") if entry.direction == "<" and entry.fields else None
     return data if type(data) is str else ""
 

@@ -31,7 +31,7 @@ MAX_FACTS_BYTES = 1 << 20
 
 MIN_RECORDS = 10_000
 """Least number of records that every file may have; a larger file as many as it has bytes. A
-recorder indexes each message with 16 bytes behind its chunk, and a chunk of 1 MiB has fewer than
+recorder indexes each message with 16 bytes after its chunk, and a chunk of 1 MiB has fewer than
 these."""
 
 MIN_UNPACKED_BYTES = 1 << 29

@@ -118,7 +118,7 @@ class RotatingRecorder:
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None where all is well."""
+        """Error for which nothing is written at the time; None if all is well."""
         return None if self._writer is None else self._writer.trouble
 
     @property
@@ -181,7 +181,7 @@ class RotatingRecorder:
 
 
 def file_name(name: str) -> str:
-    """Return the name that a source has in a recording: small letters, digits and hyphens."""
+    """Return the name that a source has in a recording: lower case letters, digits and hyphens."""
     return re.sub(r"[^a-z0-9_]+", "-", name.lower()).strip("-")[:100] or "camera"
 
 

@@ -297,7 +297,7 @@ class ReplayedLines(LineCamera):
         return found
 
     def _image_for(self, line: str) -> bytes | None:
-        """Return the picture of the last trigger; None where no picture is asked for, or known."""
+        """Return the picture of the last trigger; None if no picture is asked for, or known."""
         row = self.lines.row_of(line)
         if self.lines.message_type(m.Sender.CLIENT, row) is not m.ReadImage:
             return None

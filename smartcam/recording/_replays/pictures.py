@@ -166,5 +166,5 @@ class _ResultPictures(FrameDriver):
             self._sink = None
 
     async def close(self) -> None:
-        """Have nothing left. Idempotent."""
+        """Release everything. Idempotent."""
         await self.stop()

@@ -68,7 +68,7 @@ class _Takes:
 
     @property
     def head(self) -> Take | None:
-        """The next one; None where there is none any more."""
+        """The next one; None if there is none any more."""
         return self._takes[self._next] if self._next < len(self._takes) else None
 
     @property
@@ -119,7 +119,7 @@ class _Track:
     told: Callable[[bytes], None] = lambda _: None
 
     def give(self, number: int, byte_order: ByteOrder) -> bytes | None:
-        """End the inspection: return its container; None where it sends nothing."""
+        """End the inspection: return its container; None if it sends nothing."""
         take, self.current = self.current, None
         if take is None or not take.containers:
             return None
@@ -416,7 +416,7 @@ class ReplayedCamera(EmulatedCamera):
 
 
 def _numbers(interpret_as: str | None) -> _Numbers | None:
-    """Return the offset of the sequence number; None where it is not told, or nowhere."""
+    """Return the offset of the sequence number; None if it is not told, or nowhere."""
     try:
         layout = None if interpret_as is None else resolve(interpret_as).layout
     except ConfigurationError:  # a plug-in's that is not there, or a mapping

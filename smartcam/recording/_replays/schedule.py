@@ -46,7 +46,7 @@ all the time that it waits for a trigger."""
 
 MAX_REPLAY_BYTES = 1 << 30
 """Largest number of bytes of containers that a replay keeps in memory: five hours of 2 kB, 30 times
-a second."""
+per second."""
 
 
 @dataclass(slots=True)
@@ -70,7 +70,7 @@ class TakeList:
     triggered: list[Take] = field(default_factory=list[Take])  # takes that a client triggered
     unasked: list[Take] = field(default_factory=list[Take])  # the others
     waits: bool = True  # whether it waits for triggers; otherwise it runs free
-    load_time: float | None = None  # seconds that a switch to it took; None where none was recorded
+    load_time: float | None = None  # seconds that a switch to it took; None if none was recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,7 @@ def plan_replay(recording: Recording, camera: str | None = None) -> ReplayPlan:
     """Work out how to play a camera of a recording, by default the only one in it.
 
     Raises:
-        ConfigurationError: no such camera, it had no session, or it cannot be
-                emulated.
+        ConfigurationError: there is no such camera, it had no session, or it cannot be emulated.
         RecordingError: its containers are more than :data:`MAX_REPLAY_BYTES`.
     """
     known = recording.camera(camera)
@@ -396,7 +395,7 @@ def _settled(steps: Iterable[_ReplayStep], free: set[int]) -> list[_ReplayStep]:
 
 
 def _step(at: float, entry: TraceEntry, dialect: FramedDialect) -> _ReplayStep | None:
-    """Return the step that a frame means; None where it does not matter."""
+    """Return the step that a frame means; None if it does not matter."""
     key, fields = (entry.direction, entry.message), entry.fields
     if key in _PLAIN:
         return _ReplayStep(at, _PLAIN[key])

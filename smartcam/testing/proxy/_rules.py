@@ -150,7 +150,7 @@ class RangeRule(PlacedRule):
 
     @property
     def end(self) -> int | None:
-        """The place behind its last byte, None where it has none."""
+        """The place behind its last byte, None if it has none."""
         return None if self.count is None else self.at + self.count
 
     def change(self, data: bytes) -> bytes:
@@ -285,7 +285,7 @@ class DelayBytes(Pace, name="delay"):
 
 @dataclass(frozen=True, kw_only=True)
 class Rate(Pace):
-    """Pass so many bytes a second and not more."""
+    """Pass so many bytes per second and not more."""
 
     bytes_per_second: float
 

@@ -223,7 +223,7 @@ class DatagramRelay(Relay[_Peer]):
             peer.take("up", data)
 
     def _newcomer(self, address: Any) -> _Peer | None:
-        """Return a client that was not known; None where there is no room for it."""
+        """Return a client that was not known; None if there is no room for it."""
         self._number += 1
         try:
             peer = _Peer(self, self._number, address)

@@ -53,7 +53,7 @@ class PacketDelivery(Protocol):
         ...
 
     def close(self) -> None:
-        """Have nothing left of it."""
+        """Release everything of it."""
         ...
 
 
