@@ -104,7 +104,7 @@ def _container_text(value: object) -> str:
 
 
 def _parts_text(value: list[object]) -> str | None:
-    """Return the text of localizations; None where it is to be made in another way."""
+    """Return the text of localizations; None if it is to be made in another way."""
     texts: list[str] = []
     header: object = None
     header_text = ""
@@ -152,7 +152,7 @@ def plain(value: Any) -> Any:
 
 
 def _rows(table: Any) -> Any:
-    """Return a table's rows; None where they are not simple."""
+    """Return a table's rows; None if they are not simple."""
     names, fields = table.dtype.names, table.dtype.fields
     kinds = [fields[name][0].kind for name in names or ()]
     if table.ndim != 1 or not kinds or not _COLUMNS.issuperset(kinds):

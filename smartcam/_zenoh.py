@@ -102,7 +102,7 @@ ROUTER_TIMEOUT = 3.0
 NOT_ZENOH = "nothing there speaks Zenoh"
 
 MAX_DECLARED_AT_ONCE = 32
-"""Declarations made in one turn of the event loop at most."""
+"""Largest number of declarations made in one turn of the event loop."""
 
 _ONE = (1).to_bytes(8, sys.byteorder)
 
@@ -267,7 +267,7 @@ class ZenohSession:
         self._link, self._more, self._what = link, dict(more or {}), what
         self._zenoh = engine()
         self._session: Any = None
-        self._declared: dict[ZenohDeclared, None] = {}  # in their order
+        self._declared: dict[ZenohDeclared, None] = {}  # declarations in their order
         self._waiting: collections.deque[tuple[Callable[..., None], tuple[Any, ...], int]]
         self._waiting = collections.deque()
         self._patient = self._waiting.copy()
@@ -279,7 +279,7 @@ class ZenohSession:
         self._repliers: ThreadPoolExecutor | None = None
         self._replying = 0
         self._reopening = False
-        self._look: asyncio.TimerHandle | None = None  # for connections that linger
+        self._look: asyncio.TimerHandle | None = None  # timer for connections that linger
 
     # ------------------------------------------------------------------ life
 
@@ -599,7 +599,7 @@ class _LoopBell:
 
     @classmethod
     def on(cls, loop: asyncio.AbstractEventLoop, call: Callable[[], None]) -> _LoopBell | None:
-        """Return a bell; None where the system or the loop has nothing for it."""
+        """Return a bell; None if the system or the loop has nothing for it."""
         if sys.platform != "linux":
             return None
         with contextlib.suppress(NotImplementedError, OSError):

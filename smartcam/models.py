@@ -318,7 +318,7 @@ class Result(NamedTuple, Generic[ValueT]):
         triggered_at: when the trigger was sent, UTC; None for a result nobody had triggered.
         received_at: when its last byte arrived, UTC.
         latency: seconds from trigger to arrival (monotonic clock); None like ``triggered_at``.
-        raw: the container's bytes behind the application id.
+        raw: the container's bytes after the application id.
         value: what the interpreter made of them.
     """
 

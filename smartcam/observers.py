@@ -33,7 +33,7 @@ class TraceEntry(NamedTuple):
             unfinished frame when the link ended.
         message_id: id on the wire, None for broken bytes and where there are no such ids.
         message: name of the message, or the error's text for broken bytes.
-        fields: decoded body, None where it cannot be decoded.
+        fields: decoded body, None if it cannot be decoded.
         hex: the bytes.
     """
 
@@ -99,7 +99,7 @@ class Observer:
             camera: name of the camera.
             error: a trigger without a result, a container that does not fit its layout, a lost
                link, a reconnect that failed.
-            triggered_at: when ``trigger()`` was called, UTC; None where the error ended no trigger.
+            triggered_at: when ``trigger()`` was called, UTC; None if the error ended no trigger.
         """
 
 
@@ -132,7 +132,7 @@ class Observers:
 
     @property
     def trace(self) -> Callable[[TraceEntry], None] | None:
-        """Function to call with every frame; None where no observer looks at frames."""
+        """Function to call with every frame; None if no observer looks at frames."""
         hooks = self._overriding("on_frame")
         if not hooks:
             return None
@@ -197,6 +197,6 @@ class Observers:
 
 
 def _own_hook(observer: Observer, name: str) -> Callable[..., None] | None:
-    """Return a hook of an observer that is its own; None where it does nothing."""
+    """Return a hook of an observer that is its own; None if it does nothing."""
     hook: Callable[..., None] | None = getattr(observer, name, None)
     return None if getattr(hook, "__func__", None) is getattr(Observer, name) else hook

@@ -140,7 +140,7 @@ class _Plan(NamedTuple):
     every: float | None  # seconds between triggers; None: none are sent
     source: FrameSource | None  # whose pictures are recorded as well
     judged: JudgedPictures | None  # finds the picture of each result among the camera's frames
-    read_images: bool  # after each trigger, the camera's picture
+    read_images: bool  # whether the camera's picture is read after each trigger
 
 
 def _judged_pictures(url: str, recorder: Recorder) -> JudgedPictures | None:

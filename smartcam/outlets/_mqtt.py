@@ -131,7 +131,7 @@ class MqttOutlet(Outlet[MqttSettings]):
         """Come to the broker.
 
         Raises:
-            ConfigurationError: a secret or the authority's file is not there.
+            ConfigurationError: a secret or the authority's file does not exist.
             MissingExtraError: aiomqtt is not installed.
             Exception: the broker is away, or refuses.
         """

@@ -108,9 +108,9 @@ class Spelled(NamedTuple):
     """A frame in words.
 
     Attributes:
-        message_id: id on the wire, None where the dialect has no such ids.
+        message_id: id on the wire, None if the dialect has no such ids.
         message: the message's name.
-        fields: the frame's decoded body, None where the body cannot be decoded.
+        fields: the frame's decoded body, None if the body cannot be decoded.
         data: the whole frame's bytes.
     """
 
@@ -292,7 +292,7 @@ class Protocol:
         detection: what a client tries that was told no dialect, the most probable first, each on a
             fresh link: dialects that begin a session alike. Default: each dialect by itself.
         emulator: ``module:attribute`` of the class of its emulated cameras, a
-            :class:`~smartcam.emulator.LineCamera` for one; "" where it brings none.
+            :class:`~smartcam.emulator.LineCamera` for one; "" if it brings none.
         greeting: what a camera says first to a client that has just come and has said nothing;
             ``b""`` if it keeps silent until it is spoken to, None if that is not known.
     """

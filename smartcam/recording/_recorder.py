@@ -33,7 +33,7 @@ from smartcam.recording._mcap.form import (
     FILE_METADATA,
     FORMAT,
     KINDS,
-    MAX_NAME,
+    MAX_NAME_CHARACTERS,
     MAX_PICTURE_SIZE_BYTES,
     PICTURES,
     PROFILE,
@@ -175,7 +175,7 @@ class Recorder(Observer):
 
         Raises:
             ConfigurationError: the file is there already, another recorder writes it, or it cannot
-                be made.
+                be created.
             MissingExtraError: the mcap library is not installed.
         """
         if self._thread is not None:
@@ -260,7 +260,7 @@ class Recorder(Observer):
 
     @property
     def error(self) -> RecordingError | None:
-        """Error that ended the recording before it was closed; None where there was none."""
+        """Error that ended the recording before it was closed; None if there was none."""
         return self._failure.result() if self._failure.done() else None
 
     async def wait_failed(self) -> RecordingError:
@@ -338,7 +338,10 @@ class Recorder(Observer):
         check_kind(frame, Frame, "frame", "a Frame", "recording")
         if result is not None:
             check_kind(result, Result, "result", "a Result, or None", "recording")
-        name = check_text(camera, "camera", "recording", least=0, most=MAX_NAME) or frame.source
+        name = (
+            check_text(camera, "camera", "recording", least=0, most=MAX_NAME_CHARACTERS)
+            or frame.source
+        )
         made = (None, None) if result is None else (result.number, result.received_at)
         check_readable(frame)
         if (check := getattr(self._file, "check_picture", None)) is not None:
@@ -382,7 +385,7 @@ class Recorder(Observer):
             FrameFormatError: the file is no bitmap.
             MissingExtraError: the distribution of frames is not installed.
         """
-        camera = check_text(camera, "camera", "recording", least=1, most=MAX_NAME)
+        camera = check_text(camera, "camera", "recording", least=1, most=MAX_NAME_CHARACTERS)
         check_kind(image, bytes, "image", "bytes", "recording")
         if result is not None:
             check_kind(result, Result, "result", "a Result, or None", "recording")

@@ -183,8 +183,8 @@ def test_written_reads_grow_while_they_are_filled_and_stop() -> None:
         rooms.append(len(framer.room()))
         stream = stream[read_into(framer, stream, 1 << 30) :]
         assert taken(framer)
-    doublings = (framing.MAX_READ_BYTES // framing.FIRST_READ).bit_length()
-    growing = [framing.FIRST_READ << turn for turn in range(doublings)]
+    doublings = (framing.MAX_READ_BYTES // framing.FIRST_READ_BYTES).bit_length()
+    growing = [framing.FIRST_READ_BYTES << turn for turn in range(doublings)]
     assert rooms[:doublings] == growing
     assert {*rooms[doublings:]} == {framing.MAX_READ_BYTES}
     read_into(framer, b"P", 1)

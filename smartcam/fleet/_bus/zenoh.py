@@ -462,7 +462,7 @@ class _ZenohQuestion(BusQuestion):
 
 
 def place_of(said: str) -> tuple[str, int] | None:
-    """Return the address and the port that the engine writes; None where there are none."""
+    """Return the address and the port that the engine writes; None if there are none."""
     there = LINK.match(said)
     return None if there is None else (plain_host(there["host"]), int(there["port"]))
 

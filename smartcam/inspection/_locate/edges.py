@@ -26,13 +26,13 @@ SMOOTH_PX: Final = 1.0
 """Standard deviation of the Gaussian before the gradient, in pixels."""
 
 HALF_LENGTH_PX: Final = 4.0
-"""Half of a segment's length at most, in pixels."""
+"""Largest half length of a segment, pixels."""
 
 BESIDE_PX: Final = 1.0
 """Pixels beside a straight line through a segment's middle that its points are at most."""
 
 MAX_TURN: Final = math.radians(20.0)
-"""Angle between the directions of a segment's points and its middle's, radians, at most."""
+"""Largest angle, radians, between the directions of a segment's points and that of its middle."""
 
 MIN_POINTS: Final = 4
 """Least number of points of a segment."""
@@ -54,7 +54,7 @@ MISFIT_NOISES, MAX_MISFIT = 2.0, 0.08
 which the edge is a step whose place can be told to a fraction of a pixel."""
 
 MAX_SIGMA_PX: Final = 0.3
-"""Standard deviation of the place of a taught edge at most, in pixels."""
+"""Largest standard deviation of the place of a taught edge, pixels."""
 
 STEP_SLOPE: Final = 8 / (math.sqrt(2 * math.pi) * 1.5)
 """Response of Sobel's operator to an edge of one grey level behind the blur of picture and

@@ -31,7 +31,7 @@ CONTRAST_SHARE: Final = 0.15
 """Part of the taught contrast that a found edge has at least, where nothing else is set."""
 
 MIN_CONTRAST: Final = 8.0
-"""Grey levels of 255 of a found edge at least, where nothing else is set."""
+"""Least contrast of a found edge, grey levels of 255, unless another one is set."""
 
 MAX_FITS: Final = 12
 """Largest number of places that are fitted, besides four for each part that is looked for."""

@@ -83,7 +83,7 @@ class FinePose(NamedTuple):
     seen: NDArray[np.bool_]  # (N,), segments that were seen
     kept: NDArray[np.bool_]  # (N,), segments that the pose follows from
     noise: float  # standard deviation of the pixels, grey levels
-    chi_square: float  # of the kept segments about the pose, per degree of freedom
+    chi_square: float  # chi-square of the kept segments around the pose, per degree of freedom
     reversed: float  # part of the edges that are there with the other polarity
     blur: float  # median standard deviation of the edges' blur, pixels
 

@@ -69,7 +69,7 @@ MAX_BORDER_SHARE: Final = 0.1
 """Part of the edges that may lie at the region's border."""
 
 MIN_ACROSS: Final = 0.02
-"""Part of the edges, by their directions, that tells a place along the others at least."""
+"""Least part of the edges, by their directions, that must determine a place along the others."""
 
 LEVEL_AGREEMENT: Final = math.cos(math.radians(35.0))
 """Cosine of the angle up to which a level's gradient has the direction of a point of the part."""
@@ -81,7 +81,7 @@ MIN_SELF_CONTRAST: Final = 1.0
 """Grey levels of an edge of a part that is located in its own picture, at least."""
 
 LEVEL_RESPONSE: Final = 0.8
-"""Response of Sobel's operator to a part's edge of one grey level at a level, at least."""
+"""Least response of Sobel's operator, at a level, to a part's edge of one grey level."""
 
 NOISES: Final = 6.0
 """Standard deviations of the noise that a taught edge's contrast has at least."""
@@ -93,7 +93,7 @@ MAX_LEVEL: Final = 255.0
 """Contrast or noise that may be given at most, grey levels of 255."""
 
 DEFAULT_CONTRAST: Final = 12.0
-"""Grey levels of 255 of a taught edge at least, where nothing else is set."""
+"""Least contrast of a taught edge, grey levels of 255, unless another one is set."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -437,7 +437,7 @@ def _ordered(segments: Segments) -> Segments:
 
 
 def _check_directions(segments: Segments) -> None:
-    """Raise where the edges' directions leave a place open."""
+    """Raise if the edges' directions leave a place open."""
     weights = segments.halves / segments.halves.sum()
     square = (segments.normals * weights[:, None]).T @ segments.normals
     if float(np.linalg.eigvalsh(square)[0]) < MIN_ACROSS:

@@ -156,7 +156,7 @@ class StepFit(NamedTuple):
     height_sigmas: Array  # (N,), for noise of one grey level
     variances: Array  # (N,), of the pixels about the step
     freedoms: Array  # (N,), pixels less fitted values
-    widening: float  # by how much the common blur should grow, in parts of itself
+    widening: float  # relative growth that the common blur needs
 
 
 def fit_bands(across: Array, blurs: Array, pixels: BandPixels, count: int) -> StepFit:

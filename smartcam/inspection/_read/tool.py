@@ -164,7 +164,7 @@ class ReadTool(Tool[ReadSettings]):
         return sorted(codes, key=lambda code: (code.centre[1], code.centre[0]))
 
     def _reason(self, codes: list[ReadCode], given: bytes) -> str:
-        """Return why these codes are not what they have to be; "" where they are."""
+        """Return why these codes are not what they have to be; "" if they are."""
         settings = self.settings
         if len(codes) < settings.least:
             return f"{len(codes)} codes, expected {settings.least}"

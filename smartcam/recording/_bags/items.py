@@ -203,12 +203,12 @@ class _BagCamera:
     """One camera: its topics, its state as far as it was told, and containers on their way."""
 
     name: str
-    title: str  # for topics
+    title: str  # name in topics
     make: ResultMessages
     url: str = ""
-    known: KnownState = field(init=False)  # as far as it was told
-    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # that were told
-    specs: Specs = field(default_factory=Specs)  # how its results are read
+    known: KnownState = field(init=False)  # state, as far as it was recorded
+    facts: dict[str, Any] = field(default_factory=dict[str, Any])  # facts that were recorded
+    specs: Specs = field(default_factory=Specs)  # specifications by which its results are read
 
     def __post_init__(self) -> None:
         self.known = KnownState(self.name)
@@ -216,7 +216,7 @@ class _BagCamera:
         self.localizations = Topic(f"/{self.title}/localizations", POSES, DRIVER)
         self.detections = Topic(f"/{self.title}/detections", DETECTIONS, DRIVER)
         self._status = Topic(f"/{self.title}/status", STATUS_TYPE, LATCHED)
-        self._told: object = None  # of the last diagnostics
+        self._told: object = None  # contents of the last diagnostics
         self._containers: deque[tuple[int, bytes, datetime]] = deque(maxlen=_CONTAINERS)
 
     def see_event(self, event: CameraEvent) -> None:
@@ -300,7 +300,7 @@ def topic_of_camera(name: str) -> str:
 
 
 def parts_from_json(value: object) -> list[Localization] | None:
-    """Return the localizations that recorded JSON holds; None where it holds anything else."""
+    """Return the localizations that recorded JSON holds; None if it holds anything else."""
     if not isinstance(value, list):
         return None
     said: list[Any] = value

@@ -29,7 +29,7 @@ def open_bag(folder: Path, *, overwrite: bool) -> BagWriter:
     """Make a bag's folder, and what writes it.
 
     Raises:
-        ConfigurationError: the folder cannot be made.
+        ConfigurationError: the folder cannot be created.
         MissingExtraError: a library is not installed.
     """
     types = RosTypes(DISTRIBUTION)

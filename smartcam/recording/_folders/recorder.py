@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 class _SeenResult(NamedTuple):
     """A result as an agent has it."""
 
-    result: Result[Any]  # its value says whose it is
-    endian: int | None  # None where it is not known
+    result: Result[Any]  # result, whose value says which camera it is from
+    endian: int | None  # byte order; None if it is not known
 
 
 class FleetRecorder(Server):
@@ -98,7 +98,7 @@ class FleetRecorder(Server):
     async def start(self) -> None:
         """Begin to write the folder.
 
-        A folder that cannot be made, or written, is no error: it is tried again.
+        A folder that cannot be created, or written, is no error: it is tried again.
 
         Raises:
             ConfigurationError: another recorder writes the folder, or the server was started.
@@ -163,7 +163,7 @@ class FleetRecorder(Server):
 
     @property
     def trouble(self) -> RecordingError | None:
-        """Error for which nothing is written at the time; None where all is well."""
+        """Error for which nothing is written at the time; None if all is well."""
         return None if self._writer is None else self._writer.trouble
 
     def _tell(self, trouble: RecordingError | None) -> None:
@@ -194,7 +194,8 @@ class _Hooks(Observer):
     ) -> None:
         self._server, self._section, self._writer = server, section, writer
         self._pictures = pictures
-        self._tracks: dict[str, CameraTrack | None] = {}  # None: it is not recorded
+        # track of each camera; None for one that is not recorded
+        self._tracks: dict[str, CameraTrack | None] = {}
 
     def on_state(self, event: CameraEvent) -> None:
         """Keep an event."""

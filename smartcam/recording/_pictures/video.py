@@ -28,7 +28,7 @@ OPTIONS: Final = {"cluster_time_limit": "500", "flush_packets": "1"}
 
 
 def check_writable(frame: Frame) -> None:
-    """Raise FrameFormatError where a video cannot hold a frame without loss."""
+    """Raise FrameFormatError if a video cannot hold a frame without loss."""
     if frame.format.name != "MJPEG":
         try:
             to_lossless_video(frame)
