@@ -9,8 +9,10 @@ import numpy as np
 
 from smartcam._extras import load
 from smartcam.inspection._locate.segments import (
+    BLURS_PX2,
     MIN_BLUR_PX,
     Segments,
+    fit_bands,
     make_bands,
     pixels_in,
 )
@@ -42,6 +44,9 @@ MAX_SEGMENTS: Final = 3000
 
 FITS: Final = 8
 """Steps in which segments are fitted to the picture's pixels."""
+
+BLURRED_FITS: Final = 3
+"""Steps in which segments are fitted to their blurred picture."""
 
 MAX_SHIFT_PX: Final = 1.5
 """Pixels that a fit may move a segment by; more of them, and it is another edge."""
@@ -135,12 +140,14 @@ def segments_of(found: EdgePoints) -> Segments:
         return _no_segments()
     middles, directions, bends, halves = (np.array(one) for one in zip(*rows, strict=True))
     ones = np.ones(len(rows))
-    return Segments(middles, directions, bends, halves, 0 * ones, 1.2 * ones, 0 * ones)
+    moves = np.zeros((len(rows), len(BLURS_PX2)))
+    return Segments(middles, directions, bends, halves, 0 * ones, 1.2 * ones, 0 * ones, moves)
 
 
 def _no_segments() -> Segments:
     none = np.zeros(0)
-    return Segments(np.zeros((0, 2)), np.zeros((0, 2)), none, none, none, none, none)
+    places, moves = np.zeros((0, 2)), np.zeros((0, len(BLURS_PX2)))
+    return Segments(places, places, none, none, none, none, none, moves)
 
 
 def _segment(points: Array, normals: Array) -> tuple[Array, Array, float, float]:
@@ -182,6 +189,30 @@ def fit_segments(levels: NDArray[Any], rough: Segments, points: Array, top: floa
     exact = good & moved & step & (shifted.sigmas <= MAX_SIGMA_PX) & (shifted.blurs <= MAX_BLUR_PX)
     shifted = shifted._replace(heights=shifted.heights * 255 / top)
     return TaughtEdges(shifted, exact & (shifted.heights > 0), points)
+
+
+def blurred_moves(levels: NDArray[Any], segments: Segments, points: Array) -> Array:
+    """Return how far blurs move segments across, (N, K), by blurring their picture.
+
+    Beside a corner, a bent edge or another edge, what a blur makes of an edge is no step about the
+    same place.
+    """
+    cv2 = load("cv2", "inspection needs")
+    bands = make_bands(segments, points)
+    identity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    exact = levels.astype(np.float64)
+    found = []
+    for variance in BLURS_PX2:
+        more = cv2.GaussianBlur(exact, (0, 0), math.sqrt(variance), borderType=cv2.BORDER_REPLICATE)
+        pixels = pixels_in(bands, identity, more)
+        blurs = np.sqrt(segments.blurs**2 + variance)[pixels.owners]
+        moved = np.zeros(len(segments.halves))
+        for _ in range(BLURRED_FITS):
+            across, _ = segments.places(pixels.points, pixels.owners)
+            fit = fit_bands(across - moved[pixels.owners], blurs, pixels, len(moved))
+            moved = moved + np.where(np.isfinite(fit.sigmas), fit.shifts, 0.0).clip(-0.5, 0.5)
+        found.append(moved.clip(-MAX_SHIFT_PX, MAX_SHIFT_PX))
+    return np.column_stack(found)
 
 
 def _fitted(

@@ -36,9 +36,6 @@ STILL_PX: Final = 2e-4
 MAX_SHIFT_PX: Final = 2.0
 """Pixels that a segment says in one step at most that it should move."""
 
-MIN_BEND: Final = 0.01
-"""Bend of an edge, per pixel, from which on a blur moves it by something that matters."""
-
 MAX_BLUR_PX: Final = 4.0
 """Blur of a picture's edges up to which they are fitted, in pixels."""
 
@@ -67,7 +64,7 @@ MAX_INVERSE: Final = 1e8
 class FineSettings(NamedTuple):
     """Settings of a fit."""
 
-    contrast: float  # grey levels from the darker to the brighter side at least
+    contrast: Array  # (N,), grey levels from the darker to the brighter side at least
     noise: float  # standard deviation of the picture's noise, grey levels
     any_polarity: bool = False
     scaled: bool = False  # whether the scale is fitted
@@ -136,10 +133,8 @@ def _steps(
     if first is not None:
         blurs = np.full_like(blurs, first)
     count = len(segments.halves)
-    # a blur moves a bent edge towards its middle, by its variance over the diameter
-    bent = np.where(np.abs(segments.bends) >= MIN_BEND, segments.bends, 0.0)
-    moved = 0.5 * bent * widened / pose.scale
-    across = across * pose.scale - moved[pixels.owners]
+    moved = segments.moved_by(widened / pose.scale**2)
+    across = pose.scale * (across - moved[pixels.owners])
     return fit_bands(across, blurs[pixels.owners], pixels, count), blurs
 
 
